@@ -675,7 +675,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: the last volume vertex is not joined",
-        "transport/phase.py",
+        "media/phase.py",
         "asked = active | evaluated",
         "asked = active",
         ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[nested]",),
@@ -696,14 +696,14 @@ MUTANTS = (
     ),
     Mutant(
         "media: lamps start outside",
-        "scene/light_media.py",
+        "media/light_media.py",
         "np.where(asked.found, asked.number, self.outside)",
         "np.where(asked.found, self.outside, self.outside)",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
     Mutant(
         "media: lamps partly in fog are in one medium",
-        "scene/light_media.py",
+        "media/light_media.py",
         "return dr.select(found.found, found.number, number)",
         "return number",
         ("tests/images/test_media_edges.py::test_a_lamp_of_which_a_hundredth_is_in_fog",),
@@ -724,7 +724,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: lamps are in no medium",
-        "scene/light_media.py",
+        "media/light_media.py",
         "if len(numbers) else space.media.sensor",
         "if len(numbers) else 0",
         ("tests/images/test_media_identities.py::test_spots_in_fog[spot]",),
@@ -732,7 +732,7 @@ MUTANTS = (
     Mutant(
         "media: t = 0 has the colour of its start",
         "transport/techniques.py",
-        "throughput = flight.without_collision(walk.edge, throughput, depth)",
+        "throughput = walk.edge.without_collision(throughput, depth)",
         "throughput = walk.throughput",
         ("tests/images/test_media_known_answers.py::test_meter_in_fog[chromatic, absorbing-all]",),
     ),
@@ -755,21 +755,21 @@ MUTANTS = (
     ),
     Mutant(
         "media: seldom chosen lamps are in one medium",
-        "scene/light_media.py",
+        "media/light_media.py",
         "mixed = finite and (seldom or bool(",
         "mixed = finite and (bool(",
         ("tests/images/test_media_edges.py::test_a_lamp_that_is_seldom_chosen[0.0001-True]",),
     ),
     Mutant(
         "media: grids without boundary go unnoticed",
-        "scene/light_media.py",
+        "media/light_media.py",
         'if emitters.at_infinity else ""',
         'if False else ""',
         ("tests/images/test_media_edges.py::test_a_grid_without_boundary[sky]",),
     ),
     Mutant(
         "media: shapes are not looked at one by one",
-        "scene/light_media.py",
+        "media/light_media.py",
         "        if share.max() > _TOLERATED_OF_SHAPE:",
         "        if share.max() > 1:",
         ("tests/images/test_media_edges.py::test_a_small_hole_is_found",),
@@ -814,7 +814,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: front and back of a lamp are exchanged",
-        "scene/light_media.py",
+        "media/light_media.py",
         "outwards = dr.dot(e.anchor.n, e.d) >= 0",
         "outwards = dr.dot(e.anchor.n, e.d) < 0",
         (
@@ -824,7 +824,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: lamps shine to the front alone",
-        "scene/light_media.py",
+        "media/light_media.py",
         "outwards = dr.dot(e.anchor.n, e.d) >= 0",
         "outwards = mi.Bool(True)",
         ("tests/images/test_media_plausible_bugs.py::test_a_lamp_between_two_media",),
@@ -839,8 +839,8 @@ MUTANTS = (
     Mutant(
         "media: t = 0 has T~ of what lies behind a mask",
         "transport/techniques.py",
-        "tr = of_depth(walk.edge.depth + depth)",
-        "tr = of_depth(depth)",
+        "tr = walk.edge.weight_transmittance(depth)",
+        "tr = replace(walk.edge, depth=depth).weight_transmittance()",
         ("tests/images/test_media_plausible_bugs.py::test_a_meter_behind_a_mask_in_fog",),
     ),
     Mutant(
@@ -901,7 +901,7 @@ MUTANTS = (
     ),
     Mutant(
         "media: surroundings are what the sensor sees",
-        "scene/light_media.py",
+        "media/light_media.py",
         "[numbers, leaving.number[leaving.escaped]]",
         "[numbers]",
         (
@@ -911,21 +911,21 @@ MUTANTS = (
     ),
     Mutant(
         "media: rays may leave in two media",
-        "scene/light_media.py",
+        "media/light_media.py",
         "wrong = leaving.escaped & (leaving.number != media.outside)",
         "wrong = np.zeros_like(leaving.escaped)",
         ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a gap under a porch]",),
     ),
     Mutant(
         "media: the sky is in the sensor's medium if none is known",
-        "scene/light_media.py",
+        "media/light_media.py",
         "elsewhere = leaving.lost & (leaving.number != space.media.sensor)",
         "elsewhere = np.zeros_like(leaving.lost)",
         ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a hall]",),
     ),
     Mutant(
         "media: a lamp is outside if its medium is not known",
-        "scene/light_media.py",
+        "media/light_media.py",
         'why if lost else ""',
         '""',
         ("tests/images/test_media_boundaries.py::test_media_that_nothing_tells[a lamp in a box]",),

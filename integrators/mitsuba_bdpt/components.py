@@ -17,6 +17,7 @@ from .errors import UnsupportedError
 # The folder of each component.
 COMPONENTS = {
     "guided_emission": "mitsuba_bdpt.guided_emission",
+    "media": "mitsuba_bdpt.media",
 }
 
 
@@ -40,6 +41,6 @@ def _find(name: str) -> Any:
 
 
 if TYPE_CHECKING:
-    from . import guided_emission
+    from . import guided_emission, media
 else:
-    guided_emission = _find("guided_emission")
+    guided_emission, media = map(_find, ("guided_emission", "media"))

@@ -83,7 +83,7 @@ PHASES = {
 
 @pytest.mark.parametrize("name", PHASES)
 def test_phase_functions_are_symmetric_densities(name):
-    """For `transport.phase._SYMMETRIC`: the value is the density, the same in reverse (to rounding); a sample
+    """For `media.phase._SYMMETRIC`: the value is the density, the same in reverse (to rounding); a sample
     has weight 1 and the density that it says, to 1e-4.
     """
     phase, ctx = mi.load_dict(PHASES[name]), mi.PhaseFunctionContext(None)

@@ -26,12 +26,14 @@ TESTS = Path(__file__).resolve().parents[1]
 class Component:
     """What is known of a component beside its line in the table.
 
-    ``never``: parameters of a render without it; ``asked``: parameters that ask for it; ``tests``: its own.
+    ``tests``: its own; ``never``: parameters of a render without it; ``asked``: parameters that ask for it,
+    or ``things`` of a scene that needs it.
     """
 
-    asked: dict
     tests: tuple[str, ...]
     never: dict = field(default_factory=dict)
+    asked: dict = field(default_factory=dict)
+    things: dict = field(default_factory=dict)
 
 
 # A decision that names tables of guided emission.
@@ -47,11 +49,26 @@ _DECISION = {
     "mean": 1,
 }
 
+# Parts of the names of modules that test media.
+_OF_MEDIA = (
+    *("", "_boundaries", "_edges", "_facts", "_identities"),
+    *("_known_answers", "_plausible_bugs", "_plugins"),
+)
+
 KNOWN = {
     "guided_emission": Component(
         never={"guiding": "photons"},
         asked={"decisions": json.dumps([_DECISION])},
         tests=("guided_emission", "images/test_guided_emission.py"),
+    ),
+    "media": Component(
+        things={"fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}},
+        tests=(
+            *(f"images/test_media{name}.py" for name in _OF_MEDIA),
+            "run/test_media_runs.py",
+            "transport/test_media_oracle.py",
+            "transport/test_media_counters.py",
+        ),
     ),
 }
 
@@ -87,13 +104,17 @@ def run(sources: Path, *arguments) -> str:
     return done.stdout
 
 
-def images(parameters: dict) -> dict[str, np.ndarray]:
-    """Images of all strategies, and of those that a pilot chooses."""
+def scene(things: dict):
+    """A scene that needs no component, and these ``things``."""
     import scene_parts as parts  # once there is a variant
 
-    scene = parts.open_scene(lamp=parts.EMITTERS["rectangle"]())
-    loaded = mi.load_dict(scene, parallel=False, optimize=False)
-    made = {}
+    lamp = parts.EMITTERS["rectangle"]()
+    return mi.load_dict(parts.open_scene(lamp=lamp, **things), parallel=False, optimize=False)
+
+
+def images(parameters: dict) -> dict[str, np.ndarray]:
+    """Images of all strategies, and of those that a pilot chooses."""
+    loaded, made = scene({}), {}
     for skip, spp in (("none", 4), ("auto", 64)):
         integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "skip": skip} | parameters)
         made[skip] = np.array(integrator.render(loaded, seed=3, spp=spp))
@@ -101,12 +122,12 @@ def images(parameters: dict) -> dict[str, np.ndarray]:
     return made
 
 
-def _render(asked: dict, out: str):
-    """Render without the component, and ask for it; both results go to the file ``out``."""
+def _render(name: str, out: str):
+    """Render without the component ``name``, and ask for it; both results go to the file ``out``."""
     mi.set_variant(variants.of("rgb"))
-    said = ""
+    said, known = "", KNOWN[name]
     try:
-        mi.load_dict({"type": "bdpt"} | asked)
+        mi.load_dict({"type": "bdpt"} | known.asked).render(scene(known.things), spp=1)
     except Exception as error:  # Mitsuba wraps what is raised
         said = str(error)
     np.savez(out, said=said, package=mitsuba_bdpt.__file__, **images({}))
@@ -123,7 +144,7 @@ def test_the_rest_renders_as_before(name, tmp_path):
     order of atomic sums, with all strategies and as a pilot chooses; who asks for the component is told.
     """
     known, sources, out = KNOWN[name], without(name, tmp_path), tmp_path / "made.npz"
-    run(sources, __file__, json.dumps(known.asked), out)
+    run(sources, __file__, name, out)
     found = np.load(out)
     assert Path(str(found["package"])).is_relative_to(sources)
     assert f"{name.replace('_', ' ')} is not part of this installation" in str(found["said"])
@@ -144,4 +165,4 @@ def test_the_rest_passes_its_tests(name, tmp_path):
 
 
 if __name__ == "__main__":
-    _render(json.loads(sys.argv[1]), sys.argv[2])
+    _render(*sys.argv[1:])

@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import CommandError, message
 from ..files.loading import choose_sensor, in_proportion, parameters
 from ..files.named import named_files
-from ..media.media import media_of
+from ..host.introspection import media_of
 
 
 @dataclass(frozen=True)

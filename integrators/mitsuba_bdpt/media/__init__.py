@@ -1,4 +1,4 @@
-"""Participating media: tables, free flight, transmittance between two points.
+"""Participating media: tables, free flight, transmittance between two points. A component.
 
 Measures: surface vertices are in the area measure, volume vertices in the volume measure. Free flight samples
 the density sigma_t T of collisions, so that a walk multiplies by the albedo sigma_s / sigma_t alone; only
@@ -13,3 +13,7 @@ stays unbiased, since weights add up to 1 for each path. A random estimate of T 
 An *edge* connects two vertices; null surfaces and null collisions on it are no vertices, but cut it into
 *segments*.
 """
+
+from .prepared import prepare
+
+__all__ = ["prepare"]

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
 from ..host import renamed
-from .media import Space
+
+if TYPE_CHECKING:
+    from .space import Space
 
 
 @dr.syntax

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry import polarization, rays
 from . import tracking
-from .media import Media, Space, coefficients, depth_of, interaction, of_depth
+from .media import Media, coefficients, depth_of, interaction, of_depth
+
+if TYPE_CHECKING:
+    from ..transport.walk import Walk
+    from .space import Space
 
 
 @dataclass
@@ -36,25 +41,6 @@ class Edge:
     ratio: mi.UnpolarizedSpectrum | None = None
     lit: mi.Bool | None = None
 
-    @staticmethod
-    def begin(media: Media, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
-        """First edge of a subpath; ``u`` samples its flight, ``u_channel()`` the channel."""
-        channel = ratio = None
-        if not media.gray:
-            channel, ratio = choose_channel(u_channel()), mi.UnpolarizedSpectrum(1)
-        return Edge(
-            medium=mi.UInt32(medium),
-            maxt=mi.Float(maxt),
-            depth=mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0),
-            rest=tracking.exponential(u),
-            event=mi.UInt32(1),
-            rays=mi.UInt32(1),
-            collisions=mi.UInt32(0) if media.grids else None,
-            channel=channel,
-            ratio=ratio,
-            lit=None if media.all_lit else mi.Bool(True),
-        )
-
     def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, lit, u: mi.Float) -> Edge:
         """Return the edge after an event at distance ``length`` from the ray's origin.
 
@@ -72,9 +58,16 @@ class Edge:
             rays=self.rays + 1,
         )
 
-    def weight_transmittance(self):
-        """T~ of the edge so far."""
-        return of_depth(self.depth)
+    def weight_transmittance(self, further: mi.Float | mi.UnpolarizedSpectrum | int = 0):
+        """T~ of the edge so far, and of a ``further`` optical depth."""
+        return of_depth(self.depth if isinstance(further, int) else self.depth + further)
+
+    def without_collision(self, throughput: mi.Spectrum, depth) -> mi.Spectrum:
+        """Throughput after homogeneous ``depth`` without collision; see `_weighted`."""
+        if self.ratio is None:
+            return throughput
+        transmittance = dr.exp(-depth)
+        return polarization.scaled(throughput, transmittance / dr.mean(self.ratio * transmittance))
 
 
 @dataclass
@@ -98,11 +91,33 @@ def choose_channel(u: mi.Float) -> mi.UInt32:
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
-def advance(space: Space, ray: mi.Ray3f, landing: Landing, word, active: mi.Bool, hidden) -> Landing:
-    """Follow an edge to its end, from the ray's first hit ``landing``.
+def begin(space: Space, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
+    """First edge of a subpath; ``u`` samples its flight, ``u_channel()`` the channel."""
+    media = space.media
+    channel = ratio = None
+    if not media.gray:
+        channel, ratio = choose_channel(u_channel()), mi.UnpolarizedSpectrum(1)
+    return Edge(
+        medium=mi.UInt32(medium),
+        maxt=mi.Float(maxt),
+        depth=mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0),
+        rest=tracking.exponential(u),
+        event=mi.UInt32(1),
+        rays=mi.UInt32(1),
+        collisions=mi.UInt32(0) if media.grids else None,
+        channel=channel,
+        ratio=ratio,
+        lit=None if media.all_lit else mi.Bool(True),
+    )
+
+
+def advance(space: Space, ray: mi.Ray3f, walk: Walk, word, hidden) -> Landing:
+    """Follow the edge of a ``walk`` along ``ray`` to its end.
 
     Random numbers of tracking follow ``word``; ``hidden``: see `_passes`.
     """
+    active = walk.active
+    landing = Landing(walk.o, walk.pi, mi.Float(0), mi.Bool(False), walk.edge, walk.throughput)
     if not space.media.see_through and hidden is None:  # no surface to pass
         landing = _segment(space.media, ray, landing, word, active)[1]
     else:
@@ -197,14 +212,6 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     estimate = dr.select(homogeneous, estimate, dr.select(collided, albedo, 1))
     ratio = dr.select(homogeneous, edge.ratio * densities / mean, edge.ratio)
     return polarization.scaled(throughput, estimate), replace(edge, ratio=ratio)
-
-
-def without_collision(edge: Edge, throughput: mi.Spectrum, depth) -> mi.Spectrum:
-    """Throughput after homogeneous ``depth`` without collision; see `_weighted`."""
-    if edge.ratio is None:
-        return throughput
-    transmittance = dr.exp(-depth)
-    return polarization.scaled(throughput, transmittance / dr.mean(edge.ratio * transmittance))
 
 
 def _passes(media: Media, si, hidden) -> mi.Bool:

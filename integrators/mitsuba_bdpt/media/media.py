@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from functools import partial
 
 import drjit as dr
@@ -13,8 +12,8 @@ import numpy as np
 
 from ..errors import UnsupportedError, UsageError
 from ..geometry.boxes import points_in
-from ..geometry.rounding import ShapeErrors
-from ..host.introspection import all_shapes, children, is_instance, named
+from ..geometry.directions import random_directions, symmetric_frame
+from ..host.introspection import children, named, registry_id
 from .equal import representatives
 
 # Optical depth above which T~ is constant, so that ratios of densities stay within single precision;
@@ -75,12 +74,6 @@ class Media:
         only = [b for b in null if not b.flags() & _OTHER_LOBES]
         self.see_through = bool(only) and all(b.class_name() == "Null" for b in only)
 
-    @staticmethod
-    def of(scene: mi.Scene, sensor: mi.Sensor, bsdfs: Iterable[mi.BSDF]) -> Media | None:
-        """Return the media of a scene whose shapes have ``bsdfs``; None without media."""
-        found = media_of(scene, [sensor])
-        return Media(found, sensor.get_medium(), bsdfs) if found else None
-
     def _table(self, majorants):
         """Extinction by number, ``Float`` or ``Spectrum``; None if other variables matter."""
         if not self._spectral_table:
@@ -90,7 +83,7 @@ class Media:
 
     def number_of(self, medium: mi.Medium | None) -> int:
         """The number of a medium of the scene or of the sensor, 0 for none."""
-        return 0 if medium is None else self._number_of[_registry_id(medium)]
+        return 0 if medium is None else self._number_of[registry_id(medium)]
 
     def number(self, medium: mi.MediumPtr) -> mi.UInt32:
         """The number of a medium that the scene's shapes point to."""
@@ -142,21 +135,6 @@ class Media:
         return dr.switch(dr.select(active, number - 1, 0), questions, *others, active)
 
 
-@dataclass(frozen=True)
-class Space:
-    """The space between vertices: ``scene``, ``media``, rounding errors of shapes.
-
-    ``null_transmission(si, active)``: transmission of a surface straight through (``Spectrum``); ``clipped``:
-    some camera ray ends in a homogeneous medium at the far plane, in front of the environment.
-    """
-
-    scene: mi.Scene
-    media: Media
-    shape_errors: ShapeErrors
-    null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.UnpolarizedSpectrum]
-    clipped: bool = False
-
-
 # Lobes other than null.
 _OTHER_LOBES = int(
     mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Delta1D
@@ -169,20 +147,6 @@ def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f
     mei.p, mei.wi, mei.sh_frame = p, -d, symmetric_frame(-d)
     mei.time, mei.wavelengths = shared.time, shared.wavelengths
     return mei
-
-
-def symmetric_frame(n: mi.Vector3f) -> mi.Frame3f:
-    """Frame about unit ``n`` whose matrix equals its transpose.
-
-    It is a half-turn or a reflection of the z axis. Mitsuba 3.9.1's ``sggx`` samples with the transposed
-    frame: another distribution than its density.
-    """
-    sign = dr.select(n.z >= 0, mi.Float(1), mi.Float(-1))
-    h = dr.normalize(n + mi.Vector3f(0, 0, sign))
-    s, t = h * (2 * h.x) - mi.Vector3f(1, 0, 0), h * (2 * h.y) - mi.Vector3f(0, 1, 0)
-    frame = dr.zeros(mi.Frame3f)
-    frame.s, frame.t, frame.n = s * sign, t * sign, mi.Vector3f(n)
-    return frame
 
 
 def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
@@ -203,24 +167,6 @@ def of_depth(depth: mi.Float | mi.UnpolarizedSpectrum):
     if isinstance(depth, mi.UnpolarizedSpectrum):
         transmittance = dr.mean(transmittance)
     return dr.maximum(transmittance, _LEAST)
-
-
-def media_of(scene: mi.Scene, sensors: Iterable[mi.Sensor]) -> dict[int, mi.Medium]:
-    """Media that rays of a scene and these sensors may be in, by registry index."""
-    media = [sensor.get_medium() for sensor in sensors]
-    media += [medium for shape in all_shapes(scene) for medium in _sides(shape)]
-    return {_registry_id(medium): medium for medium in media if medium is not None}
-
-
-def _sides(shape: mi.Shape) -> tuple:
-    """Media on both sides of a shape; none for instances (their shapes have them)."""
-    if is_instance(shape) or not shape.is_medium_transition():
-        return ()
-    return shape.interior_medium(), shape.exterior_medium()
-
-
-def _registry_id(medium: mi.Medium) -> int:
-    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
 
 
 def _numbers(number_of: dict[int, int]) -> mi.UInt32:
@@ -285,10 +231,6 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
         volumes = [extinction]
     mei.p = _points_within([volume.bbox() for volume in volumes], rng)
     return mei
-
-
-def random_directions(rng, count: int) -> mi.Vector3f:
-    return mi.warp.square_to_uniform_sphere(mi.Point2f(rng.random((2, count))))
 
 
 def _volumes(owner) -> list[mi.Volume]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,10 @@ from ..geometry import rays
 from ..geometry.rounding import met
 from ..host import renamed
 from . import tracking
-from .media import Media, Space, depth_of, of_depth
+from .media import Media, depth_of, of_depth
+
+if TYPE_CHECKING:
+    from .space import Space
 
 
 @dataclass

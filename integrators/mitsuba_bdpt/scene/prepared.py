@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import drjit as dr
 import mitsuba as mi
 
+from .. import components
 from ..emitters.emitters import Emitters
-from ..errors import UnsupportedError
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, check_not_animated, children, is_instance, named
-from ..media.media import Media, Space
+from ..host.introspection import all_shapes, check_not_animated, children, is_instance, media_of
 from ..sensors.checks import check_sensor
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
-from .light_media import LightMedia, medium_at_far_plane
 from .plugin_claims import check_plugins
 
 
@@ -43,12 +39,10 @@ class PreparedScene:
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found)
         self.space = self.light_media = None
-        if media := Media.of(scene, sensor, found):
-            _check_passed(found)
-            space = Space(scene, media, self.emitters.shape_errors, self.traits.null_transmission)
-            far = medium_at_far_plane(space, sensor)
-            self.space = replace(space, clipped=far > 0 and media.objects[far - 1].is_homogeneous())
-            self.light_media = LightMedia(self.space, self.emitters, sensor, far)
+        if media := media_of(scene, [sensor]):
+            self.space, self.light_media = components.media.prepare(
+                media, self.emitters, sensor, found, self.traits
+            )
             delta &= ~int(mi.BSDFFlags.Null)  # which edges pass
         self.delta = any(b.flags() & delta for b in found)
 
@@ -57,15 +51,6 @@ class PreparedScene:
         if settings.internals.stored_vertices is not None:
             return settings.internals.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
-
-
-def _check_passed(found):
-    """Raise ``UnsupportedError`` for polarizing null lobes: shadow rays are scalar."""
-    for one in bsdf.polarizing(found):
-        raise UnsupportedError(
-            f"{named(one)} of class {one.class_name()} polarizes what it lets pass, which is not supported "
-            "in scenes with participating media; take out the media or the surface, or use volpath"
-        )
 
 
 def _prepare_bitmaps(found):

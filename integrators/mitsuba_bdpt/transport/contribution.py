@@ -9,7 +9,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..emitters.records import Cell
-from ..media.media import Space
 from . import spectra
 from .inputs import Kernel
 from .plan import Plan
@@ -87,19 +86,19 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counted_in_media(space: Space | None) -> list[str]:
+def counted_in_media(space) -> list[str]:
     """Names of the counters of edges in media; collisions only with grids."""
     return [] if space is None else list(MEDIA if space.media.grids else MEDIA[:1])
 
 
-def counted_by_light(plan: Plan, space: Space | None) -> Counters:
+def counted_by_light(plan: Plan, space) -> Counters:
     """Counters of the vertices of light subpaths."""
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     names += ["non_finite"] * (plan.splat or plan.arrival)
     return Counters.zeros(*names, *counted_in_media(space) * plan.splat)
 
 
-def counted_by_camera(plan: Plan, space: Space | None) -> Counters:
+def counted_by_camera(plan: Plan, space) -> Counters:
     """Counters of the vertices of camera subpaths."""
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)

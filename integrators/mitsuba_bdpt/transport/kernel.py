@@ -55,12 +55,12 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
 In scenes with media y and z may lie in one as well; null surfaces are passed and are no edges::
 
-    the medium of the first edge <- boundaries around the emitter; the      scene.light_media
+    the medium of the first edge <- boundaries around the emitter; the      media.light_media
         one that the sensor declares
     an edge ends where a flight collides, or at a surface that is not       walk._landing, media.flight
         null; throughput <- times the albedo
     d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
-    BSDF -> phase function, cosine -> 1, in a volume                        scattering, phase
+    BSDF -> phase function, cosine -> 1, in a volume                        scattering, media.phase
     a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
     store y -> of a long subpath 64 reweighted vertices                     light_path.Thinning
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from . import bsdf, phase
+from . import bsdf
 from .bsdf import Evaluation, Target
 
 
@@ -14,15 +14,14 @@ def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None)
     take = bsdf.sample_adjoint if adjoint else bsdf.sample
     if vertex.volume is None:
         return take(vertex.bsdf, vertex.si, u1, u2, active, kernel.traits, target)
-    media = kernel.space.media
     on_surface = _of(target, ~vertex.volume)
     step, f = None, None
     if kernel.surfaces:
         step, f = take(vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface)
-    if not media.scatters:
+    if not kernel.space.media.scatters:
         return step, f
     medium, active = vertex.edge.medium, active & vertex.volume
-    in_volume = phase.sample(media, medium, vertex.si, u1, u2, active, _of(target, vertex.volume))
+    in_volume = kernel.space.sample(medium, vertex.si, u1, u2, active, _of(target, vertex.volume))
     return in_volume if step is None else dr.select(vertex.volume, in_volume, (step, f))
 
 
@@ -61,10 +60,9 @@ def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio
 
 def _chosen(kernel, vertex, medium, wo, active, surface) -> Evaluation:
     """Evaluation by ``surface`` (a function of a mask) or by the vertex's medium."""
-    media = kernel.space.media
-    if not media.scatters:
+    if not kernel.space.media.scatters:
         return surface(active & ~vertex.volume)
-    in_volume = phase.evaluate(media, medium, vertex.si, wo, active & vertex.volume)
+    in_volume = kernel.space.evaluate(medium, vertex.si, wo, active & vertex.volume)
     if not kernel.surfaces:
         return in_volume
     return dr.select(vertex.volume, in_volume, surface(active & ~vertex.volume))

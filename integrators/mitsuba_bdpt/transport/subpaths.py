@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
-from ..media import flight
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraStart
 from . import mis, spectra, techniques
@@ -172,7 +171,7 @@ def _no_merges(kernel: Kernel, asked: bool):
     return kernel.heuristic.zero() if asked and used else 0
 
 
-def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
+def _first_edge(kernel: Kernel, side: str, stream, medium, ray):
     """The first edge of a subpath along ``ray`` from ``medium``, in scenes with media."""
     points = kernel.points
 
@@ -180,4 +179,4 @@ def _first_edge(kernel: Kernel, side: str, stream, medium, ray) -> flight.Edge:
         return points.draw_1d(side, stream, Purpose.CHANNEL)
 
     u = points.draw_1d(side, stream, Purpose.FLIGHT, 1)
-    return flight.Edge.begin(kernel.space.media, medium, ray.maxt, u, u_channel)
+    return kernel.space.begin(medium, ray.maxt, u, u_channel)

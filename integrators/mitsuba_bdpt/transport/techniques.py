@@ -14,8 +14,6 @@ import mitsuba as mi
 
 from ..emitters.records import Direct, Emission
 from ..geometry import polarization, rays
-from ..media import flight, transmittance
-from ..media.media import of_depth
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, spectra
@@ -242,8 +240,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     if kernel.space is not None:
         reached, depth = _edge_to_sensor(kernel, walk, y, z, active)
         active &= reached
-        throughput = flight.without_collision(walk.edge, throughput, depth)
-        tr = of_depth(walk.edge.depth + depth)
+        throughput = walk.edge.without_collision(throughput, depth)
+        tr = walk.edge.weight_transmittance(depth)
     if kernel.plan.hide_emitters:
         active &= walk.seen
     value = throughput * (z.importance * dr.rcp(kernel.count_light))
@@ -295,7 +293,7 @@ def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active)
     distance = dr.sqrt(z.dist2) - z.near
     length = distance - dr.norm(walk.o - walk.previous)
     ray = mi.Ray3f(walk.o, walk.d, dr.maximum(length, 0), y.si.time, y.si.wavelengths)
-    depth = transmittance.depth_along(kernel.space, ray, walk.edge.medium, active)
+    depth = kernel.space.depth_along(ray, walk.edge.medium, active)
     before_end = ~y.hit | (distance <= dr.norm(y.si.p - walk.previous) * (1 + _ROUNDING))
     return (length > 0) & before_end, depth
 
@@ -304,7 +302,7 @@ def _hidden(kernel: Kernel, ray: mi.Ray3f, active):
     """Mask: a surface blocks ``ray``."""
     if kernel.space is None:
         return rays.occluded(kernel.scene, ray, active)
-    return ~transmittance.between(kernel.space, ray, kernel.sensor_medium, active, None, mi.UInt32(0)).clear
+    return ~kernel.space.between(ray, kernel.sensor_medium, active, None, mi.UInt32(0)).clear
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import polarization, rays
-from ..media import transmittance
 from ..sampling.points import Purpose, Stream
 from .contribution import Contribution, Counters
 from .inputs import Kernel
@@ -43,8 +42,7 @@ def seen(kernel: Kernel, c: Contribution, shadow_ray: ShadowRay) -> Contribution
     """Deactivate ``c`` if blocked; in media apply transmittance, and T~ in the weight."""
     if kernel.space is None:
         return replace(c, active=c.active & ~_blocked(kernel, shadow_ray, c.active))
-    crossing = transmittance.between(
-        kernel.space,
+    crossing = kernel.space.between(
         shadow_ray.ray,
         shadow_ray.medium,
         c.active,

@@ -16,7 +16,6 @@ import mitsuba as mi
 from ..emitters.records import Direct
 from ..geometry import polarization, rays
 from ..host import renamed
-from ..media import flight
 from ..sampling.points import Purpose
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, scattering, spectra
@@ -53,7 +52,7 @@ class Walk:
     seen: mi.Bool
     broken: mi.Bool
     active: mi.Bool
-    edge: Any = None  # a `flight.Edge`
+    edge: Any = None  # a `media.flight.Edge`
     isolated: mi.Bool | None = None
     guided: mi.Float | None = None
     only_delta: mi.Bool | None = None
@@ -120,7 +119,7 @@ class Vertex:
     active: mi.Bool
     event: mi.UInt32
     volume: mi.Bool | None = None
-    landing: Any = None  # a `flight.Landing`
+    landing: Any = None  # a `media.flight.Landing`
     # Set with a `Side.join`: its result, and an `Evaluation`.
     endpoint: Any = None
     endpoint_active: Any = None
@@ -307,17 +306,16 @@ def _anchor(kernel: Kernel, si, ray, volume: mi.Bool | None) -> rays.Anchor:
     return anchor if volume is None else dr.select(volume, rays.free_anchor(si.p), anchor)
 
 
-def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream) -> flight.Landing:
+def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream):
     """End of the walk's edge in a scene with media."""
-    start = flight.Landing(walk.o, walk.pi, mi.Float(0), mi.Bool(False), walk.edge, walk.throughput)
     word = kernel.points.series(stream, Purpose.TRACKING, walk.event)
     hidden = None
     if kernel.plan.hide_emitters and not side.adjoint:
         hidden = walk.edges == 1
-    return flight.advance(kernel.space, ray, start, word, walk.active, hidden)
+    return kernel.space.advance(ray, walk, word, hidden)
 
 
-def _landed(landing: flight.Landing, ray, active) -> mi.SurfaceInteraction3f:
+def _landed(landing, ray, active) -> mi.SurfaceInteraction3f:
     """The surface at the end of an edge; in a medium a point without normal and shape."""
     si = landing.pi.compute_surface_interaction(ray, renamed.hit_flags(), active & ~landing.collided)
     point = dr.zeros(mi.SurfaceInteraction3f)

@@ -15,11 +15,12 @@ import numpy as np
 
 from ..emitters.emitters import Emitters
 from ..geometry.boxes import box_of, corners, points_in, scene_box
+from ..geometry.directions import random_directions
 from ..host.introspection import is_instance, named
-from ..media import boundaries
-from ..media.media import Space, random_directions
 from ..transport.inputs import Shared
-from ..transport.phase import asymmetry
+from . import boundaries
+from .phase import asymmetry
+from .space import Space
 
 # Rays for a sensor's medium; for an emitter's (fewer if there are many); of all emitters. A part of 1/1000 of
 # an emitter in another medium is missed in one of sixty cases.

@@ -10,13 +10,19 @@ light subpaths.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..geometry.directions import random_directions, symmetric_frame
 from ..host.introspection import children
-from ..media.media import Media, interaction, probes, random_directions, symmetric_frame
-from .bsdf import Evaluation, Step, Target
+from ..transport.bsdf import Evaluation, Step, Target
+from .media import interaction, probes
+
+if TYPE_CHECKING:
+    from .space import Space
 
 # Plugins with equal forward and reverse densities.
 _SYMMETRIC = frozenset(
@@ -65,14 +71,14 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
     return mi.Spectrum(value), pdf, pdf_rev
 
 
-def evaluate(media: Media, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
+def evaluate(space: Space, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
     """Evaluate the phase function of ``medium`` (index) towards the local ``wo``."""
     mei = interaction(si.p, -si.to_world(si.wi), si)
-    return Evaluation(*media.ask(medium, _evaluated, mei, si.to_world(wo), active))
+    return Evaluation(*space.media.ask(medium, _evaluated, mei, si.to_world(wo), active))
 
 
 def sample(
-    media: Media, medium: mi.UInt32, si, u1, u2, active: mi.Bool, target: Target | None
+    space: Space, medium: mi.UInt32, si, u1, u2, active: mi.Bool, target: Target | None
 ) -> tuple[Step, Evaluation | None]:
     """Continue a subpath from a volume vertex; results as in `bsdf.sample`."""
 
@@ -89,7 +95,9 @@ def sample(
     # Subpaths that end here are still connected.
     asked = active | evaluated
 
-    d, weight, pdf, pdf_rev, joined = media.ask(medium, questions, mei, u1, u2, active, wo, evaluated, asked)
+    d, weight, pdf, pdf_rev, joined = space.media.ask(
+        medium, questions, mei, u1, u2, active, wo, evaluated, asked
+    )
     step = Step(
         # Otherwise its length would drift along subpaths: frames are built from directions.
         wo=dr.normalize(si.to_local(d)),
