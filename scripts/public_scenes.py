@@ -31,7 +31,7 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import definition, number
 from mitsuba_bdpt.errors import CommandError, did_you_mean, message
 from mitsuba_bdpt.files.images import read_layers
-from mitsuba_bdpt.files.named import named_files
+from mitsuba_bdpt.files.loading import named_files, parsed, searching
 from mitsuba_bdpt.measure import agreement, analysis, given, making, page, showing
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import Method, Preset, Subject
@@ -130,7 +130,8 @@ def references_beside(name: str, file: Path, folder: Path) -> tuple[Path | None,
     there = [path for path in _with_suffix(file.parent, ".exr") if own or path.name.lower() in wanted]
     if not there:
         return None, ()
-    textures = {path.resolve() for path in named_files(file)}
+    with searching(file):
+        textures = {path.resolve() for path in named_files(parsed(file, {}, strict=False)[1])}
     there = [path for path in there if path.resolve() not in textures]
     known = [path for path in there if path.name.lower() in wanted]
     taken = min(known, key=lambda path: wanted.index(path.name.lower()), default=None)

@@ -3,7 +3,6 @@
 import io
 import re
 import sys
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +13,7 @@ from rich.console import Console
 
 
 def report(done, total=100, seconds=2.0, rays=5_000_000, **more):
-    return SimpleNamespace(spp_done=done, spp_total=total, seconds=seconds, rays=rays, **more)
+    return progress.Report(done, total, seconds, rays, **{"error": None} | more)
 
 
 def test_a_bar_shows_rate_and_time_left():

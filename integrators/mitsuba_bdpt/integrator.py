@@ -14,11 +14,9 @@ import mitsuba as mi
 from .emitters.kinds import third_party_elsewhere
 from .errors import UnsupportedError, UsageError, UsageTypeError
 from .host import tracebacks
-from .image.features import feature_names
-from .image.layers import layer_names
 from .planning.budget import is_open
 from .planning.explain import explain
-from .properties import check_variant, integer, read_settings
+from .properties import check_variant, film_layers, integer, read_settings
 from .run import messages
 from .run.arguments import check_made_for, check_resumable, resolve_sensor, samples_per_pixel
 from .run.rendering import PassReport, Render
@@ -149,17 +147,14 @@ class BDPTIntegrator(metaclass=ABCMeta):
         ``start``: a snapshot of the same scene from which the render continues. The image is that of the
         uninterrupted render up to rounding. Raises ``UsageError`` and ``UnsupportedError``.
         """
-        check_made_for(self, scene)
         if self.on_pass is not None and not callable(self.on_pass):
             raise UsageTypeError(f"on_pass={self.on_pass!r} must be None or a function of a PassReport")
-        sensor = resolve_sensor(scene, sensor)
-        spp = samples_per_pixel(sensor, spp, self.settings)
-        render = Render(scene, sensor, self.settings, seed, spp)
+        render = self._new_render(scene, sensor, seed, spp)
         if start is not None:
             check_resumable(start)
             render.resume(start)
-        messages.warn_of_parameters(scene, sensor)
-        messages.warn_of_media(render.prepared, sensor)
+        messages.warn_of_parameters(scene, render.sensor)
+        messages.warn_of_media(render.prepared, render.sensor)
         try:
             self._cancelled = False
             render.run(self.on_pass, lambda: self._cancelled)
@@ -169,7 +164,13 @@ class BDPTIntegrator(metaclass=ABCMeta):
         messages.log(self.statistics)
         self.statistics["lost_light"] = render.lost_light()
         messages.warn_of_late_decisions(self.settings.decisions, len(self.statistics["passes"]))
-        return _result(sensor.film(), develop, evaluate)
+        return _result(render.sensor.film(), develop, evaluate)
+
+    def _new_render(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> Render:
+        """Check the arguments and prepare a render."""
+        check_made_for(self, scene)
+        sensor = resolve_sensor(scene, sensor)
+        return Render(scene, sensor, self.settings, seed, samples_per_pixel(sensor, spp, self.settings))
 
     def cancel(self):
         """Stop the render after its current pass; called by ``on_pass`` or another thread."""
@@ -206,10 +207,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         Empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the reason. As JSON,
         the list is a value of the parameter ``decisions``. Decisions do not depend on ``seed``.
         """
-        check_made_for(self, scene)
-        sensor = resolve_sensor(scene, sensor)
-        spp = samples_per_pixel(sensor, spp, self.settings)
-        render = Render(scene, sensor, self.settings, seed, spp)
+        render = self._new_render(scene, sensor, seed, spp)
         render.decide()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
@@ -238,16 +236,11 @@ class BDPTIntegrator(metaclass=ABCMeta):
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
         self.statistics["lost_light"] = render.lost_light()
-        return _result(sensor.film(), develop, evaluate)
+        return _result(render.sensor.film(), develop, evaluate)
 
     def aov_names(self) -> list[str]:
         """Return the names of the film's layers beside colours and alpha."""
-        settings = self.settings
-        depth, merges = settings.strategy_depth, settings.merge_images
-        names = feature_names(settings.aovs)
-        return layer_names(
-            depth, settings.variance, names, merges=merges, denoise=settings.denoise, stokes=settings.stokes
-        )
+        return film_layers(self.settings)
 
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""

@@ -13,7 +13,8 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from typing import TYPE_CHECKING, Protocol, TextIO
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TextIO
 
 # Not at run time: the command declares its options, and `doctor` runs, without rich.
 if TYPE_CHECKING:
@@ -23,17 +24,20 @@ if TYPE_CHECKING:
 EVERY, SHARE = 10.0, 0.02
 
 
-class Report(Protocol):
-    """Attributes of a `PassReport` that displays read."""
+@dataclass(frozen=True)
+class Report:
+    """Progress after a pass, as displays show it."""
 
-    @property
-    def spp_done(self) -> int: ...
-    @property
-    def spp_total(self) -> int: ...
-    @property
-    def seconds(self) -> float: ...
-    @property
-    def rays(self) -> int: ...
+    spp_done: int
+    """Samples per pixel so far."""
+    spp_total: int
+    """Samples per pixel of the whole render."""
+    seconds: float
+    """Seconds since the render began."""
+    rays: int
+    """Rays so far, of all kinds; 0 if they are not counted."""
+    error: float | None
+    """The relMSE at the last estimate for ``target_error``, else ``None``."""
 
 
 def share_done(report: Report, limit: float | None = None) -> float:
@@ -59,8 +63,7 @@ def in_words(report: Report, limit: float | None = None, open_ended: bool = Fals
         text += f", {readable(report.rays / max(report.seconds, 1e-9))} rays/s"
     if limit or not open_ended:
         text += f", {seconds_left(report, limit):.0f} s left"
-    error = getattr(report, "error", None)
-    return text if error is None else f"{text}, relMSE {error:.2g}"
+    return text if report.error is None else f"{text}, relMSE {report.error:.2g}"
 
 
 def readable(number: float) -> str:
@@ -109,8 +112,8 @@ class Bar(Display):
         super().__init__(limit, open_ended)
         console = console or Console(stderr=True)
         columns = BarColumn(), TextColumn("{task.description}")
-        # rich draws in notebooks with ipywidgets, which plain Jupyter lacks; `_CellOutput` replaces it.
-        self._cell = _CellOutput() if console.is_jupyter else None
+        # rich draws in notebooks with ipywidgets, which plain Jupyter lacks; `_show_in_cell` replaces it.
+        self._in_cell, self._output = console.is_jupyter, None
         shown = console.is_terminal and not console.is_jupyter
         # Draws at passes only: a refresh thread would survive an interrupted render.
         self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not shown)
@@ -135,36 +138,24 @@ class Bar(Display):
         text = in_words(report, self._limit, self._open_ended)
         self._bar.update(self._task, completed=done, description=text)
         self._bar.refresh()
-        if self._cell is not None:
-            self._cell.show(self._bar.make_tasks_table(self._bar.tasks))
+        if self._in_cell:
+            self._show_in_cell(self._bar.make_tasks_table(self._bar.tasks))
         if report.spp_done >= report.spp_total:
             self.close()
 
     def close(self) -> None:
         if self._begun:
             self._bar.stop()
-        if self._cell is not None:
-            self._cell = _CellOutput()  # for the next render, in another cell
-        self._begun = False
+        self._begun, self._output = False, None
 
-
-class _CellOutput:
-    """One output of a notebook cell, which is updated in place.
-
-    Uses IPython's display identifiers, which Jupyter, Colab and editors support.
-    """
-
-    def __init__(self):
-        self._handle = None
-
-    def show(self, shown: object) -> None:
-        """Show an object in place of the previous one."""
-        if self._handle is None:
+    def _show_in_cell(self, shown: object) -> None:
+        """Update the output by IPython's identifiers, which Jupyter, Colab and editors support."""
+        if self._output is None:
             from IPython.display import display
 
-            self._handle = display(shown, display_id=True)
+            self._output: Any = display(shown, display_id=True)
         else:
-            self._handle.update(shown)
+            self._output.update(shown)
 
 
 class Lines(Display):

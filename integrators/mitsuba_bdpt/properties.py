@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from numbers import Integral, Real
 
 import drjit as dr
@@ -157,19 +158,11 @@ _READERS = {
 _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}
 
 
-def _check_layers(settings: Settings):
-    """Raise ``UsageError`` if two layers of the film have the same name."""
-    seen = set()
-    names = features.feature_names(settings.aovs)
-    depth, merges = settings.strategy_depth, settings.merge_images
-    for layer in layer_names(
-        depth, settings.variance, names, merges=merges, denoise=settings.denoise, stokes=settings.stokes
-    ):
-        if layer in seen:
-            raise UsageError(
-                f"aovs={settings.aovs!r}: there are two layers {layer}; give the feature another name"
-            )
-        seen.add(layer)
+def film_layers(settings: Settings) -> list[str]:
+    """Return the names of the film's layers beside colours and alpha."""
+    depth, names = settings.strategy_depth, features.feature_names(settings.aovs)
+    merges, denoise, stokes = settings.merge_images, settings.denoise, settings.stokes
+    return layer_names(depth, settings.variance, names, merges=merges, denoise=denoise, stokes=stokes)
 
 
 def _not_a_parameter(name: str, value) -> str:
@@ -214,7 +207,11 @@ def _check_together(settings: Settings):
             "decisions together with light_paths, connections, skip or layers=strategies is "
             "contradictory; leave out one or the other"
         )
-    _check_layers(settings)
+    twice = [layer for layer, count in Counter(film_layers(settings)).items() if count > 1]
+    if twice:
+        raise UsageError(
+            f"aovs={settings.aovs!r}: there are two layers {twice[0]}; give the feature another name"
+        )
     if settings.stokes and not mi.is_polarized:
         raise UsageError(
             f"layers=stokes needs a polarized variant, {mi.variant()} has no Stokes vectors; use one, for "
@@ -272,36 +269,22 @@ def check_film(sensor, settings: Settings):
     or too large.
     """
     colour = film_colours(sensor, settings.stokes)
-    if settings.stokes and isinstance(colour, Bands):
+    film = sensor.film()
+    rgb_only = [name for name in settings.layers if name != "variance"]
+    if rgb_only and isinstance(colour, Bands):
         raise UnsupportedError(
-            f"layers=stokes is not possible with film {named(sensor.film())} of class SpecFilm: these layers "
-            "are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
-        )
-    if settings.strategy_images and isinstance(colour, Bands):
-        raise UnsupportedError(
-            f"layers=strategies is not possible with film {named(sensor.film())} of class SpecFilm: "
-            "these layers are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
+            f"layers={rgb_only[0]} is not possible with film {named(film)} of class SpecFilm: these layers are "
+            "RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     count = len(features.feature_names(settings.aovs))
     if settings.denoise:
-        if isinstance(colour, Bands):
-            raise UnsupportedError(
-                f"layers=denoised is not possible with film {named(sensor.film())} of class SpecFilm: the "
-                "denoiser knows RGB images only; use hdrfilm"
-            )
         denoising.check_installed()
         count += denoising.GUIDE_CHANNELS
-    _check_has_pixels(sensor.film())
-    stokes = POLARIZED if settings.stokes else 0
-    channels = Channels.of(sensor.film(), len(colour.names), count, stokes)
-    film_limits.check_film(sensor.film(), channels, settings.variance)
-    film_limits.check_strategies(sensor.film(), settings.strategy_depth, settings.merge_images)
-    return colour
-
-
-def _check_has_pixels(film):
-    """Raise ``UsageError`` for a film without pixels."""
     width, height = (int(x) for x in film.crop_size())
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
+    channels = Channels.of(film, len(colour.names), count, POLARIZED if settings.stokes else 0)
+    film_limits.check_film(film, channels, settings.variance)
+    film_limits.check_strategies(film, settings.strategy_depth, settings.merge_images)
+    return colour

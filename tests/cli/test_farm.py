@@ -419,16 +419,14 @@ def test_a_scheduler_that_does_not_answer_is_said_soon(capsys, monkeypatch):
 
 def test_a_preview_is_rewritten(monkeypatch):
     """Expected: the PNG is there, with the image so far, before the EXR is; the last one is the EXR's."""
-    from mitsuba_bdpt.cli import live
-
-    seen, write = [], live.write_png
+    seen, write = [], render.write_png
 
     def noted(film, bitmap, path, exposure):
         write(film, bitmap, path, exposure)
         seen.append((Path(path).read_bytes(), Path("shown.exr").exists()))
 
     with monkeypatch.context() as patch:
-        patch.setattr(live, "write_png", noted)
+        patch.setattr(render, "write_png", noted)
         assert main([*SMALL, "--spp", "12", "--preview", "0", "-o", "shown.exr"]) == 0
     assert (
         len(seen) > 2 and len({data for data, _ in seen}) == len(seen) and not any(done for _, done in seen)

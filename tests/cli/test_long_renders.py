@@ -12,7 +12,7 @@ import pytest
 import rendered
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.files.named import named_files
+from mitsuba_bdpt.files.loading import named_files, parsed, searching
 from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.run.snapshot import read
 from mitsuba_bdpt.run.statistics import Meter
@@ -121,13 +121,13 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
 
 NAMES = """<scene version="3.0.0">
     <!-- <string name="filename" value="gone.ply"/> -- -->
-    <default name="kind" value="default"/>
+    <default name="kind" value="default"/><path value="more/meshes"/>
     <include filename="more/part.xml"/>
     <shape type="ply"><string value="turned.ply" name="filename"/></shape>
     <texture type="bitmap"><string name="filename" value="$kind.exr"/></texture>
     <spectrum name="radiance" filename="light.spd"/>
 </scene>"""
-PART = """<scene version="3.0.0"><path value="meshes"/>
+PART = """<scene version="3.0.0">
     <include filename="plain.xml"/>
     <shape type="obj"><string name="filename" value="inner.obj"/></shape>
     <texture type="bitmap"><string name="filename" value="$kind.exr"/></texture>
@@ -136,12 +136,13 @@ PART = """<scene version="3.0.0"><path value="meshes"/>
 
 def test_what_a_scene_names_is_part_of_it():
     """Expected: whatever a scene file names, in any order of attributes, by a parameter, in a file that it
-    includes and in one that this includes, beside the one or the other or in a <path>: an edit of it makes
+    includes and in one that this includes, beside the scene file or in a <path> of it: an edit of it makes
     another scene. What stands in a comment is not named."""
     Path("more/meshes").mkdir(parents=True)
     files = ["turned.ply", "default.exr", "light.spd", "more/meshes/inner.obj", "more/plain.xml"]
     for name in [*files, "given.exr", "gone.ply"]:
-        Path(name).write_text("<scene/>")
+        Path(name).write_text('<scene version="3.0.0"><bsdf type="diffuse"/></scene>')
+    Path("light.spd").write_text("400 1\n450 1")
     Path("scene.xml").write_text(NAMES)
     Path("more/part.xml").write_text(PART)
     options = build_parser().parse_args(["render", "scene.xml"])
@@ -149,14 +150,14 @@ def test_what_a_scene_names_is_part_of_it():
 
     def changes(options, name):
         before = checkpoints.digest(options)
-        Path(name).write_text(Path(name).read_text() + " ")
+        Path(name).write_text(Path(name).read_text() + "\n500 2" * name.endswith(".spd") + " ")
         return checkpoints.digest(options) != before
 
     assert [name for name in (*files, "more/part.xml", "scene.xml") if not changes(options, name)] == []
     assert not changes(options, "gone.ply") and not changes(options, "given.exr")
     assert changes(given, "given.exr") and not changes(given, "default.exr")
     Path("more/plain.xml").write_text("<scene>")
-    with pytest.raises(ValueError, match="plain.xml' is not well-formed XML"):
+    with pytest.raises(RuntimeError, match="plain.xml"):
         checkpoints.digest(options)
 
 
@@ -169,11 +170,12 @@ def test_many_files_of_a_scene(monkeypatch):
         Path(name).write_text("a mesh")
     shapes = "".join(f'<shape type="ply"><string name="filename" value="{name}"/></shape>' for name in names)
     Path("scene.xml").write_text(f'<scene version="3.0.0">{shapes}{shapes}</scene>')
+    state = parsed(Path("scene.xml"), {})[1]
     compared, original = [], PurePath.__eq__
-    with monkeypatch.context() as patch:
+    with searching(Path("scene.xml")), monkeypatch.context() as patch:
         patch.setattr(PurePath, "__eq__", lambda a, b: compared.append(a) or original(a, b))
-        found = named_files(Path("scene.xml"))
-    assert [path.name for path in found] == names
+        found = named_files(state)
+    assert [path.name for path in found] == ["scene.xml", *names]
     assert len(compared) < 2 * 2 * len(names)
 
 
@@ -189,7 +191,9 @@ def test_encodings_of_a_scene_file(encoding):
     shape = f'<shape type="ply"><string name="filename" value="{name}"/></shape>'
     text = f'<?xml version="1.0" encoding="{encoding}"?>\n<scene version="3.0.0"><!-- a -- b -->{{}}</scene>'
     Path("names.xml").write_bytes(text.format(shape).encode(encoding))
-    assert [path.name for path in named_files(Path("names.xml"))] == [name]
+    with searching(Path("names.xml")):
+        found = named_files(parsed(Path("names.xml"), {})[1])
+    assert [path.name for path in found] == ["names.xml", name]
     box = SCENE.read_text().partition("<scene")[2].partition(">")[2].rpartition("</scene>")[0]
     Path("box.xml").write_bytes(text.format(box).encode(encoding))
     command = [ARGUMENTS[0], "box.xml", *ARGUMENTS[2:]]

@@ -131,20 +131,20 @@ def test_definitions_seed_spp_and_exposure(scene):
 
 
 def test_a_width_changes_the_height_in_proportion(scene):
-    """Expected: of a file that has defaults for both, whatever the order of their attributes and whatever
-    stands in comments (two hyphens too, as Mitsuba takes them); not where the height is given, and nothing
-    of text that is not XML, about which Mitsuba has its own words."""
-    heights = """<!-- -- <default name="resolution" value="1"/> -->
-    <default value="256" name="resolution"/>
-    <default
-        name='resolution_y' value='144'/>"""
-    scene.write_text(SCENE.replace('<default name="light" value="2"/>', heights))
+    """Expected: of a file whose film has both; not where the height is given, not of a film that is square
+    in any case, and nothing of text that is not XML, about which Mitsuba has its own words."""
+    heights = """<default value="256" name="resolution"/><default name="resolution_y" value="144"/>"""
+    film = '<film type="hdrfilm">'
+    film = f'{film}<integer name="width" value="$resolution"/><integer name="height" value="$resolution_y"/>'
+    text = f'<scene version="3.0.0">{heights}{film}</film></scene>'
+    scene.write_text(text)
     both = {"resolution": "512", "resolution_y": 288}
     assert in_proportion(scene, {"resolution": "512"}) == both
     for given in ({}, {"resolution": "512", "resolution_y": "7"}, {"resolution": "wide"}):
         assert in_proportion(scene, given) == given
-    scene.write_text(heights)
-    assert in_proportion(scene, {"resolution": "512"}) == {"resolution": "512"}
+    for other in (text.replace("$resolution_y", "$resolution"), heights):
+        scene.write_text(other)
+        assert in_proportion(scene, {"resolution": "512"}) == {"resolution": "512"}
 
 
 def test_film_component_format_is_kept(scene):
@@ -573,7 +573,7 @@ MISTYPED = [
     (["-Dintegrator=pth", "--integrator", "scene"], 'Plugin "pth" not found! Did you mean path?'),
     (["-Dlihgt=1"], "-D lihgt: no parameter of the scene; it has integrator=path, format=float32, light=2"),
     (["-Dlihgt=1"], "; did you mean light?"),
-    (["-Dprat=1"], "it has integrator=path, format=float32, light=2, width, part=3; did you mean part?"),
+    (["-Dprat=1"], "it has integrator=path, width, format=float32, light=2, part=3; did you mean part?"),
     (["-Dprat=1", "-Dxyzzy=2"], "-D prat, xyzzy: no parameter of the scene"),
 ]
 

@@ -11,9 +11,11 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
+import mitsuba as mi
+
 from ..errors import CommandError
 from ..files.images import attribute
-from ..files.named import named_files
+from ..files.loading import named_files, parsed, searching
 from ..files.whole import check_writable, replacing
 from ..host.versions import versions
 from ..run.snapshot import Snapshot, read
@@ -31,11 +33,18 @@ def path_of(output: Path) -> Path:
 
 
 def digest(options: Namespace) -> str:
-    """Hash the scene file, files that it names, definitions, sensor and film."""
+    """Hash the loaded scene's files, files and spectra that they name, definitions, sensor and film."""
     film = [options.size, options.crop] if options.size or options.crop else []
     found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor, *film]).encode())
-    for path in (options.scene, *named_files(options.scene, options.defines, options.append)):
+    with searching(options.scene, options.append):
+        state = parsed(options.scene, dict(options.defines), strict=False)[1]
+        files = named_files(state)
+    for path in files:
         found.update(hashlib.sha256(path.read_bytes()).digest())
+    for node in state.nodes:
+        for name, value in node.props.items():
+            if node.props.type(name) == mi.Properties.Type.Spectrum:  # a file that the parser has read
+                found.update(repr((list(value.wavelengths), list(value.values))).encode())
     return found.hexdigest()
 
 

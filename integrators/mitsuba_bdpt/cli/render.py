@@ -17,15 +17,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError, behind
-from ..files.images import attribute, check_channels, check_png, prepare_output, write_images
+from ..files.images import attribute, check_channels, check_png, prepare_output, write_images, write_png
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
 from ..host import memory
 from ..host.versions import versions
-from ..progress import display, readable
+from ..progress import Report, display, readable
 from ..run.rendering import PassReport
-from . import checkpoints, cluster, live
+from . import checkpoints, cluster
 from .mistakes import INTERRUPTED, answered, in_words, is_mistake
 from .signals import Ending, terminable
 
@@ -276,9 +276,9 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 def render(
     scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, least: int = 0
 ) -> Outcome:
-    """Render into the sensor's film, with progress; ``least``: see `live.watchers`."""
+    """Render into the sensor's film, with progress; ``least``: see `Preview`."""
     film = choose_sensor(scene, options.sensor).film()
-    watchers = live.watchers(options, film, options.output, least)
+    watchers = [] if options.preview is None else [Preview(options, film, least)]
     if options.scheduler is None:
         if options.time is not None and not hasattr(integrator, "on_pass"):
             return render_repeatedly(scene, integrator, options, spp)
@@ -293,6 +293,27 @@ def render(
     seconds, done = time.perf_counter() - started, sum(statistics["passes"])
     error = ended if isinstance(ended, Exception) else None
     return Outcome(seconds, done, ended is not None, statistics=statistics, error=error)
+
+
+class Preview:
+    """Rewrites the PNG with the image so far, after the first pass and then at intervals.
+
+    From ``least`` samples per pixel on; a full disk does not end the render.
+    """
+
+    def __init__(self, job: Namespace, film: mi.Film, least: int):
+        self._job, self._film, self._least, self._last = job, film, least, -math.inf
+
+    def __call__(self, report: PassReport) -> None:
+        if report.spp_done < self._least or time.monotonic() - self._last < self._job.preview:
+            return
+        report.image()
+        path = self._job.output.with_suffix(".png")
+        try:
+            write_png(self._film, self._film.bitmap(), path, self._job.exposure)
+        except OSError as error:
+            print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
+        self._last = time.monotonic()
 
 
 def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
@@ -365,16 +386,6 @@ def reached(target_error: float, statistics: Mapping) -> bool:
     return 0 < target_error and statistics["error"] <= target_error
 
 
-@dataclass(frozen=True)
-class _Report:
-    """`PassReport` for displays, of an integrator without counts of rays."""
-
-    spp_done: int
-    spp_total: int
-    seconds: float
-    rays: int = 0
-
-
 def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
     """Render with consecutive seeds until the time limit; the film has the mean.
 
@@ -390,7 +401,7 @@ def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcom
             # Raw sums include their weights, so passes of any size add up.
             total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
             done += size
-            shown(_Report(done, spp, time.perf_counter() - started))
+            shown(Report(done, spp, time.perf_counter() - started, 0, None))
     except KeyboardInterrupt:
         interrupted = True
     finally:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import codecs
+import os
 import pkgutil
 import re
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
-from xml.etree import ElementTree
 
 import mitsuba as mi
 
@@ -42,59 +42,85 @@ METERS = {"irradiancemeter": "IrradianceMeter", "radiancemeter": "RadianceMeter"
 AROUND = ("aov", "stokes", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
 
+_MISSING = re.compile(r"undefined parameter: \$(\w+)")
+"""Mitsuba's error about a parameter without value."""
+
 LISTED = 8
 """Names that a message lists, at most."""
 
-# First bytes of files in other encodings than UTF-8: a byte order mark, or the first "<". The first match
-# counts.
-_STARTS = (
-    (codecs.BOM_UTF32_LE, "utf-32"),
-    (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"),
-    (codecs.BOM_UTF16_BE, "utf-16"),
-    (b"<\0\0\0", "utf-32-le"),
-    (b"\0\0\0<", "utf-32-be"),
-    (b"<\0", "utf-16-le"),
-    (b"\0<", "utf-16-be"),
-)
 
-
-def elements(file: Path) -> list[ElementTree.Element]:
-    """Return the elements of a scene file; raises ``CommandError`` if not XML."""
-    text = _decoded(file.read_bytes())
+@contextmanager
+def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
+    """Within, Mitsuba looks for files beside the ``scene`` file first, and in ``folders`` last."""
+    former = mi.file_resolver()
+    own = mi.FileResolver(former)
+    own.prepend(str(scene.resolve().parent))
+    for folder in folders:
+        own.append(str(folder.resolve()))
+    mi.set_file_resolver(own)
     try:
-        # Mitsuba accepts "--" within comments, XML does not.
-        return list(ElementTree.fromstring(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)).iter())
-    except (ElementTree.ParseError, ValueError) as error:
-        raise CommandError(f"{str(file)!r} is not well-formed XML: {error}") from error
+        yield
+    finally:
+        mi.set_file_resolver(former)
 
 
-def _decoded(data: bytes) -> str:
-    """Decode a scene file; its first bytes give the encoding, as in Mitsuba."""
-    if re.match(rb"<\?xml[^>]*encoding\s*=\s*[\"'](iso-8859-1|latin1)[\"']", data, re.IGNORECASE):
-        return data.decode("latin-1")
-    encoding = next((name for start, name in _STARTS if data.startswith(start)), "utf-8-sig")
-    return data.decode(encoding, errors="replace")
+def parsed(
+    scene: Path, definitions: Mapping[str, object], strict: bool = True
+) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
+    """Parse a ``scene`` file by Mitsuba's parser.
+
+    ``definitions``: values of its parameters; if ``strict``, unused and missing ones are errors.
+    """
+    config = mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
+    if strict:
+        return config, mi.parser.parse_file(config, str(scene), **definitions)
+    config.unused_parameters = mi.LogLevel.Debug
+    while True:
+        try:
+            return config, mi.parser.parse_file(config, str(scene), **definitions)
+        except RuntimeError as error:
+            missing = _MISSING.search(str(error))
+            if missing is None:
+                raise
+            definitions = {**definitions, missing[1]: "1"}
+
+
+def named_files(state: mi.parser.ParserState) -> list[Path]:
+    """Return the files of a parsed scene, and the existing ones that it names, each once.
+
+    Those of spectra are left out: the parser has read them. Has to be called within `searching`.
+    """
+    names = (str(mi.file_resolver().resolve(name)) for name in _filenames(state))
+    files = [str(file) for file in state.files]
+    return [Path(name) for name in dict.fromkeys((*files, *filter(os.path.isfile, names)))]
+
+
+def _filenames(state: mi.parser.ParserState) -> list[str]:
+    found = (node.props.get("filename") for node in state.nodes)
+    return [name for name in found if isinstance(name, str)]
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:
     """Add to ``definitions`` a ``resolution_y`` that keeps the aspect ratio.
 
-    Only if ``resolution`` is defined, ``resolution_y`` is not, and the scene file has defaults for both.
+    Only if ``resolution`` is defined, ``resolution_y`` is not, and the scene file uses both.
     """
     if "resolution" not in definitions or "resolution_y" in definitions:
         return definitions
+
+    def sizes(definitions: dict) -> list[tuple]:
+        state = parsed(scene, definitions)[1]
+        return [(film.props.get("width"), film.props.get("height")) for film in _films(state)]
+
+    others = {name: value for name, value in definitions.items() if name != "resolution"}
     try:
-        defaults = [element for element in elements(scene) if element.tag == "default"]
-    except ValueError:  # Mitsuba's parser accepts more, and decides
-        return definitions
-    # Mitsuba takes the first of several with one name.
-    known = {element.get("name"): element.get("value", "") for element in reversed(defaults)}
-    texts = str(definitions["resolution"]), known.get("resolution", ""), known.get("resolution_y", "")
-    if not all(text.strip().isdecimal() for text in texts) or not int(texts[1]):
-        return definitions
-    asked, width, height = map(int, texts)
-    return definitions | {"resolution_y": max(round(asked * height / width), 1)}
+        pairs = zip(sizes(others), sizes(definitions), strict=True)
+        width, height, asked = next((w, h, asked) for (w, h), (asked, y) in pairs if asked != w and y == h)
+        both = definitions | {"resolution_y": max(round(asked * height / width), 1)}
+        sizes(both)
+    except (RuntimeError, StopIteration, TypeError, ZeroDivisionError):
+        return definitions  # Mitsuba's parser decides
+    return both
 
 
 class Loaded(NamedTuple):
@@ -128,11 +154,9 @@ def load(options: Namespace) -> Loaded:
             f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
-    mi.file_resolver().prepend(str(options.scene.resolve().parent))
-    for folder in options.append:
-        mi.file_resolver().append(str(folder.resolve()))
     try:
-        return _load(options)
+        with searching(options.scene, options.append):
+            return _load(options)
     except RuntimeError as error:
         better = _in_words(str(error), options)
         if better is None:
@@ -148,9 +172,8 @@ def _load(options: Namespace) -> Loaded:
     asked = None if options.integrator == SCENES_OWN else options.integrator
     if asked is not None:
         _check_kind(asked)
-    config = mi.parser.ParserConfig(options.variant)
     defines = in_proportion(options.scene, dict(options.defines))
-    state = mi.parser.parse_file(config, str(options.scene), **defines)
+    config, state = parsed(options.scene, defines)
     _check_root(state, options.scene)
     _check_film_sizes(state)
     for film in _films_of_images(state):
@@ -326,16 +349,16 @@ def _scenes_near(scene: Path) -> str:
     return f"{listed}; {did_you_mean(scene.name, there)}".rstrip("; ")
 
 
-def _files_near(scene: Path, name: str) -> str:
+def _files_near(options: Namespace, name: str) -> str:
     """Describe where Mitsuba searched for a missing file, and suggest others.
 
-    Empty if the scene file does not contain ``name``; Mitsuba may report its last part only.
+    Empty if no object of the scene has the file ``name``; Mitsuba may report its last part only.
     """
     try:
-        texts = [element.get("value", "") for element in elements(scene)]
-    except ValueError:  # Mitsuba accepts more than XML
+        texts = _filenames(parsed(options.scene, dict(options.defines), strict=False)[1])
+    except RuntimeError:  # of a spectrum or an included file
         return ""
-    files = [scene.parent / text for text in texts if text == name or Path(text).name == name]
+    files = [options.scene.parent / text for text in texts if text == name or Path(text).name == name]
     if not files:
         return ""
     folder = files[0].parent
@@ -354,20 +377,20 @@ def _in_words(error: str, options: Namespace) -> str | None:
         name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.MULTILINE)
     ]
     if "unused parameters" in error and unused:
-        known = parameters(options.scene)
+        known = parameters(options.scene, dict(options.defines))
         named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
         text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
         return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
     if rejected := _rejected(error, options):
         return rejected
-    missing = re.search(r"undefined parameter: \$(\w+)", error)
+    missing = _MISSING.search(error)
     if missing:
         return f"{error}; give it a value: -D {missing[1]}=VALUE"
     missing = re.search(
         r'"([^"]+)": (I/O error while attempting to open file: No such|file not found)', error
     )
     if missing:
-        return f"{error}{_files_near(options.scene, missing[1])}"
+        return f"{error}{_files_near(options, missing[1])}"
     if suggested := _unused_parameters(error, options):
         return suggested
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
@@ -428,32 +451,17 @@ def _rejected(error: str, options: Namespace) -> str | None:
     return f"{' or '.join(given)}: {found[0].rstrip('.')}, in {str(options.scene)!r}{where}; give it another"
 
 
-def parameters(scene: Path) -> dict[str, str]:
-    """Return the parameters that ``-D`` can set in a scene file, with their defaults.
+def parameters(scene: Path, definitions: Mapping[str, object]) -> dict[str, str]:
+    """Return the parameters that a scene file uses, or one that it includes, with their defaults.
 
-    Only parameters that the file, or an included one, uses: Mitsuba rejects unused ones. A missing default is
-    empty.
+    A missing default is empty.
     """
-    found, used, files, done = {}, set(), [scene], set()
-    while files:
-        file = files.pop(0)
-        if file in done or not file.is_file():
-            continue
-        done.add(file)
-        try:
-            there = elements(file)
-        except ValueError:  # Mitsuba accepts more than XML
-            continue
-        for element in there:
-            names = [name for value in element.attrib.values() for name in re.findall(r"\$(\w+)", value)]
-            used |= set(names)
-            found |= {name: found.get(name, "") for name in names}
-            if element.tag == "default":
-                name = element.get("name", "")
-                found[name] = found.get(name) or element.get("value", "")
-            if element.tag == "include":
-                files.append(scene.parent / element.get("filename", ""))
-    return {name: default for name, default in found.items() if name in used}
+    with searching(scene):
+        state = parsed(scene, definitions, strict=False)[1]
+    text = "".join(Path(str(file)).read_text(errors="replace") for file in state.files)
+    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
+    defaults = dict(reversed(re.findall(r'<default\s+name="(\w+)"\s+value="([^"]*)"', text)))
+    return {name: defaults.get(name, "") for name in re.findall(r"\$(\w+)", text)}
 
 
 def plugins() -> list[str]:

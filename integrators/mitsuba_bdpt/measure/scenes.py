@@ -6,7 +6,6 @@ import hashlib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, message
-from ..files.loading import choose_sensor, in_proportion, parameters
-from ..files.named import named_files
+from ..files.loading import choose_sensor, in_proportion, named_files, parameters, parsed, searching
 from ..host.introspection import media_of
 
 
@@ -144,17 +142,18 @@ class SceneFile(MeasuredScene):
 
     @property
     def sha256(self) -> str:
-        return digest(self.file, *named_files(self.file))
+        with searching(self.file):
+            return digest(*named_files(parsed(self.file, {}, strict=False)[1]))
 
     @property
     def _parameters(self) -> Mapping[str, str]:
-        return parameters(self.file)
+        return parameters(self.file, {})
 
     def _plain(self, definitions: dict) -> mi.Scene:
         return mi.load_file(str(self.file), parallel=False, **in_proportion(self.file, definitions))
 
     def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
-        with _names_resolved_beside(self.file):
+        with searching(self.file):
             return super()._instantiated(definitions, sampler)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
@@ -333,16 +332,3 @@ def _replace_sampler(nodes, sensor, kind: str) -> None:
     # Before the list grows, which invalidates Python's references to its entries.
     sensor.props["sampler"] = mi.Properties.ResolvedReference(len(nodes))
     nodes.append(node)
-
-
-@contextmanager
-def _names_resolved_beside(file: Path):
-    """Within, Mitsuba searches meshes and textures beside ``file`` first."""
-    former = mi.file_resolver()
-    own = mi.FileResolver(former)
-    own.prepend(str(file.resolve().parent))
-    mi.set_file_resolver(own)
-    try:
-        yield
-    finally:
-        mi.set_file_resolver(former)

@@ -24,6 +24,7 @@ from ..planning.configuration import MOST_ROULETTE
 from ..planning.findings import Findings
 from ..planning.lost_light import LostLight
 from ..planning.planner import Planner
+from ..progress import Report
 from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
@@ -44,22 +45,12 @@ from .statistics import Meter, rays
 
 
 @dataclass(frozen=True)
-class PassReport:
+class PassReport(Report):
     """Progress after a pass.
 
     ``snapshot`` and ``image`` are valid until the report of the next pass.
     """
 
-    spp_done: int
-    """Samples per pixel so far."""
-    spp_total: int
-    """Samples per pixel of the whole render."""
-    seconds: float
-    """Seconds since the render began."""
-    rays: int
-    """Rays so far, of all kinds."""
-    error: float | None
-    """The relMSE at the last estimate for ``target_error``, else ``None``."""
     snapshot: Callable[[], Snapshot]
     """Returns the snapshot from which another render can continue."""
     image: Callable[[], mi.TensorXf]

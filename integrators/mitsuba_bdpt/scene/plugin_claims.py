@@ -2,13 +2,14 @@
 
 Strategies, densities and tables follow from flags and methods like ``is_spatially_varying``, whose defaults
 are easily left unchanged. A declaration that the plugin's own values contradict makes strategies disagree, so
-it raises an error. Mitsuba's own plugins are not checked.
+it raises an error. Mitsuba's own plugins are not checked. Checks yield contradictions with remedies, of
+which the first is raised.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
@@ -47,7 +48,12 @@ def check_plugins(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
     def check() -> None:
         for owner in users:
-            _CHECKS[_base(owner)](owner, scene, media)
+            kind = _base(owner)
+            for contradiction in _CHECKS[kind](owner, scene, media):
+                raise UsageError(
+                    f"{kind.lower()} {named(owner)} of the Python class {type(owner).__name__} contradicts "
+                    f"itself, and strategies would disagree about the image: {contradiction}"
+                )
 
     cached(scene, sensor, "plugins", State.of(users), check, most=1)
 
@@ -91,14 +97,6 @@ def _held(scene: mi.Scene) -> list[mi.Object]:
         seen |= {id(value): value for value in fresh}
         left += fresh
     return [owner for owner in seen.values() if isinstance(owner, kinds)]
-
-
-def _contradiction(owner, method: str, states: str, but: str, remedy: str) -> UsageError:
-    kind = _base(owner).lower()
-    return UsageError(
-        f"{kind} {named(owner)} of the Python class {type(owner).__name__}: {method} {states}, but {but}; "
-        f"strategies would disagree about the image. {remedy}"
-    )
 
 
 def _numbers(value) -> np.ndarray:
@@ -154,7 +152,7 @@ def _places(scene: mi.Scene) -> mi.Point3f:
 # -- textures ---------------------------------------------------------------------------------
 
 
-def _check_texture(texture: mi.Texture, scene, media) -> None:
+def _check_texture(texture: mi.Texture, scene, media) -> Iterator[str]:
     value = _first_answer((texture.eval, texture.eval_3, texture.eval_1), _interaction())
     if value is None:
         return
@@ -163,32 +161,23 @@ def _check_texture(texture: mi.Texture, scene, media) -> None:
     varies = found.size and (np.ptp(found, axis=1) > 1e-5 * np.abs(found).max()).any()
     if not texture.is_spatially_varying():
         if varies:
-            raise _contradiction(
-                texture,
-                "is_spatially_varying()",
-                "returns False (the default)",
-                "its values at different texture coordinates differ",
-                "Let it return True.",
+            yield (
+                "is_spatially_varying() returns False (the default), but its values at different texture "
+                "coordinates differ. Let it return True."
             )
         return
     uv, pdf = texture.sample_position(spread_points(_COUNT))
     stated = texture.pdf_position(uv)
     if _differ(pdf, stated, _lit(pdf)):
-        raise _contradiction(
-            texture,
-            "pdf_position()",
-            "is not the density that sample_position() returns with its points",
-            "both are the density over the unit square",
-            "Return the same number.",
+        yield (
+            "pdf_position() is not the density that sample_position() returns with its points, but both are "
+            "the density over the unit square. Return the same number."
         )
     lit = _lit(value) & (_numbers(texture.pdf_position(_interaction().uv)) <= 0).all(0)
     if lit.mean() > _OFF:
-        raise _contradiction(
-            texture,
-            "pdf_position()",
-            f"is 0 on {lit.mean():.0%} of the unit square",
-            "its values there are not 0",
-            "Sample every point that is not black.",
+        yield (
+            f"pdf_position() is 0 on {lit.mean():.0%} of the unit square, but its values there are not 0. "
+            "Sample every point that is not black."
         )
 
 
@@ -213,7 +202,7 @@ _LOBES = {
 }
 
 
-def _check_bsdf(bsdf: mi.BSDF, scene, media) -> None:
+def _check_bsdf(bsdf: mi.BSDF, scene, media) -> Iterator[str]:
     ctx, si, flags = mi.BSDFContext(), _interaction(), int(bsdf.flags())
     u = np.random.default_rng(3).random((3, _COUNT))
     bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(u[1], u[2]), mi.Bool(True))
@@ -228,30 +217,24 @@ def _check_bsdf(bsdf: mi.BSDF, scene, media) -> None:
     smooth = (drawn & ~delta) | _lit(anywhere)
     for lobe, seen in zip(_LOBES, (drawn & delta, smooth, back, through), strict=True):
         if seen.mean() > _OFF and not flags & int(_LOBES[lobe]):
-            raise _contradiction(
-                bsdf,
-                "flags()",
-                f"states no {lobe.split(' ', 1)[1]} lobe",
-                f"sample() or eval() has {lobe} one",
-                "Set m_flags, and m_components for each lobe.",
+            yield (
+                f"flags() states no {lobe.split(' ', 1)[1]} lobe, but sample() or eval() has {lobe} one. Set "
+                "m_flags, and m_components for each lobe."
             )
     black = drawn & ~delta & _known(wo) & _known(value) & _known(pdf) & ~_lit(value) & ~_lit(pdf)
     if black.mean() > _OFF:
-        raise _contradiction(
-            bsdf,
-            "sample()",
-            "returns sampled_type of a diffuse or glossy lobe",
-            "eval() and pdf() are 0 in the directions that it draws",
-            "Return the type of a delta lobe, or implement eval() and pdf().",
+        yield (
+            "sample() returns sampled_type of a diffuse or glossy lobe, but eval() and pdf() are 0 in the "
+            "directions that it draws. Return the type of a delta lobe, or implement eval() and pdf()."
         )
-    _check_null(bsdf, si, kind, drawn, flags, media)
+    yield from _check_null(bsdf, si, kind, drawn, flags, media)
 
 
 def _known(value) -> np.ndarray:
     return np.asarray(np.isfinite(_numbers(value)).all(0))
 
 
-def _check_null(bsdf, si, kind, drawn, flags: int, media: bool) -> None:
+def _check_null(bsdf, si, kind, drawn, flags: int, media: bool) -> Iterator[str]:
     """Check ``eval_null_transmission`` against the flag ``Null`` in scenes with media."""
     if not media:
         return
@@ -259,27 +242,21 @@ def _check_null(bsdf, si, kind, drawn, flags: int, media: bool) -> None:
     null = int(mi.BSDFFlags.Null)
     stated = bool(flags & null)
     if passes and not stated:
-        raise _contradiction(
-            bsdf,
-            "flags()",
-            "states no null lobe",
-            "eval_null_transmission() lets light pass",
-            "Set mi.BSDFFlags.Null in m_flags and m_components.",
+        yield (
+            "flags() states no null lobe, but eval_null_transmission() lets light pass. Set "
+            "mi.BSDFFlags.Null in m_flags and m_components."
         )
     if not passes and (drawn & ((kind & null) != 0)).any():
-        raise _contradiction(
-            bsdf,
-            "eval_null_transmission()",
-            "returns 0 (the default)",
-            "sample() lets light pass as a null event",
-            "Implement it: what a surface lets pass straight on.",
+        yield (
+            "eval_null_transmission() returns 0 (the default), but sample() lets light pass as a null "
+            "event. Implement it: what a surface lets pass straight on."
         )
 
 
 # -- emitters ---------------------------------------------------------------------------------
 
 
-def _check_emitter(emitter: mi.Emitter, scene, media) -> None:
+def _check_emitter(emitter: mi.Emitter, scene, media) -> Iterator[str]:
     it = dr.zeros(mi.Interaction3f, _COUNT)
     it.p, it.wavelengths = _places(scene), _wavelengths()
     ds, weight = emitter.sample_direction(it, spread_points(_COUNT), mi.Bool(True))
@@ -289,12 +266,9 @@ def _check_emitter(emitter: mi.Emitter, scene, media) -> None:
     delta, flags = mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta), emitter.flags()
     sampled_delta = np.broadcast_to(np.array(ds.delta), _COUNT) & drawn
     if sampled_delta.any() and not delta:
-        raise _contradiction(
-            emitter,
-            "flags()",
-            "states neither DeltaPosition nor DeltaDirection",
-            "sample_direction() returns samples that are delta",
-            "Set m_flags, or ds.delta to False.",
+        yield (
+            "flags() states neither DeltaPosition nor DeltaDirection, but sample_direction() returns "
+            "samples that are delta. Set m_flags, or ds.delta to False."
         )
     infinite = mi.has_flag(flags, mi.EmitterFlags.Infinite)
     if not infinite and emitter.get_shape() is None:
@@ -302,29 +276,20 @@ def _check_emitter(emitter: mi.Emitter, scene, media) -> None:
     radiance = emitter.eval(_hit(it, ds, infinite), mi.Bool(True))
     if delta:
         if (_lit(radiance) & drawn).mean() > _OFF:
-            raise _contradiction(
-                emitter,
-                "flags()",
-                "states DeltaPosition or DeltaDirection",
-                "eval() returns radiance for rays that hit it",
-                "Set other m_flags, or let eval() return 0.",
+            yield (
+                "flags() states DeltaPosition or DeltaDirection, but eval() returns radiance for rays that "
+                "hit it. Set other m_flags, or let eval() return 0."
             )
         return
     if _differ(emitter.pdf_direction(it, ds, mi.Bool(True)), ds.pdf, drawn):
-        raise _contradiction(
-            emitter,
-            "pdf_direction()",
-            "is not the density ds.pdf that sample_direction() returns",
-            "both are the density over solid angle",
-            "Return the same number.",
+        yield (
+            "pdf_direction() is not the density ds.pdf that sample_direction() returns, but both are the "
+            "density over solid angle. Return the same number."
         )
     if _differ(radiance, weight * ds.pdf, drawn):
-        raise _contradiction(
-            emitter,
-            "eval()",
-            "is not what sample_direction() returns, times its density",
-            "both are the emitted radiance",
-            "Return the radiance over ds.pdf from sample_direction().",
+        yield (
+            "eval() is not what sample_direction() returns, times its density, but both are the emitted "
+            "radiance. Return the radiance over ds.pdf from sample_direction()."
         )
 
 
@@ -350,23 +315,20 @@ def _volume_vertices(scene) -> mi.MediumInteraction3f:
     return mei
 
 
-def _check_phase(phase: mi.PhaseFunction, scene, media) -> None:
+def _check_phase(phase: mi.PhaseFunction, scene, media) -> Iterator[str]:
     mei, ctx = _volume_vertices(scene), mi.PhaseFunctionContext(None)
     u = np.random.default_rng(6).random((3, _COUNT))
     wo, weight, pdf = phase.sample(ctx, mei, mi.Float(u[0]), mi.Point2f(u[1], u[2]), mi.Bool(True))
     value, stated = phase.eval_pdf(ctx, mei, wo, mi.Bool(True))
     drawn = _lit(weight) & (_numbers(pdf) > 0).all(0)
     if _differ(pdf, stated, drawn) or _differ(weight * pdf, value, drawn):
-        raise _contradiction(
-            phase,
-            "eval_pdf()",
-            "is not what sample() returns in the directions that it draws",
-            "value and density of a direction are one",
-            "Return value / density and the same density from sample().",
+        yield (
+            "eval_pdf() is not what sample() returns in the directions that it draws, but value and density "
+            "of a direction are one. Return value / density and the same density from sample()."
         )
 
 
-def _check_medium(medium: mi.Medium, scene, media) -> None:
+def _check_medium(medium: mi.Medium, scene, media) -> Iterator[str]:
     mei = _volume_vertices(scene)
     _, _, sigma_t = medium.get_scattering_coefficients(mei, mi.Bool(True))
     majorant, sigma_t = _numbers(medium.get_majorant(mei, mi.Bool(True))), _numbers(sigma_t)
@@ -374,24 +336,18 @@ def _check_medium(medium: mi.Medium, scene, media) -> None:
         varies = (np.ptp(sigma_t, axis=1) > 1e-5 * np.abs(sigma_t).max()).any()
         above = (sigma_t > majorant * (1 + 1e-4)).any(0).mean()
     if medium.is_homogeneous() and varies:
-        raise _contradiction(
-            medium,
-            "is_homogeneous()",
-            "returns True",
-            "get_scattering_coefficients() differs from place to place",
-            "Let it return False, and get_majorant() the largest extinction.",
+        yield (
+            "is_homogeneous() returns True, but get_scattering_coefficients() differs from place to place. "
+            "Let it return False, and get_majorant() the largest extinction."
         )
     if above > 0:
-        raise _contradiction(
-            medium,
-            "get_majorant()",
-            f"is less than the extinction at {above:.0%} of the points asked",
-            "flights take it for the largest",
-            "Return the largest extinction.",
+        yield (
+            f"get_majorant() is less than the extinction at {above:.0%} of the points asked, but flights "
+            "take it for the largest. Return the largest extinction."
         )
 
 
-_CHECKS: dict[str, Callable] = {
+_CHECKS: dict[str, Callable[..., Iterator[str]]] = {
     "BSDF": _check_bsdf,
     "Texture": _check_texture,
     "Emitter": _check_emitter,
