@@ -35,8 +35,8 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import drjit as dr  # isort: skip
 import mitsuba as mi
 import repository
+from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.host.jit import evaluated_mode
-from mitsuba_bdpt.host.versions import versions
 from mitsuba_bdpt.image.accumulator import Accumulator
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.run import schedule

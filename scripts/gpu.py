@@ -28,7 +28,7 @@ import ablation
 import numpy as np
 import repository
 from mitsuba_bdpt.cli.values import number
-from mitsuba_bdpt.host.versions import versions
+from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
 from mitsuba_bdpt.measure.efficiency import equal_time_speedup
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse

@@ -422,14 +422,14 @@ MUTANTS = (
     ),
     Mutant(
         "film: the filter's taps begin a pixel early",
-        "image/block.py",
+        "image/accumulator.py",
         "first = mi.Point2i(dr.ceil(at - radius))",
         "first = mi.Point2i(dr.floor(at - radius))",
         ("tests/image/test_films.py::test_bands_are_known[gaussian crop]",),
     ),
     Mutant(
         "film: weights of the filter in one direction",
-        "image/block.py",
+        "image/accumulator.py",
         "weight = self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)",
         "weight = self._rfilter.eval(distance.x)",
         ("tests/image/test_films.py::test_bands_are_known[gaussian crop]",),
@@ -654,7 +654,7 @@ MUTANTS = (
     ),
     Mutant(
         "polarized: Stokes vectors of an upright sensor",
-        "image/stokes.py",
+        "image/colour.py",
         "world_transform(sensor) @ mi.Vector3f(0, 1, 0)",
         "mi.Vector3f(0, 1, 0)",
         ("tests/images/test_polarized.py::test_stokes_vectors_are_mitsubas[rough metal and plastic]",),
@@ -1455,7 +1455,7 @@ MUTANTS = (
     ),
     Mutant(
         "scale: projectors are asked at one unit of length",
-        "emitters/projectors.py",
+        "emitters/position.py",
         "far = (1 + np.abs(matrix[:3, 3]).max()) / np.linalg.norm(matrix[:3, 2])",
         "far = 1.0",
         ("tests/emitters/test_scales.py::test_lamps_of_any_size[at a point]",),

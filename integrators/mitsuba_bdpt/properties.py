@@ -15,9 +15,8 @@ from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
 from .image import denoising, features, film_limits
 from .image.accumulator import Channels
-from .image.colour import Bands, film_colours
+from .image.colour import POLARIZED, Bands, film_colours
 from .image.layers import layer_names
-from .image.stokes import POLARIZED
 from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 

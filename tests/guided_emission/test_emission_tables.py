@@ -15,7 +15,7 @@ import scene_parts as parts
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.errors import UsageError
-from mitsuba_bdpt.geometry.flat import is_flat
+from mitsuba_bdpt.geometry.smooth_meshes import is_flat
 from mitsuba_bdpt.guided_emission.tables import MOST_CELLS, SIDES, Cells, EmissionTables, side_of
 from mitsuba_bdpt.host.jit import evaluated_mode
 from scipy import stats

@@ -15,7 +15,8 @@ import variants
 import views
 import welch as st
 from mitsuba_bdpt.geometry import polarization
-from mitsuba_bdpt.image import sink, stokes
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.image.colour import STOKES_NAMES
 from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
@@ -426,8 +427,8 @@ def test_the_first_layer_is_the_image(rfilter):
     method = bdpt(max_depth=4, skip="none", aovs="dd:depth", layers="stokes,variance")
     scene = room(floor(ROUGH), ball({"type": "dielectric"}), sensor=camera)
     image = np.array(method.render(scene, spp=8, seed=0))
-    assert method.aov_names()[:13] == [*stokes.NAMES, "dd.T"]
-    assert mi.load_dict({"type": "stokes", "nested": {"type": "path"}}).aov_names() == list(stokes.NAMES)
+    assert method.aov_names()[:13] == [*STOKES_NAMES, "dd.T"]
+    assert mi.load_dict({"type": "stokes", "nested": {"type": "path"}}).aov_names() == list(STOKES_NAMES)
     colours = image.shape[2] - len(method.aov_names())
     np.testing.assert_allclose(image[..., colours], image[..., 0], rtol=1e-5)
     # Physical: no vector is longer than its intensity.

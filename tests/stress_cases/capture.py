@@ -16,7 +16,7 @@ from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.infinite import SKY_BINS
 from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.geometry import rays
-from mitsuba_bdpt.geometry.flat import is_flat
+from mitsuba_bdpt.geometry.smooth_meshes import is_flat
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points, Purpose
 from mitsuba_bdpt.transport import bsdf, kernel, techniques

@@ -17,7 +17,7 @@ from ..errors import CommandError
 from ..files.images import attribute
 from ..files.loading import named_files, parsed, searching
 from ..files.whole import check_writable, replacing
-from ..host.versions import versions
+from ..host.introspection import versions
 from ..run.snapshot import Snapshot, read
 
 BEGIN_ANEW = "begin anew by --resume never"

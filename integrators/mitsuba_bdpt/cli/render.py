@@ -22,7 +22,7 @@ from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
 from ..host import memory
-from ..host.versions import versions
+from ..host.introspection import versions
 from ..progress import Report, display, readable
 from ..run.rendering import PassReport
 from . import checkpoints, cluster

@@ -7,9 +7,9 @@ points made by other strategies. Emission is therefore sampled here, on top of t
 ``sample_direction``, ``pdf_direction``, ``eval`` and the shapes' ``sample_position``.
 `geometry.mitsubas_choices` lists replacements where these are wrong too.
 
-`emitters.Emitters` selects an emitter and dispatches to its group (`group.Group`: area, directional area,
-position, infinite, hit-only, third-party), one module each. A new kind of emitter is such a module, or a line
-in an existing one, and a line in `kinds.KINDS`.
+`emitters.Emitters` selects an emitter and dispatches to its group (a `group.Group`, of the modules area,
+directional_area, position and infinite; hit-only in group, user-defined classes in kinds). A new kind of
+emitter is such a module, or a line in an existing one, and a line in `kinds.KINDS`.
 
 The density of an emission has two factors:
 

@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError, UsageError
 from ..geometry.boxes import scene_box
-from ..geometry.flat import is_flat
 from ..geometry.mitsubas_choices import (
     TEXTURE_SAMPLED,
     check_densities,
@@ -19,10 +18,10 @@ from ..geometry.mitsubas_choices import (
     is_textured,
 )
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
+from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import children, named, number, own_parameters
-from .group import Context, Group, weight_over
-from .hit_only import HitOnlyEmitters
+from .group import Context, Group, HitOnlyEmitters, weight_over
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .surfaces import Surfaces, spheres_of
 from .tables import Mask, look_up, rows, table

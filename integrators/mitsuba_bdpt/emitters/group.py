@@ -137,6 +137,24 @@ class Group:
         raise NotImplementedError(f"{type(self).__name__} has no hit_densities")
 
 
+class HitOnlyEmitters(Group):
+    """Area lights that camera subpaths can hit, and no other strategy.
+
+    They are on shapes of which Mitsuba samples no points, or their radiance needs a hit (mesh attributes).
+    Emission and next-event estimation may select them, by their sampling weight: the sample is black.
+    """
+
+    hittable = True
+    supports_next_event = supports_emission = connectible_to_sensor = False
+    limits = "no points of it with a known radiance can be sampled; it can only be hit"
+
+    def __init__(self, emitters, context: Context):
+        pass
+
+    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+        return mi.Float(0), mi.Float(0), mi.Float(0)
+
+
 def emitting_point(p, shared):
     """Interaction at the point ``p`` off surfaces; time and wavelengths of ``shared``."""
     si = dr.zeros(mi.SurfaceInteraction3f)

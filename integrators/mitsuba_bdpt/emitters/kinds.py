@@ -1,15 +1,65 @@
-"""Maps the ``class_name()`` of an emitter to its group."""
+"""Maps the ``class_name()`` of an emitter to its group; the group of user-defined classes."""
 
 from __future__ import annotations
 
+import drjit as dr
+import mitsuba as mi
+
+from ..geometry import rays
 from ..host.jit import registered_emitters
 from .area import AreaEmitters
 from .directional_area import DirectionalAreaEmitters
-from .group import Group
-from .hit_only import HitOnlyEmitters
+from .group import Context, Group, HitOnlyEmitters, weight_over
 from .infinite import InfiniteEmitters
 from .position import PositionEmitters
-from .third_party import ThirdPartyEmitters
+from .records import Chosen, Direct, Hit
+
+
+class ThirdPartyEmitters(Group):
+    """Emitters of user-defined classes: only calls that camera subpaths need are used.
+
+    No light subpath starts from them. Their density gets the normal of Mitsuba's ``DirectionSample3f``, not
+    the geometric one.
+    """
+
+    supports_emission = connectible_to_sensor = False
+    limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"
+
+    @classmethod
+    def left_out(cls, emitter) -> list[tuple[str, str]]:
+        return [(what, f"{why} ({emitter.class_name()})") for what, why in super().left_out(emitter)]
+
+    @classmethod
+    def is_hittable(cls, emitter) -> bool:
+        return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)
+
+    def __init__(self, emitters, context: Context):
+        on_shapes = any(emitter.get_shape() is not None for emitter in filter(None, emitters))
+        self._shape_errors = context.shape_errors if on_shapes else None
+
+    def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
+        flags = chosen.emitter.flags()
+        delta = mi.has_flag(flags, mi.EmitterFlags.Delta) | ds.delta
+        n = dr.select(mi.has_flag(flags, mi.EmitterFlags.Surface), ds.n, 0)
+        errors = None
+        if self._shape_errors is not None:
+            errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
+        return Direct(
+            weight=weight_over(chosen.pmf, weight, ds.pdf),
+            pdf_w=dr.select(delta, 1, ds.pdf) * chosen.pmf,
+            d=ds.d,
+            anchor=rays.sampled_anchor(ds.p, n, errors),
+            infinite=mi.has_flag(flags, mi.EmitterFlags.Infinite),
+            delta=delta,
+            emission_ratio=mi.Float(0),
+        )
+
+    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+        ds = hit.direction()
+        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
+        connect = dr.select(hit.si.is_valid(), pdf_w * hit.to_area(ds), pdf_w)
+        return connect, mi.Float(0), mi.Float(0)
+
 
 KINDS: dict[str, type[Group]] = {
     "AreaLight": AreaEmitters,

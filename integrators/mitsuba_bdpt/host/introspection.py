@@ -1,7 +1,8 @@
-"""Children and parameters of Mitsuba's objects."""
+"""Children and parameters of Mitsuba's objects; versions of the software."""
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Iterable
 from functools import cache
 
@@ -9,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .._version import __version__
 from . import renamed
 
 
@@ -165,3 +167,12 @@ def _sides(shape: mi.Shape) -> tuple:
 def registry_id(medium: mi.Medium) -> int:
     """Index of a medium in Dr.Jit's registry."""
     return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, Mitsuba, Dr.Jit and LLVM."""
+    found = {"mitsuba-bdpt": __version__}
+    found |= {name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")}
+    if "llvm" in mi.variant():
+        found["LLVM"] = ".".join(map(str, dr.detail.llvm_version()))
+    return found

@@ -1,4 +1,4 @@
-"""Conversion of spectra to the film's colours: linear sRGB or bands.
+"""Conversion of spectra to the film's colours: linear sRGB or bands; Stokes vectors.
 
 An object of these classes belongs to one render. It is called with a spectrum (multiplied by the weight of
 its wavelengths) and the wavelengths that the sensor sampled.
@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UnsupportedError
-from ..host.introspection import children, named
-from .stokes import Stokes
+from ..geometry.polarization import basis
+from ..host.introspection import children, named, world_transform
 
 # Wavelengths at which a film's response to a spectrum of 1 is evaluated.
 RESPONSE_SAMPLES = 4096
@@ -102,3 +102,33 @@ class Bands:
 def _band_names(film) -> list[str]:
     """Return the names of the bands in the film's order."""
     return [name for name, value in children(film).items() if isinstance(value, mi.Texture)]
+
+
+STOKES_NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")
+"""Of the layers."""
+
+POLARIZED = 9
+"""Numbers of a sample besides its colours, which are the intensity S0: S1, S2 and S3 in linear sRGB."""
+
+
+class Stokes:
+    """Stokes vectors of samples, in the frame of a ``sensor`` with horizontal x axis.
+
+    S1 > 0: horizontal; S2 > 0: +45 degrees; S3 > 0: right circular polarization.
+    """
+
+    def __init__(self, sensor: mi.Sensor, rgb):
+        self._vertical = world_transform(sensor) @ mi.Vector3f(0, 1, 0)
+        dr.make_opaque(self._vertical)
+        self._rgb = rgb
+
+    def __call__(self, value: mi.Spectrum, wavelengths, towards: mi.Vector3f) -> list[mi.Float]:
+        """Return S1, S2 and S3 of light that travels along ``towards`` to the sensor.
+
+        The first column of the Mueller matrix ``value`` is the Stokes vector in the frame
+        `polarization.basis`.
+        """
+        target = dr.cross(-towards, self._vertical)
+        turned = mi.mueller.rotate_stokes_basis(towards, basis(towards), target)
+        vector = [sum(turned[i, j] * value[j, 0] for j in range(1, 4)) for i in range(1, 4)]
+        return [number for entry in vector for number in self._rgb(entry, wavelengths)]

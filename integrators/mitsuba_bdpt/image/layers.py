@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from . import stokes as stokes_layers
+from .colour import STOKES_NAMES
 
 # Layers of the denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
@@ -46,7 +46,7 @@ def layer_names(
     Layers of ``stokes``, ``features``, ``denoise``, the variance of ``colours``, and strategy images of paths
     of up to ``depth`` edges, with one of all ``merges`` if true.
     """
-    names = [*(stokes_layers.NAMES if stokes else ()), *features, *(DENOISED if denoise else ())]
+    names = [*(STOKES_NAMES if stokes else ()), *features, *(DENOISED if denoise else ())]
     names += [f"variance.{colour}" for colour in colours if variance]
     of_strategies = [f"s{s}t{t}" for _, s, t in strategies(depth)] + ["merged"] * merges
     return names + [

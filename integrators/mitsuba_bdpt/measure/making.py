@@ -31,7 +31,7 @@ import numpy as np
 from ..errors import CommandError, message
 from ..files.texts import read_toml, table_of
 from ..files.whole import check_writable
-from ..host.versions import versions
+from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means
 from .efficiency import REFERENCE_SHARE

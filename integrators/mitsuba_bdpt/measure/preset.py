@@ -48,7 +48,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
-from ..host.versions import versions
+from ..host.introspection import versions
 from . import probes
 from .agreement import TILES
 from .project import Project, depth_in
