@@ -254,30 +254,6 @@ def test_an_hour_a_night():
     assert 0 < first < second == rendered.image("a.exr")[1]["spp"]
 
 
-def test_a_better_image_is_kept(capsys):
-    """Rationale: a checkpoint that --time has left may lie beside an image of more samples, of another run.
-
-    Expected: a resumed render that ends before it has as many keeps image and PNG, says so and goes on with
-    its checkpoint; it replaces them when it is finished, or if they are of another scene.
-    """
-    arguments = [*ARGUMENTS, "-P", "skip=impossible", "-P", "max_depth=3", "--spp", "8", "-o", "a.exr"]
-    timed = ["--time", "0", "--checkpoint", "60", "--preview", "0"]
-    assert main([*arguments, *timed]) == 0
-    assert main(arguments) == 0
-    better, png = Path("a.exr").read_bytes(), Path("a.png").read_bytes()
-    for spp in (2, 3):
-        assert main([*arguments, *timed, "--resume"]) == 0
-        assert "a.exr is kept: it has 8 samples per pixel" in capsys.readouterr().err
-        assert read(Path("a.checkpoint.npz")).spp == spp
-        assert (Path("a.exr").read_bytes(), Path("a.png").read_bytes()) == (better, png)
-    assert main([*arguments, "--checkpoint", "60", "--resume"]) == 0
-    assert Path("a.exr").read_bytes() != better and not Path("a.checkpoint.npz").exists()
-    assert main([*arguments, "-D", "resolution=8"]) == 0
-    assert main([*arguments, *timed]) == 0
-    assert main([*arguments, *timed, "--resume"]) == 0
-    assert rendered.image("a.exr")[1]["spp"] == 2
-
-
 def test_a_full_disk_does_not_cost_the_render(monkeypatch, capsys):
     def full(number):
         raise OSError(28, "No space left on device")

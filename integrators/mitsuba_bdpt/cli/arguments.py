@@ -27,7 +27,7 @@ from .values import crop, definition, frames, number, property_, resume, size
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> int | None:
     """Run a command line (default: the process's own) and return its exit status."""
     parser = build_parser()
     options = parser.parse_args(arguments)

@@ -23,8 +23,8 @@ from ..run.snapshot import Snapshot, read
 BEGIN_ANEW = "begin anew by --resume never"
 """What to do about a checkpoint that is of no use."""
 
-CONTENT = "bdptContent"
-"""Attribute of images beside checkpoints: `content`."""
+IDENTITY = "bdptIdentity"
+"""Attribute of finished images of renders with checkpoints: `identity`."""
 
 
 def path_of(output: Path) -> Path:
@@ -48,33 +48,18 @@ def digest(options: Namespace) -> str:
     return found.hexdigest()
 
 
-def content(options: Namespace) -> str:
-    """Hash what determines the expected image of a command line."""
-    names = "variant", "integrator", "properties", "denoise", "exposure"
-    return _hash([digest(options), versions(), *(getattr(options, name) for name in names)])
-
-
 def identity(options: Namespace, spp: int) -> str:
     """Hash what determines the image of a command line with ``spp`` samples per pixel."""
-    return _hash([content(options), spp, options.seed, options.time, options.target_error])
-
-
-def _hash(values: list) -> str:
+    names = "variant", "integrator", "properties", "denoise", "exposure", "seed", "time", "target_error"
+    values = [digest(options), versions(), spp, *(getattr(options, name) for name in names)]
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
-def attributes(options: Namespace, output: Path) -> dict[str, str]:
-    """Return header attributes of an image whose render can be resumed."""
-    is_needed = options.checkpoint is not None or path_of(output).exists()
-    return {CONTENT: content(options)} if is_needed else {}
-
-
-def samples_of_image(options: Namespace, output: Path) -> int:
-    """Return samples per pixel of the existing image; 0 if it has other content."""
-    is_resumed = options.checkpoint is not None and options.resume != "never" and path_of(output).exists()
-    if not is_resumed or attribute(output, CONTENT) != content(options):
-        return 0
-    return int(json.loads(attribute(output, "bdptStatistics") or "{}").get("spp", 0))
+def is_done(options: Namespace, output: Path, spp: int) -> bool:
+    """Return whether an earlier run of this command with checkpoints made the frame's image."""
+    if options.frames is None or options.checkpoint is None or options.resume == "never":
+        return False
+    return attribute(output, IDENTITY) == identity(options, spp)
 
 
 def check(options: Namespace, output: Path) -> None:

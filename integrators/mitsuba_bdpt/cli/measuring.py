@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import importlib.util
-import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
@@ -22,19 +21,15 @@ NEEDED = ("colour", "flip_evaluator", "matplotlib", "pyarrow", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Namespace) -> int | None:
     """Run a subcommand and return its exit status."""
-    try:
-        return mistakes.answered(lambda: _run(arguments))
-    except KeyboardInterrupt:
-        print("interrupted; what was finished is kept", file=sys.stderr)
-        return mistakes.INTERRUPTED
 
+    def measured() -> int:
+        check_installed(arguments.command)
+        *_, module = COMMANDS[arguments.command]
+        return importlib.import_module(f"..measure.{module}", __package__).run(arguments)
 
-def _run(arguments: Namespace) -> int:
-    check_installed(arguments.command)
-    *_, module = COMMANDS[arguments.command]
-    return importlib.import_module(f"..measure.{module}", __package__).run(arguments)
+    return mistakes.answered(measured, "interrupted; what was finished is kept")
 
 
 def check_installed(command: str) -> None:

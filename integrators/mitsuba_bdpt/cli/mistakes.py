@@ -22,7 +22,6 @@ import errno
 import re
 import sys
 from collections.abc import Callable
-from typing import TypeVar
 
 from ..errors import FailureError, UnsupportedError, UsageError, behind, chain, message
 
@@ -46,18 +45,17 @@ STATUSES = (
 )
 """What ``--help`` says of them."""
 
-Status = TypeVar("Status", int, int | None)
-
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
 
-def answered(main: Callable[[], Status]) -> Status | int:
-    """Return the exit status of ``main``; prints its error, if any."""
+def answered(main: Callable[[], int | None], interrupted: str = "interrupted") -> int | None:
+    """Return the exit status of ``main``; prints its error, if any, or ``interrupted``."""
     try:
         return main()
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
         if behind(error, KeyboardInterrupt) is not None:
-            raise KeyboardInterrupt from error
+            print(interrupted, file=sys.stderr)
+            return INTERRUPTED
         status = status_of(error)
         if status is None:
             raise
@@ -83,7 +81,7 @@ PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, er
 """Errors of the system about a path that the user gave."""
 
 
-def in_words(error: Exception) -> str:
+def in_words(error: BaseException) -> str:
     """Describe the error; for system errors, with the file and a remedy."""
     if (lacking := of_memory(error)) is not None:
         return f"not enough memory ({message(lacking) or 'no more was given'}); {MEMORY_REMEDY}"
@@ -110,7 +108,7 @@ def of_memory(error: BaseException) -> BaseException | None:
     return next(filter(is_lack, chain(error)), None)
 
 
-def status_of(error: Exception) -> int | None:
+def status_of(error: BaseException) -> int | None:
     """Return the exit status after an ``error``, see above; None for a bug."""
     if is_mistake(error):
         return USAGE
@@ -118,7 +116,7 @@ def status_of(error: Exception) -> int | None:
     return FAILURE if failed else None
 
 
-def is_mistake(error: Exception) -> bool:
+def is_mistake(error: BaseException) -> bool:
     """Return whether ``error`` is a usage error, see above."""
     if isinstance(error, OSError):
         return error.errno in PATHS

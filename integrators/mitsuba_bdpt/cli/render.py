@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError, behind
-from ..files.images import attribute, check_channels, check_png, prepare_output, write_images, write_png
+from ..files.images import check_channels, check_png, prepare_output, write_images, write_png
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
@@ -39,10 +39,6 @@ SETS = {"time": "timeout", "target_error": "target_error"}
 """The integrator's parameter that an option sets, see `loading.load`."""
 
 
-IDENTITY = "bdptIdentity"
-"""Attribute of images that are finished: what has determined them."""
-
-
 @dataclass
 class Outcome:
     """Result of a finished or interrupted render, beside the film."""
@@ -50,8 +46,6 @@ class Outcome:
     seconds: float
     spp: int
     interrupted: bool = False
-    finished: bool = True
-    """Whether it has all samples, or the error, that it was to have; with checkpoints only."""
     statistics: dict = field(default_factory=dict)
     error: Exception | None = None
     """What has ended it before its end, if something else than a signal has."""
@@ -59,14 +53,11 @@ class Outcome:
     """To be called when the image is written."""
 
 
-def run(options: Namespace) -> int:
+def run(options: Namespace) -> int | None:
     """Render as the command-line `options` request; returns the exit status."""
     with terminable() as ending:
-        try:
-            return answered(lambda: _run(options, ending))
-        except KeyboardInterrupt:
-            print("interrupted; no image written", file=sys.stderr)
-            return ending.status
+        status = answered(lambda: _run(options, ending), "interrupted; no image written")
+    return ending.status if status == INTERRUPTED else status
 
 
 def _run(options: Namespace, ending: Ending) -> int:
@@ -117,13 +108,6 @@ def jobs_of(options: Namespace) -> list[Namespace]:
     return [of_frame(number) for number in dict.fromkeys(options.frames)]
 
 
-def is_done(job: Namespace, spp: int) -> bool:
-    """Return whether an earlier run of this command with checkpoints made the image."""
-    if job.frames is None or job.checkpoint is None or job.resume == "never":
-        return False
-    return attribute(job.output, IDENTITY) == checkpoints.identity(job, spp)
-
-
 def loaded(options: Namespace) -> Loaded:
     """Like `load`; also sets the memory limit and number of threads of the process."""
     memory.set_limit(options.memory and options.memory * 2**30)
@@ -143,15 +127,13 @@ def loaded(options: Namespace) -> Loaded:
 def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, ending: Ending) -> bool:
     """Render and write one image; returns whether it was completed.
 
-    Writing ignores signals, and the checkpoint is removed afterwards. A resumed render that ends early does
-    not replace an image with more samples.
+    Writing ignores signals, and the checkpoint is removed afterwards.
     """
     sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
-    if is_done(job, spp):
+    if checkpoints.is_done(job, job.output, spp):
         say(f"{job.output}: rendered before by the same command")
         return True
-    least = checkpoints.samples_of_image(job, job.output)
-    outcome = render(scene, integrator, job, spp, least)
+    outcome = render(scene, integrator, job, spp)
     ending.patient = True
     try:
         if outcome.interrupted and not outcome.spp:
@@ -159,14 +141,9 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
             return False
         found = report(outcome)
         attributes = {"bdptSettings": json.dumps(settings(job, spp)), "bdptStatistics": json.dumps(found)}
-        attributes |= checkpoints.attributes(job, job.output)
         if job.checkpoint is not None and not outcome.interrupted:
-            attributes[IDENTITY] = checkpoints.identity(job, spp)
-        if outcome.finished or outcome.spp >= least:
-            write(sensor.film(), job, attributes)
-        else:
-            why = f"it has {least} samples per pixel, the checkpoint of the resumed render {outcome.spp}"
-            print(f"warning: {job.output} is kept: {why}", file=sys.stderr)
+            attributes[checkpoints.IDENTITY] = checkpoints.identity(job, spp)
+        write(sensor.film(), job, attributes)
         if job.statistics is not None:
             write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
@@ -221,21 +198,16 @@ def say(line: str) -> None:
             print(f"warning: standard output: {error}", file=sys.stderr)
 
 
-def explain(options: Namespace) -> int:
+def explain(options: Namespace) -> int | None:
     """Print what such a render would do; returns the exit status."""
-    try:
-        return answered(lambda: _explain(options))
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
 
+    def explained() -> int:
+        scene, integrator, _ = loaded(options)
+        sensor = choose_sensor(scene, options.sensor)
+        say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
+        return 0
 
-def _explain(options: Namespace) -> int:
-    """Print the report of `explain`; raises errors."""
-    scene, integrator, _ = loaded(options)
-    sensor = choose_sensor(scene, options.sensor)
-    say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
-    return 0
+    return answered(explained)
 
 
 def check_options(options: Namespace) -> None:
@@ -273,12 +245,10 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
         cluster.check_settings(integrator.settings)
 
 
-def render(
-    scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int, least: int = 0
-) -> Outcome:
-    """Render into the sensor's film, with progress; ``least``: see `Preview`."""
+def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
+    """Render into the sensor's film, with progress."""
     film = choose_sensor(scene, options.sensor).film()
-    watchers = [] if options.preview is None else [Preview(options, film, least)]
+    watchers = [] if options.preview is None else [Preview(options, film)]
     if options.scheduler is None:
         if options.time is not None and not hasattr(integrator, "on_pass"):
             return render_repeatedly(scene, integrator, options, spp)
@@ -298,14 +268,14 @@ def render(
 class Preview:
     """Rewrites the PNG with the image so far, after the first pass and then at intervals.
 
-    From ``least`` samples per pixel on; a full disk does not end the render.
+    A full disk does not end the render.
     """
 
-    def __init__(self, job: Namespace, film: mi.Film, least: int):
-        self._job, self._film, self._least, self._last = job, film, least, -math.inf
+    def __init__(self, job: Namespace, film: mi.Film):
+        self._job, self._film, self._last = job, film, -math.inf
 
     def __call__(self, report: PassReport) -> None:
-        if report.spp_done < self._least or time.monotonic() - self._last < self._job.preview:
+        if time.monotonic() - self._last < self._job.preview:
             return
         report.image()
         path = self._job.output.with_suffix(".png")
@@ -362,9 +332,8 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics=statistics)
     if kept is not None:
         whole = done == spp or reached(target_error_of(integrator), statistics)
-        outcome.finished = not interrupted and whole
         # A finished render keeps it until the image is written.
-        if outcome.finished:
+        if whole and not interrupted:
             outcome.written = kept.remove
         else:
             kept.write()
