@@ -7,7 +7,7 @@ import socket
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from typing import Any
@@ -87,56 +87,41 @@ def results(cluster: Cluster, function, arguments):
     that a slow machine does not delay the end; results must not depend on the worker. Calls of a lost worker
     move to another one; calls of a lost scheduler are repeated by the next.
     """
+    left = dict(enumerate(arguments))
+    while left:
+        try:
+            yield from _computed(cluster.client, function, left)
+        except _gone():
+            cluster.reconnect()
+
+
+def _computed(client, function, left):
+    """Like `results`, of the calls in ``left``, from which it removes what was yielded."""
     from distributed import as_completed
 
-    to_do, running, done = deque(range(len(arguments))), {}, set()
-    pending = as_completed()
-
-    def submit(index):
-        future = cluster.client.submit(function, *arguments[index], pure=False)
-        running[future] = index
-        pending.add(future)
+    running, pending = {}, as_completed()
 
     def fill():
-        workers = max(1, worker_count(cluster.client))  # may be 0 for a moment
-        while len(running) < workers and to_do:
-            submit(to_do.popleft())
-        for index in [i for i in running.values() if i not in done]:
-            if len(running) < workers and list(running.values()).count(index) == 1:
-                submit(index)
-
-    def recover():
-        nonlocal pending
-        cluster.reconnect()
-        to_do.extendleft(sorted({i for i in running.values() if i not in done}, reverse=True))
-        running.clear()
-        pending = as_completed()
-        fill()
+        workers, times = max(1, worker_count(client)), Counter(running.values())  # may be 0 for a moment
+        for index in sorted(left, key=times.__getitem__):  # those that run nowhere first
+            if len(running) < workers and times[index] < 2:
+                future = client.submit(function, *left[index], pure=False)
+                running[future] = index
+                pending.add(future)
 
     try:
         fill()
-        while len(done) < len(arguments):
+        while left:
             future = next(pending)
-            index, found = running[future], None
-            try:
-                if future.cancelled():  # not by this function
-                    raise CancelledError
-                if index not in done:
-                    found = _result(future, index)
-            except _gone():
-                recover()
-                continue
-            del running[future]
-            if found is not None:
-                done.add(index)
+            index = running.pop(future)
+            if index in left:
+                found = _result(future, index)
+                del left[index]
                 yield index, found
-            try:
-                fill()
-            except _gone():
-                recover()
+            fill()
     finally:
         with contextlib.suppress(Exception):  # the scheduler may be gone
-            cluster.client.cancel(list(running), force=True)
+            client.cancel(list(running), force=True)
 
 
 def _gone() -> tuple[type[BaseException], ...]:

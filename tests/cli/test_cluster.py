@@ -171,9 +171,6 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
         def result(self):
             return self.value
 
-        def cancelled(self):
-            return False
-
     class Client:
         submitted = []
 

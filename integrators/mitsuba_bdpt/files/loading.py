@@ -259,26 +259,17 @@ def _films(state: mi.parser.ParserState) -> list:
 
 def _meters(state: mi.parser.ParserState) -> list:
     """Return the nodes of sensors without image: at a point, along a ray, on a shape."""
-    return [node for node in state.nodes if node.type == mi.ObjectType.Sensor and _is_meter(node)]
-
-
-def _is_meter(node: mi.parser.SceneNode) -> bool:
-    return node.props.plugin_name() in METERS
+    sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
+    return [node for node in sensors if node.props.plugin_name() in METERS]
 
 
 def _films_of_images(state: mi.parser.ParserState) -> list:
     """Return the nodes of all films but those of meters."""
-    held: set[int] = set()
-    for node in _meters(state):
-        values = [node.props[name] for name in node.props]
-        held |= {value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)}
-        named = [value.id() for value in values if isinstance(value, mi.Properties.Reference)]
-        held |= {state.id_to_index[name] for name in named if name in state.id_to_index}
-    return [
-        node
-        for index, node in enumerate(state.nodes)
-        if node.type == mi.ObjectType.Film and index not in held
-    ]
+    values = [value for node in _meters(state) for _, value in node.props.items()]
+    held = {value.index() for value in values if isinstance(value, mi.Properties.ResolvedReference)}
+    held |= {state.id_to_index.get(v.id(), -1) for v in values if isinstance(v, mi.Properties.Reference)}
+    films = ((i, node) for i, node in enumerate(state.nodes) if node.type == mi.ObjectType.Film)
+    return [node for i, node in films if i not in held]
 
 
 def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
@@ -373,16 +364,17 @@ def _in_words(error: str, options: Namespace) -> str | None:
 
     None for other errors.
     """
-    unused = [
-        name for name, _ in options.defines if re.search(rf"^  - \${re.escape(name)}=", error, re.MULTILINE)
-    ]
-    if "unused parameters" in error and unused:
+    if "unused parameters" in error:
         known = parameters(options.scene, dict(options.defines))
+        unused = [name for name, _ in options.defines if name not in known]
         named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
         text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
         return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
-    if rejected := _rejected(error, options):
-        return rejected
+    if re.search("could not parse|is out of", error):
+        given = [
+            f"-D {k}={text}" for k, text in options.defines if f'"{text}"' in error or f" {text} " in error
+        ]
+        return f"{error}; give {' or '.join(given)} another value" if given else None
     missing = _MISSING.search(error)
     if missing:
         return f"{error}; give it a value: -D {missing[1]}=VALUE"
@@ -432,23 +424,6 @@ def words_of(plugin: str) -> list[str]:
     library = next((Path(mi.__file__).parent / "plugins").glob(f"{plugin}.*"), None)
     words = re.findall(rb"(?<=\0)[a-z][a-z0-9_]{2,}(?=\0)", library.read_bytes()) if library else []
     return [word.decode() for word in words]
-
-
-def _rejected(error: str, options: Namespace) -> str | None:
-    """Return a message for Mitsuba's ``error`` about a value of ``-D``; else None."""
-    found = re.search(
-        r'could not parse ([\w ]+) value "([^"]*)".*|Property "\w+": value (\S+) is out of.*', error
-    )
-    if not found:
-        return None
-    value = found[2] if found[3] is None else found[3]
-    given = [f"-D {name}={text}" for name, text in options.defines if text == value]
-    if not given:
-        return None
-    place = re.search(r"\(line \d+, col \d+\)", error)
-    where = f" {place[0]}" if place else ""
-    # If several have the value, Mitsuba does not name the parameter.
-    return f"{' or '.join(given)}: {found[0].rstrip('.')}, in {str(options.scene)!r}{where}; give it another"
 
 
 def parameters(scene: Path, definitions: Mapping[str, object]) -> dict[str, str]:
