@@ -103,11 +103,6 @@ def _choice(value, name: str) -> str:
     return value
 
 
-def _max_depth(value, name: str) -> int:
-    depth = _integer(value, name)
-    return UNLIMITED if depth < 0 else depth
-
-
 def _light_paths(value, name: str) -> float | str:
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
@@ -125,16 +120,6 @@ def _light_paths(value, name: str) -> float | str:
     return number
 
 
-def _decisions(value, name: str) -> tuple | None:
-    text = _string(value, name)
-    return read_decisions(text) if text else None
-
-
-def _aovs(value, name: str) -> str:
-    features.check_syntax(_string(value, name))
-    return value
-
-
 def _layers(value, name: str) -> tuple[str, ...]:
     """The layers, in the order of `LAYERS`."""
     text = _string(value, name)
@@ -148,10 +133,10 @@ def _layers(value, name: str) -> tuple[str, ...]:
 
 # Readers of parameters with their own syntax.
 _READERS = {
-    "max_depth": _max_depth,
+    "max_depth": lambda value, name: UNLIMITED if (depth := _integer(value, name)) < 0 else depth,
     "light_paths": _light_paths,
-    "decisions": _decisions,
-    "aovs": _aovs,
+    "decisions": lambda value, name: read_decisions(text) if (text := _string(value, name)) else None,
+    "aovs": lambda value, name: features.checked(_string(value, name)),
     "layers": _layers,
 }
 _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}

@@ -20,7 +20,7 @@ from ..host.introspection import number
 from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context, Group
 from .infinite import contrast
-from .kinds import GROUPS, group_of, is_third_party, needs_evaluation
+from .kinds import GROUPS, group_of, is_third_party
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .tables import Mask, inverse_table
 
@@ -55,7 +55,8 @@ class Emitters:
         weights = [number(emitter.sampling_weight()) for emitter in emitters]
         registered = registered_emitters()
         self._summarize(emitters, types, weights)
-        self.evaluated = any(map(needs_evaluation, registered))
+        # It evaluates a mask, which cannot be recorded.
+        self.evaluated = "TimedSunskyEmitter" in registered
         self.groups, self.disks, self.has_places = (), None, False
         if not emitters:
             return

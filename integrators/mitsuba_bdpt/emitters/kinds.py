@@ -95,8 +95,3 @@ def third_party_elsewhere(scene) -> int:
     """Number of user-defined emitters outside ``scene``; virtual calls visit them."""
     own = sum(is_third_party(emitter.class_name()) for emitter in scene.emitters())
     return sum(map(is_third_party, registered_emitters())) - own
-
-
-def needs_evaluation(class_name: str) -> bool:
-    """Whether calls of such an emitter cannot be recorded, since it evaluates a mask."""
-    return class_name == "TimedSunskyEmitter"

@@ -145,15 +145,15 @@ def _of_spot(emitter) -> _Cone:
     return _Cone(_origin(to_world), x, y, z, cos_cutoff, pdf_w)
 
 
-def _of_projector(emitter) -> _Cone:
-    return _Cone(position=_origin(own_parameters(emitter)["to_world"]))
-
-
 def _origin(to_world):
     return dr.slice(mi.Point3f(to_world @ mi.Point3f(0, 0, 0)))
 
 
-_CONES = {"PointLight": _of_point, "SpotLight": _of_spot, "Projector": _of_projector}
+_CONES = {
+    "PointLight": _of_point,
+    "SpotLight": _of_spot,
+    "Projector": lambda e: _Cone(_origin(own_parameters(e)["to_world"])),
+}
 
 
 class Projectors:

@@ -133,8 +133,10 @@ def check_rotation(emitter: mi.Emitter):
     """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation."""
     columns = matrix_of(emitter)[:3, :3]
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
+        name = emitter.class_name()
+        kind = _PLUGINS.get(name) or name.removesuffix("Emitter").lower()
         raise UsageError(
-            f"to_world of {_plugin(emitter)} {named(emitter)} is not a rotation (the lengths of its "
+            f"to_world of {kind} {named(emitter)} is not a rotation (the lengths of its "
             f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
         )
 
@@ -160,11 +162,6 @@ _ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angl
 
 
 _PLUGINS = {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}
-
-
-def _plugin(emitter: mi.Emitter) -> str:
-    name = emitter.class_name()
-    return _PLUGINS.get(name) or name.removesuffix("Emitter").lower()
 
 
 def _lengths(matrix) -> str:

@@ -25,18 +25,11 @@ def registered_emitters() -> list[str]:
     """Class names of all emitters in the process; virtual calls visit all of them."""
     found, index, missing = [], 0, 0
     while missing < _GAP:
-        index += 1
-        emitter = _emitter(index)
-        missing = missing + 1 if emitter is None else 0
-        found += [emitter.class_name()] if emitter is not None else []
+        index, missing = index + 1, missing + 1
+        with contextlib.suppress(RuntimeError, AttributeError):  # never given, or freed
+            found.append(dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0].class_name())
+            missing = 0
     return found
-
-
-def _emitter(index: int):
-    try:
-        return dr.reinterpret_array(mi.EmitterPtr, mi.UInt32(index))[0]
-    except RuntimeError:  # never given, or freed
-        return None
 
 
 @contextlib.contextmanager

@@ -76,7 +76,8 @@ class Bands:
 
     def __init__(self, film, sensor):
         self._film, self._sensor = film, sensor
-        self.names = tuple(_band_names(film))
+        bands = children(film).items()
+        self.names = tuple(name for name, value in bands if isinstance(value, mi.Texture))
         self._channels, self.unit = None, None  # set by `prepare`
 
     def __call__(self, value, wavelengths):
@@ -97,11 +98,6 @@ class Bands:
     def stored(self, colours, weight, layers) -> list:
         """Return the parts of the film's storage in order; the weight is last."""
         return [colours, *layers, weight]
-
-
-def _band_names(film) -> list[str]:
-    """Return the names of the bands in the film's order."""
-    return [name for name, value in children(film).items() if isinstance(value, mi.Texture)]
 
 
 STOKES_NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")

@@ -80,8 +80,8 @@ KINDS = tuple(_KINDS)
 _KINDS[WORLD_NORMAL] = ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=False))
 
 
-def check_syntax(aovs: str):
-    """Raise ``UsageError`` unless ``aovs`` consists of pairs ``name:kind``."""
+def checked(aovs: str) -> str:
+    """Return ``aovs``; raises ``UsageError`` unless it consists of pairs ``name:kind``."""
     for pair in pairs(aovs):
         name, colon, kind = pair.partition(":")
         if not (name and colon and kind):
@@ -94,6 +94,7 @@ def check_syntax(aovs: str):
                 f"aovs={aovs!r}: {kind!r} is not a kind of feature; "
                 f"{did_you_mean(kind, KINDS)}Kinds: {', '.join(KINDS)}"
             )
+    return aovs
 
 
 def feature_names(aovs: str) -> list[str]:

@@ -92,12 +92,6 @@ def warn_of_lost_light(prepared, plan, text: str):
         warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
 
 
-def warn_of_missed_direct(prepared, texts: list[str]):
-    """Warn once of unsampled light on the sensor; empty ``texts`` are skipped."""
-    for text in filter(None, texts):
-        warn_once(prepared.scene, prepared.camera.sensor, text)
-
-
 def _some(found: list[str]) -> str:
     """Return the first `NAMED` entries, and the number of the others."""
     more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
+from ..host.notices import warn_once
 from ..image.accumulator import Accumulator
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
@@ -129,10 +130,9 @@ class Render:
                 self._decide_again()
                 if not number:
                     messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())
-                    messages.warn_of_missed_direct(
-                        self.prepared,
-                        missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings),
-                    )
+                    missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
+                    for text in filter(None, missed):
+                        warn_once(self.prepared.scene, self.sensor, text)
                 self._pass(step)
                 if not number:
                     self.lost_light()
@@ -245,17 +245,13 @@ class Render:
         if first and self.plan.roulette:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
 
-    def _radius_in_pixels(self, done: int) -> float:
-        """Return the merging radius after ``done`` passes of the same image or replicate."""
-        return self.settings.internals.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)
-
     def _photons(self, step: Step, footprints: Footprints) -> Merging:
         """Trace the photons of a pass.
 
         Their merging radius follows from the number of passes done of the same image or replicate.
         """
         done = passes_since(self.passes, step.done)
-        factor = self._radius_in_pixels(done)
+        factor = self.settings.internals.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)  # in pixels
         pixels = int(self.prepared.camera.region.size.prod())
         count = photon_pass.photons_of_pass(step.size * pixels, pixels, factor)
         changes = self.planner.changes

@@ -48,7 +48,7 @@ def check_plugins(scene: mi.Scene, sensor: mi.Sensor) -> None:
 
     def check() -> None:
         for owner in users:
-            kind = _base(owner)
+            kind = next(base for base in _CHECKS if isinstance(owner, getattr(mi, base)))
             for contradiction in _CHECKS[kind](owner, scene, media):
                 raise UsageError(
                     f"{kind.lower()} {named(owner)} of the Python class {type(owner).__name__} contradicts "
@@ -79,10 +79,6 @@ def _counts(owner, owners) -> bool:
         return True
     emitters = (e for e in owners if isinstance(e, mi.Emitter) and e.class_name() != "SpotLight")
     return any(owner is value for emitter in emitters for value in children(emitter).values())
-
-
-def _base(owner) -> str:
-    return next(base for base in _CHECKS if isinstance(owner, getattr(mi, base)))
 
 
 def _held(scene: mi.Scene) -> list[mi.Object]:

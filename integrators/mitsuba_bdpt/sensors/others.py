@@ -242,7 +242,9 @@ class RayOnlySensor(Sensor):
         super().__init__(sensor)
         self.reason = self.no_area = reason
         self._views = views or [sensor]
-        self.delta = not any(map(_has_area, self._views))
+        # Whether direct light of delta emitters reaches it, as far as known.
+        area = (v.class_name() == "ThinLensCamera" or v.get_shape() is not None for v in self._views)
+        self.delta = not any(area)
 
     def _start(self, uv, u_lens, shared) -> CameraStart:
         index, x = view_at(uv.x, len(self._views))
@@ -261,11 +263,6 @@ class RayOnlySensor(Sensor):
             weight=weight,
             arrival=mi.Float(0),
         )
-
-
-def _has_area(sensor: mi.Sensor) -> bool:
-    """Whether direct light of a delta emitter reaches the sensor, as far as known."""
-    return sensor.class_name() == "ThinLensCamera" or sensor.get_shape() is not None
 
 
 def _sampled(view, uv, u_lens, shared):
