@@ -26,7 +26,7 @@ def run(arguments: Namespace) -> int | None:
 
     def measured() -> int:
         check_installed(arguments.command)
-        *_, module = COMMANDS[arguments.command]
+        module = COMMANDS[arguments.command][1]
         return importlib.import_module(f"..measure.{module}", __package__).run(arguments)
 
     return mistakes.answered(measured, "interrupted; what was finished is kept")
@@ -43,11 +43,14 @@ def check_installed(command: str) -> None:
 
 def add_commands(add_command: Callable[[str, str], argparse.ArgumentParser]) -> None:
     """Declare all subcommands; ``add_command(name, help)`` returns a parser."""
-    for name, (help_text, declare, _) in COMMANDS.items():
+    for name, (help_text, _, kind, *others) in COMMANDS.items():
         parser = add_command(name, help_text)
         text = "folder with scenes/, references/, presets/, results/; default: the current one"
         parser.add_argument("--project", type=Path, default=Path(), metavar="DIR", help=text)
-        declare(parser)
+        for *names, settings in others:
+            parser.add_argument(*names, **settings)
+        if kind is not None:
+            declare(parser, kind)
 
 
 def integrator(text: str) -> tuple[str, dict]:
@@ -81,68 +84,54 @@ def _parsed(bounds):
     return bounds if isinstance(bounds, type) else within(bounds)
 
 
-SCENES = "scene files, or names in PROJECT/scenes"
+_SCENE = ("scene", {"help": "a scene file, or a name in PROJECT/scenes"})
+_SCENES = {"help": "scene files, or names in PROJECT/scenes"}
+_FOLDER = ("folder", {"help": "what sweep has filled, or a name in PROJECT/results"})
+_SIDE = "TYPE KEY=VALUE …, in quotes; sampler=TYPE is the sensor's sampler"
+_INTEGRATORS = "TYPE KEY=VALUE …, each in quotes; default: path (with media: volpath) and bdpt"
 
-
-def _declare_sweep(parser) -> None:
-    parser.add_argument("preset", help="TOML file, or a name in PROJECT/presets: what is rendered")
-    declare(parser, options.Sweep)
-
-
-def _declare_report(parser) -> None:
-    parser.add_argument("folder", help="what sweep has filled, or a name in PROJECT/results")
-    parser.add_argument("--readme", type=Path, help="a Markdown file whose parts are filled")
-
-
-def _declare_page(parser) -> None:
-    parser.add_argument("folder", help="what sweep has filled, or a name in PROJECT/results")
-    parser.add_argument("-o", "--output", type=Path, help="default: FOLDER/page.html")
-
-
-def _declare_reference(parser) -> None:
-    parser.add_argument("scenes", nargs="*", help=SCENES)
-    parser.add_argument("--all", action="store_true", help="all scenes of PROJECT/scenes")
-    declare(parser, options.MakeReference)
-
-
-def _declare_compare(parser) -> None:
-    text = "TYPE KEY=VALUE …, in quotes; sampler=TYPE is the sensor's sampler"
-    parser.add_argument("sides", nargs=2, type=parameters, metavar="SIDE", help=text)
-    parser.add_argument("--scenes", nargs="+", required=True, help=SCENES)
-    declare(parser, options.Compare)
-
-
-def _declare_equal_time(parser) -> None:
-    parser.add_argument("scene", help="a scene file, or a name in PROJECT/scenes")
-    text = "TYPE KEY=VALUE …, each in quotes; default: path (with media: volpath) and bdpt"
-    parser.add_argument("-i", "--integrators", nargs="+", type=integrator, default=[], help=text)
-    declare(parser, options.EqualTime)
-
-
-def _declare_pyramid(parser) -> None:
-    parser.add_argument("scene", help="a scene file, or a name in PROJECT/scenes")
-    declare(parser, options.Pyramid)
-
-
-COMMANDS: dict[str, tuple[str, Callable, str]] = {
+COMMANDS: dict[str, tuple] = {
     "sweep": (
         "render scenes by several integrators, budgets and seeds: a row of times and errors for each render",
-        _declare_sweep,
         "sweep",
+        options.Sweep,
+        ("preset", {"help": "TOML file, or a name in PROJECT/presets: what is rendered"}),
     ),
-    "report": ("tables and plots of a sweep, as Markdown", _declare_report, "report"),
-    "page": ("a sweep as one HTML file, with images to compare", _declare_page, "page"),
+    "report": (
+        "tables and plots of a sweep, as Markdown",
+        "report",
+        None,
+        _FOLDER,
+        ("--readme", {"type": Path, "help": "a Markdown file whose parts are filled"}),
+    ),
+    "page": (
+        "a sweep as one HTML file, with images to compare",
+        "page",
+        None,
+        _FOLDER,
+        ("-o", "--output", {"type": Path, "help": "default: FOLDER/page.html"}),
+    ),
     "reference": (
         "make references with an error estimate of their own",
-        _declare_reference,
         "making",
+        options.MakeReference,
+        ("scenes", {"nargs": "*"} | _SCENES),
+        ("--all", {"action": "store_true", "help": "all scenes of PROJECT/scenes"}),
     ),
     "compare": (
         "two ways to render, alternating: time, error and efficiency of the first over the second",
-        _declare_compare,
         "compare",
+        options.Compare,
+        ("sides", {"nargs": 2, "type": parameters, "metavar": "SIDE", "help": _SIDE}),
+        ("--scenes", {"nargs": "+", "required": True} | _SCENES),
     ),
-    "equal-time": ("a picture of integrators side by side at equal time", _declare_equal_time, "equal_time"),
-    "pyramid": ("an image of each strategy (s, t), as EXR and PNG", _declare_pyramid, "pyramid"),
+    "equal-time": (
+        "a picture of integrators side by side at equal time",
+        "equal_time",
+        options.EqualTime,
+        _SCENE,
+        ("-i", "--integrators", {"nargs": "+", "type": integrator, "default": [], "help": _INTEGRATORS}),
+    ),
+    "pyramid": ("an image of each strategy (s, t), as EXR and PNG", "pyramid", options.Pyramid, _SCENE),
 }
-"""Help, declaration of the arguments, and module of `measure` whose ``run`` does it, of each subcommand."""
+"""Help, module of `measure` whose ``run`` does it, options, and further arguments, of each subcommand."""
