@@ -173,20 +173,17 @@ class Projectors:
 
     def sample(self, index, u, active):
         """Sample a direction (world, unit length) and its density (solid angle)."""
-        d, pdf_w = mi.Vector3f(0, 0, 1), mi.Float(1)
-        for number, projector in self._rows:
-            mask = active & (index == number)
-            sampled, density = projector.sample(u, mask)
-            d, pdf_w = dr.select(mask, sampled, d), dr.select(mask, density, pdf_w)
-        return d, pdf_w
+        return self._ask("sample", (mi.Vector3f(0, 0, 1), mi.Float(1)), index, u, active)
 
     def pdf_w(self, index, d, active):
         """Density (solid angle) of ``d`` from the projector ``index``; 0 for others."""
-        pdf_w = mi.Float(0)
+        return self._ask("pdf_w", mi.Float(0), index, d, active)
+
+    def _ask(self, method, found, index, argument, active):
         for number, projector in self._rows:
             mask = active & (index == number)
-            pdf_w = dr.select(mask, projector.pdf_w(d, mask), pdf_w)
-        return pdf_w
+            found = dr.select(mask, getattr(projector, method)(argument, mask), found)
+        return found
 
 
 class _Projector:

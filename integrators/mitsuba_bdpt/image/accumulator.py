@@ -99,37 +99,19 @@ class Channels:
         return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes)
 
     @property
-    def of_colours(self) -> slice:
-        """Slice of the colours, for camera samples and splats."""
-        return slice(0, self.colours)
-
-    @property
     def weight(self) -> int:
         """Index of the filter's weight."""
         return self.colours + self.alpha
 
     @property
-    def of_features(self) -> slice:
-        return slice(self.weight + 1, self.weight + 1 + self.features)
-
-    @property
-    def of_stokes(self) -> slice:
-        return slice(self.of_features.stop, self.of_features.stop + self.stokes)
-
-    @property
-    def of_stokes_light(self) -> slice:
-        """Slice of the Stokes channels of a splat."""
-        return slice(self.colours, self.colours + self.stokes)
-
-    @property
     def camera(self) -> int:
         """Number of channels of camera samples, padded to an even number."""
-        return even(self.of_stokes.stop)
+        return even(self.weight + 1 + self.features + self.stokes)
 
     @property
     def light(self) -> int:
         """Number of channels of splats, padded to an even number."""
-        return even(self.of_stokes_light.stop)
+        return even(self.colours + self.stokes)
 
     def sample(self, colours, alpha, features, stokes) -> list:
         """Return the channels of a camera sample with filter weight 1."""
@@ -267,16 +249,12 @@ class Accumulator:
 
     def _pixels(self, camera, light) -> _Pixels:
         """Reshape the sums of an image to (height, width, channels)."""
-        w, h = self.size
-        camera, light, channels = camera.reshape(h, w, -1), light.reshape(h, w, -1), self._channels
-        return _Pixels(
-            colours=camera[..., channels.of_colours],
-            alpha=camera[..., channels.colours : channels.weight],
-            weight=camera[..., channels.weight, None],
-            features=camera[..., channels.of_features],
-            light=light[..., channels.of_colours],
-            polarized=(camera[..., channels.of_stokes], light[..., channels.of_stokes_light]),
-        )
+        (w, h), c = self.size, self._channels
+        parts = np.cumsum([c.colours, c.alpha, 1, c.features, c.stokes])
+        *of_camera, polarized, _ = np.split(camera.reshape(h, w, -1), parts, axis=-1)
+        parts = np.cumsum([c.colours, c.stokes])
+        splats, of_splats, _ = np.split(light.reshape(h, w, -1), parts, axis=-1)
+        return _Pixels(*of_camera, light=splats, polarized=(polarized, of_splats))
 
     def mean(self):
         """Return the mean of the image so far, the scale of roulette.

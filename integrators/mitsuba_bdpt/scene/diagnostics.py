@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -31,31 +30,23 @@ _COARSE = 1e-2
 _QUICKLY_READ = 1 << 17
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """A texture that scales what a BSDF scatters, the parameter ``name``.
-
-    ``owners``: the texture, its BSDF and the enclosing objects, innermost first.
-    """
-
-    owners: tuple
-    name: str
-
-
 def non_conserving_bsdfs(owners) -> list[str]:
     """Describe the BSDFs, nested ones included, that are not energy-conserving."""
     scales = _scales([(owner,) for owner in owners])
     most = max(_QUICKLY_READ // max(len(scales), 1), 1)
-    found = [(scale, _largest(scale.owners[0], most)) for scale in scales]
+    found = ((name, owners, _largest(owners[0], most)) for name, owners in scales)
     return [
-        f"{_called(scale.owners)} has {scale.name} up to {largest:.4g}"
-        for scale, largest in found
+        f"{_called(owners)} has {name} up to {largest:.4g}"
+        for name, owners, largest in found
         if largest > _MORE_THAN_ALL
     ]
 
 
-def _scales(chains) -> list[_Scale]:
-    """Scaling textures in ``chains``: objects followed by those enclosing them."""
+def _scales(chains) -> list[tuple[str, tuple]]:
+    """Textures in ``chains`` that scale scattered light: names of parameters, and chains.
+
+    A chain is an object followed by those that enclose it.
+    """
     chains, found, seen = list(chains), [], set()
     for chain in chains:  # grows on the way
         for name, value in children(chain[0]).items():
@@ -63,7 +54,7 @@ def _scales(chains) -> list[_Scale]:
                 seen.add(id(value))
                 chains.append((value, *chain))
             elif isinstance(value, mi.Texture) and isinstance(chain[0], mi.BSDF) and name.endswith(_SCALES):
-                found.append(_Scale((value, *chain), name))
+                found.append((name, (value, *chain)))
     return found
 
 
