@@ -257,8 +257,8 @@ def check_film(sensor, settings: Settings):
     rgb_only = [name for name in settings.layers if name != "variance"]
     if rgb_only and isinstance(colour, Bands):
         raise UnsupportedError(
-            f"layers={rgb_only[0]} is not possible with film {named(film)} of class SpecFilm: these layers are "
-            "RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
+            f"layers={rgb_only[0]} is not possible with film {named(film)} of class SpecFilm: these layers "
+            "are RGB, and the film samples the wavelengths of its bands only; use hdrfilm"
         )
     count = len(features.feature_names(settings.aovs))
     if settings.denoise:
