@@ -609,7 +609,8 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
     scene.write_text(SCENE.replace('name="sample_count" value="4"', 'name="sample_count" value="$light"'))
     assert main(["render", str(scene), "-Dlight=-1"]) == 2
     error = capsys.readouterr().err
-    assert '-D light=-1: Property "sample_count": value -1 is out of bounds' in error
+    assert 'Property "sample_count": value -1 is out of bounds' in error
+    assert "; give -D light=-1 another value" in error
 
 
 @pytest.mark.parametrize(
