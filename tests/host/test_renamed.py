@@ -8,6 +8,7 @@ import pytest
 from mitsuba_bdpt.errors import UnsupportedError
 from mitsuba_bdpt.host import introspection, renamed
 from mitsuba_bdpt.host.introspection import own_parameters
+from mitsuba_bdpt.scene import prepared
 
 
 def mesh():
@@ -138,12 +139,36 @@ class MovingCamera(mi.Sensor):
         callback.put("to_world", Transform(MOVED, TURNED), mi.ParamFlags.NonDifferentiable)
 
 
-@pytest.mark.parametrize("moving", ["lamp", "eye"])
+@pytest.mark.parametrize("moving", ["lamp", "eye", "view"])
 def test_animated_scenes_are_refused(of_3_10, moving):
-    """Expected: a render of a scene with a lamp or a camera that moves is refused, with its name."""
+    """Expected: a render of a scene with a lamp, a camera or a view of a batch that moves is refused, with
+    its name.
+    """
     mi.register_emitter("moving_lamp", MovingLamp)
     mi.register_sensor("moving_camera", MovingCamera)
     scene = {"type": "scene", "eye": {"type": "perspective"}, "lamp": {"type": "point"}}
     scene[moving] = {"type": "moving_lamp" if moving == "lamp" else "moving_camera"}
+    if moving == "view":
+        film = {"type": "hdrfilm", "width": 2, "height": 1, "rfilter": {"type": "box"}}
+        still = {"type": "perspective", "id": "still"}
+        scene["eye"] = {"type": "batch", "film": film, "still": still, "view": scene.pop("view")}
     with pytest.raises(UnsupportedError, match=f"bdpt: to_world of .* '{moving}' is animated"):
         mi.load_dict({"type": "bdpt"}).render(mi.load_dict(scene), spp=1)
+
+
+def test_all_that_may_move_is_looked_at(monkeypatch):
+    """Expected: shapes, instances, shapes of groups, emitters and the sensor are asked for a transformation
+    with key frames.
+    """
+    group = {"type": "shapegroup", "id": "group", "box": {"type": "cube"}}
+    parts = {
+        "eye": {"type": "perspective"},
+        "lamp": {"type": "point"},
+        "ball": {"type": "sphere"},
+        "group": group,
+        "copy": {"type": "instance", "of": {"type": "ref", "id": "group"}},
+    }
+    scene, asked = mi.load_dict({"type": "scene", **parts}), []
+    monkeypatch.setattr(prepared, "check_not_animated", asked.extend)
+    prepared.PreparedScene(scene, scene.sensors()[0])
+    assert {"eye", "lamp", "ball", "box", "copy"} <= {owner.id() for owner in asked}

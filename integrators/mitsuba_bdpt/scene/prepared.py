@@ -9,7 +9,7 @@ from .. import components
 from ..emitters.emitters import Emitters
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, check_not_animated, children, is_instance, media_of
-from ..sensors.checks import check_sensor
+from ..sensors.checks import check_sensor, views
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
@@ -25,7 +25,7 @@ class PreparedScene:
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
-        check_not_animated([*all_shapes(scene), *scene.emitters(), sensor])
+        check_not_animated([*all_shapes(scene), *scene.emitters(), sensor, *views(sensor)])
         self.scene = scene
         check_plugins(scene, sensor)
         self.surfaces = bool(scene.shapes())
