@@ -277,6 +277,20 @@ def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
     assert re.search(words, capsys.readouterr().err)
 
 
+def test_what_is_around_bdpt_is_not_advised(around, capsys):
+    """Rationale: a file with `moment` around `bdpt` was answered with ``--integrator scene``, which was
+    refused in turn. Expected: the remedy that works alone; around others both.
+    """
+    moment = around.read_text().replace('type="aov" name="in"', 'type="moment" name="in"')
+    own = moment.replace("$integrator", "bdpt").replace('<default name="integrator" value="path"/>', "")
+    for text, advised in ((moment, True), (own, False)):
+        around.write_text(text)
+        assert main(["render", str(around)]) == 2
+        error = capsys.readouterr().err
+        assert ("--integrator scene" in error) == advised
+        assert "write the inner integrator alone" in error
+
+
 def test_bdpt_in_place_of_stokes_has_its_layers(around):
     """Expected: in a polarized variant the parameter ``stokes`` and the other layers, named as in Mitsuba; in
     others words."""

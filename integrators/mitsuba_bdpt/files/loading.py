@@ -484,8 +484,8 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         if kind in NOT_CARRIED:
             raise CommandError(
                 f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
-                f"adds {NOT_CARRIED[kind]}; render with the scene file's own by --integrator {SCENES_OWN}, "
-                "or write the inner integrator alone into the file."
+                f"adds {NOT_CARRIED[kind]}; {_own_instead(nodes, node)}write the inner integrator alone into "
+                "the file."
             )
         if kind == "stokes":
             if not mi.is_polarized:
@@ -505,6 +505,14 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         if "layers" in carried:
             carried["layers"] = _added(node.props.get("layers", ""), carried["layers"])
     return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
+
+
+def _own_instead(nodes: Sequence, node) -> str:
+    """Return the advice to render with ``node``, empty if it is around `bdpt`, which it cannot render."""
+    while node.props.plugin_name() in AROUND:
+        node = _nested(nodes, node)[1]
+    own = f"render with the scene file's own by --integrator {SCENES_OWN}, or "
+    return "" if node.props.plugin_name() == "bdpt" else own
 
 
 def _nested(nodes: Sequence, node) -> tuple[str, object]:
