@@ -1,23 +1,23 @@
 """What the default's choice of strategies is worth: its time to an error over that of the best fixed choice.
 
     python scripts/choices.py small_casters/point_cube cornell_box
-    python scripts/choices.py --all -o docs/reports/choices.json            # every scene; can be interrupted
-    python scripts/choices.py --all -o docs/reports/choices.json --again    # after a change of the choice
+    python scripts/choices.py --all -o results/choices.json    # every scene; goes on after an interruption
 
-For each scene the candidates of a pilot with 1, 4 and 16 camera subpaths per light subpath, those with all
-inner connections in place of one drawn, and what pilots of 32 seeds choose, are rendered by hand (parameter
-``decisions``, with the tables of emission and the guided samples of s = 0 that the default has); those which
-one render of a seed of its own shows to be among the best, or which are chosen, with 8 seeds, as the default
-is, 64 samples per pixel. A time is that of the processor, which neighbours on the machine disturb less than
-seconds; the default's without the pilot, which later renders of a scene remember (docs/method/skipping.md has
-what it takes). Errors are relMSE, raw and trimmed of the worst 0.1 %.
+For each scene those of the pilot's candidates that are possible there are rendered by hand (parameter
+``decisions``, with the tables of emission and the guided samples that the default has): first once with a
+seed of its own; those which are then among the best, or which pilots of `PILOT_SEEDS` seeds choose, with
+`SEEDS` seeds, as the default is, in turns, 128^2 (small_casters: their own film), 64 samples per pixel. A
+time is that of the processor; the default's is without the pilot, which later renders of a scene remember.
+Errors are relMSE, raw and trimmed of the worst 0.1 %.
+
 The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
-fixed choices, with the interval that nine in ten resamplings of the seeds (the same for both sides) lie in,
-and the same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its
-two ratios, which is 1 where one choice is best by both errors; and what was chosen. The least of several
-noisy products is below the true one: figures are on the safe side. The scenes of small_casters get a
-reference of 8,192 samples per pixel with a light subpath each, and so do those whose stored reference has
-light that only `merging` finds, which no choice has.
+fixed choices, with the interval of nine in ten resamplings of the seeds (the same for both sides), and the
+same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its two
+ratios; the pilot's predicted time to an error over the measured one (trimmed), the largest ratio of two
+candidates; and what was chosen. The least of several noisy products is below the true one: figures are on the
+safe side. References of 8,192 samples per pixel are made for scenes of small_casters, and for those whose
+stored reference has light that only `merging` finds, which no choice has. A scene in OUTPUT is measured again
+if the pilot's candidates have changed.
 """
 
 from __future__ import annotations
@@ -37,15 +37,14 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.tables import table
-from mitsuba_bdpt.planning import pilot
-from mitsuba_bdpt.planning.candidates import candidates
-from mitsuba_bdpt.planning.configuration import Configuration, Decision
+from mitsuba_bdpt.planning.choice import Prediction
+from mitsuba_bdpt.planning.configuration import CANDIDATES, Configuration, Decision
 from mitsuba_bdpt.run import rendering
 
 import mitsuba as mi  # isort: skip
 import drjit as dr  # isort: skip
 
-SPP, SEEDS, PILOT_SEEDS, SERVED = 64, 8, 32, (1, 4, 16)
+SPP, SEEDS, PILOT_SEEDS = 64, 8, 16
 REFERENCE_SPP, REFERENCE_SEED, FIRST_SEED = 4096, 1_000_000, 1000
 
 # A fixed choice is among the best if one render's time times error, raw or trimmed, is within this factor.
@@ -90,117 +89,73 @@ def product(rows, seeds=slice(None)) -> np.ndarray:
     return rows[:, 0].min() * rows[seeds, 1:].mean(axis=0)
 
 
-def by_hand(scene, depth: int, way: Configuration, mean: float):
-    """An integrator that does what the candidate ``way`` says; ``mean`` of the image."""
-    made = json.dumps([Decision.of(way, first_pass=0, cost=1.0, variance=1.0, mean=mean).record()])
+def named(way: Configuration) -> str:
+    """Light subpaths per camera subpath, connections, kappa of t <= 1 (without light subpaths of s = 1)."""
+    way = CANDIDATES[way.number]
+    if not way.light_paths:
+        return f"0, {way.kappa_direct:g}"
+    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}"
+
+
+def piloted(scene, settings, seed: int | None = None) -> list[Prediction]:
+    """The predictions of a pilot of this seed, the best first."""
+    render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
+    if seed is not None:
+        render.planner.pilot_seed = seed
+    return render.decide()
+
+
+def by_hand(scene, depth: int, row: Prediction, best: Configuration, mean: float):
+    """An integrator that does what ``row`` predicts, with what the ``best`` has beside its candidate."""
+    alike = row.candidate.number == best.number
+    way = replace(
+        row.candidate,
+        emission=best.emission if row.candidate.light_paths else None,
+        guided=best.guided,
+        joined=best.joined if alike else 1,
+    )
+    made = json.dumps([Decision.of(way, 0, cost=row.cost, variance=row.variance, mean=mean).record()])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
     integrator.render(scene, spp=1)  # compiles
     return integrator
 
 
-def piloted(scene, settings) -> Counter:
-    """How often pilots of `PILOT_SEEDS` seeds choose which candidate; nothing where none is asked."""
-    tables = []
-    for seed in range(PILOT_SEEDS):
-        render = rendering.Render(scene, scene.sensors()[0], settings, 0, SPP)
-        render.planner.pilot_seed = seed
-        tables.append(render.decide())
-    return Counter(named(table[0].candidate) for table in tables if table)
+def fixed(scene, depth: int, expected, chosen: set[str], predicted: list[Prediction], mean: float) -> dict:
+    """Integrators, by their names, of the candidates that are among the best or ``chosen``."""
+    rows = {named(row.candidate): row for row in predicted}
+    made = {name: by_hand(scene, depth, row, predicted[0].candidate, mean) for name, row in rows.items()}
+    first = {n: product([measured(scene, w, FIRST_SEED, expected)]) for n, w in made.items()}
+    best = np.min(list(first.values()), axis=0)
+    return {n: w for n, w in made.items() if n in chosen or (first[n] <= AMONG_BEST * best).any()}
 
 
-def fixed(scene, depth: int, expected, chosen: set, known: dict) -> dict:
-    """Integrators, by their names, of the candidates that are among the best or ``chosen``.
-
-    Where those among the best are ``known``, only of the best, by which the machine's speed is told, and the
-    chosen.
-    """
-    settings = mi.load_dict({"type": "bdpt", "max_depth": depth}).settings
-    render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
-    mean = pilot.measure(render.prepared, render.plan, settings, dr.opaque(mi.UInt32, 1), 1 << 14).mean
-    ways = candidates(render.prepared, render.plan, settings)
-    ways += [replace(way, connections="all") for way in ways if way.connections == "one"]
-    ways = {named(way): way for way in map(as_taught(settings, scene), ways)}
-    if known:
-        old = {name: product(rows) for name, rows in known.items()}
-        names = chosen | {min(old, key=lambda name: old[name][i]) for i in (0, 1)}
-    else:
-        names = chosen | {name for name, way in ways.items() if way.camera_paths_per_light_path in SERVED}
-    made = {name: by_hand(scene, depth, ways[name], mean) for name in sorted(names)}
-    if not known:
-        first = {n: product([measured(scene, w, FIRST_SEED, expected)]) for n, w in made.items()}
-        best = np.min(list(first.values()), axis=0)
-        made = {n: w for n, w in made.items() if n in chosen or (first[n] <= AMONG_BEST * best).any()}
-    return made
-
-
-def as_taught(settings, scene):
-    """A function that gives a candidate what the default has learnt beside the choice among candidates."""
-    render = rendering.Render(scene, scene.sensors()[0], settings, 1, SPP)
-    table = render.decide()
-    if not table:
-        return lambda way: way
-    best = table[0].candidate
-
-    def taught(way: Configuration) -> Configuration:
-        alike = way.light_paths and (way.light_paths, way.connections) == (best.light_paths, best.connections)
-        return replace(
-            way,
-            emission=best.emission if way.light_paths else None,
-            guided=best.guided,
-            joined=best.joined if alike else 1,
-        )
-
-    return taught
-
-
-def as_fast(known: dict, found: dict) -> dict:
-    """``known`` rows with the times that they would have at the machine's present speed.
-
-    That is told by ``found``, rows of some of the same choices.
-    """
-    both = known.keys() & found.keys()
-    speeds = [np.array(found[name])[:, 0].min() / np.array(known[name])[:, 0].min() for name in both]
-    return {name: np.array(rows) * [np.median(speeds), 1, 1] for name, rows in known.items()}
-
-
-def named(way: Configuration) -> str:
-    """In words: light subpaths per camera subpath, connections (with how many), kappa of t <= 1 or s = 1."""
-    if not way.light_paths:
-        return f"0, {way.kappa_direct:g}"
-    joined = f" of {way.joined}" if way.joined > 1 else ""
-    return f"1/{way.camera_paths_per_light_path} {way.connections}{joined} {way.kappa_light:g}"
-
-
-def measure(name: str, known: dict) -> dict:
-    """A row: `measured` with each seed, of the default and of fixed choices, and what pilots have chosen.
-
-    Choices that are ``known`` are kept, their times scaled to the machine's present speed.
-    """
+def measure(name: str) -> dict:
+    """A row: `measured` with each seed, of the default and of fixed choices; the pilots' results."""
     scene, depth, expected = loaded(name)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth})
     integrator.render(scene, seed=FIRST_SEED, spp=SPP)  # compiles
-    chosen = dict(piloted(scene, integrator.settings).most_common())
-    ways = fixed(scene, depth, expected, set(chosen), known)
-    rows, kinds, found = [], [], {way: [] for way in ways}
+    predicted = piloted(scene, integrator.settings)
+    tables = [piloted(scene, integrator.settings, seed) for seed in range(PILOT_SEEDS)]
+    chosen = Counter(named(found[0].candidate) for found in tables if found)
+    mean = integrator.statistics["decisions"][0]["mean"]
+    ways = fixed(scene, depth, expected, set(chosen), predicted, mean)
+    rows, found = [], {way: [] for way in ways}
     for seed in range(SEEDS):
         # In turns, since the machine's speed changes.
         for way, by in ways.items():
-            found[way].append(measured(scene, by, seed, expected))
-        rows.append(measured(scene, integrator, seed, expected))
-        (made,) = integrator.statistics["decisions"] or [None]
-        kinds.append(made and (made["light_paths"], made["connections"]))
-    if known:
-        found = as_fast(known, found) | found
-    # One kind of decision takes other times than another: the least of each, as often as it is made.
-    least = {kind: min(row[0] for row, of in zip(rows, kinds, strict=True) if of == kind) for kind in kinds}
-    rows = np.array(rows)
-    rows[:, 0] = np.mean([least[kind] for kind in kinds])
-    return {"scene": name, "fixed": rounded(found), "default": rounded({"": rows})[""], "chosen": chosen}
+            found[way].append(measured(scene, by, seed, expected).tolist())
+        rows.append(measured(scene, integrator, seed, expected).tolist())
+    return {
+        "scene": name,
+        "candidates": CANDIDATE_NAMES,
+        "fixed": found,
+        "default": rows,
+        "chosen": dict(chosen.most_common()),
+        "predicted": {named(row.candidate): row.time for row in predicted if named(row.candidate) in found},
+    }
 
 
-def rounded(found: dict) -> dict:
-    """``found`` with five digits of each number."""
-    return {name: [[float(f"{x:.5g}") for x in row] for row in rows] for name, rows in found.items()}
+CANDIDATE_NAMES = [named(way) for way in CANDIDATES]
 
 
 def ratios(row: dict, seeds=slice(None)) -> dict:
@@ -223,8 +178,10 @@ def shown(row: dict) -> list[str]:
     cells = [
         f"{m:.2f} ({a:.2f}–{b:.2f}), {w:.2f}" for m, a, b, w in zip(default, low, high, worst, strict=True)
     ]
+    wrong = [time / found[name][1] for name, time in row["predicted"].items()]
     counts = ", ".join(f"{name} ({n})" for name, n in row["chosen"].items())
-    return [f"`{row['scene']}`", *cells, f"{min(map(max, found.values())):.2f}", counts or "–"]
+    best = f"{min(map(max, found.values())):.2f}"
+    return [f"`{row['scene']}`", *cells, best, f"{max(wrong) / min(wrong):.2g}", counts]
 
 
 def main(arguments=None) -> int:
@@ -232,7 +189,6 @@ def main(arguments=None) -> int:
     parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="*", help="names in scenes/, also small_casters/NAME")
     parser.add_argument("--all", action="store_true", help="the benchmark's scenes and all of small_casters")
-    parser.add_argument("--again", action="store_true", help="render the default of scenes in OUTPUT anew")
     parser.add_argument("-o", "--output", type=Path, help="JSON of the rows; scenes that are in it are kept")
     options = parser.parse_args(arguments)
     names = list(options.scenes)
@@ -246,10 +202,8 @@ def main(arguments=None) -> int:
     stored = options.output and options.output.exists() and json.loads(options.output.read_text())
     rows = {row["scene"]: row for row in stored or []}
     for name in names:
-        if name not in rows or options.again:
-            # Errors against a reference that is made anew are others.
-            kept = name in rows and not name.startswith(SMALL)
-            rows[name] = measure(name, rows[name]["fixed"] if kept else {})
+        if name not in rows or rows[name].get("candidates") != CANDIDATE_NAMES:
+            rows[name] = measure(name)
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
             write_json(options.output, list(rows.values()))
@@ -258,6 +212,7 @@ def main(arguments=None) -> int:
         "raw: default, worst pilot",
         "trimmed: default, worst pilot",
         "best by both",
+        "predicted / measured",
         "chosen (pilots)",
     ]
     print(table(head, [shown(rows[name]) for name in names]))

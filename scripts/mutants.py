@@ -478,9 +478,9 @@ MUTANTS = (
     ),
     Mutant(
         "pilot: shared light subpaths cost nothing",
-        "planning/choice.py",
-        "parts[:, :, 1] * [c.camera_paths_per_light_path for c in candidates]",
-        "parts[:, :, 1] * [1 for c in candidates]",
+        "planning/pilot.py",
+        "each = light**2 / candidate.light_paths",
+        "each = light**2",
         ("tests/planning/test_pilot.py::test_small_caustics_get_their_light[point_cube]",),
     ),
     Mutant(

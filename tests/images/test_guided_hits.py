@@ -14,7 +14,7 @@ import pytest
 import welch as st
 from mitsuba_bdpt.planning import choice, pilot
 from mitsuba_bdpt.planning.choice import Alternatives
-from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration
+from mitsuba_bdpt.planning.configuration import CANDIDATES
 from mitsuba_bdpt.planning.isolated import LANES, group
 from mitsuba_bdpt.planning.moments import GROUPS, Moments
 from mitsuba_bdpt.planning.planner import Planner
@@ -314,13 +314,13 @@ def test_how_many_samples(isolated, chosen):
     """Rationale: what guiding gains has to pay, and more samples over fewer. Expected: the number that
     follows from the isolated paths' variances (without, with each number) beside 1 of all else.
     """
-    width = len(WEIGHTINGS)
+    width = len(CANDIDATES)
     base, none = np.ones((GROUPS, width)), np.zeros((GROUPS, width))
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
     rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1}
     each = np.tile(isolated, (GROUPS, 1))
     moments = Moments(base, none, none, none, each, np.ones(width), 1.0, rays, 4096)
-    possible = [Configuration.weighted(w, 1, "none") for w in WEIGHTINGS if w.light and not w.inner]
+    possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]
     table = choice.choose(moments, Alternatives(possible, True, guidable=True))
     assert table[0].candidate.guided == chosen
     gain = choice.guided_gain(moments, Alternatives(possible, True, guidable=True), table)
@@ -335,13 +335,13 @@ def test_a_gain_has_to_be_seen_in_most_of_a_pilot(count, chosen):
     them. Expected: guiding that gains 5 in ``count`` of sixteen groups, and nothing in the others, is chosen
     if these are more than three quarters.
     """
-    none, width = np.zeros((GROUPS, len(WEIGHTINGS))), len(WEIGHTINGS)
+    none, width = np.zeros((GROUPS, len(CANDIDATES))), len(CANDIDATES)
     each = np.zeros((GROUPS, 1 + len(GUIDED)))
     each[:count] = [9.0, 0.5, 0.5, 0.5]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
     rays |= {"far": 0.0, "aimed": 0.05, "kinds": 1}
     moments = Moments(none + 1, none, none, none, each, np.ones(width), 1.0, rays, 4096)
-    possible = [Configuration.weighted(w, 1, "none") for w in WEIGHTINGS if w.light and not w.inner]
+    possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]
     table = choice.choose(moments, Alternatives(possible, True, guidable=True))
     assert bool(table[0].candidate.guided) == chosen
 

@@ -17,10 +17,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.planning import budget, choice, even_sky, moments, pilot
+from mitsuba_bdpt.planning import budget, choice, moments, pilot
+from mitsuba_bdpt.planning import candidates as uniform
 from mitsuba_bdpt.planning.candidates import candidates
 from mitsuba_bdpt.planning.choice import Alternatives
-from mitsuba_bdpt.planning.configuration import WEIGHTINGS, Configuration, Decision, Weighting
+from mitsuba_bdpt.planning.configuration import CANDIDATES, Configuration, Decision
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
@@ -112,34 +113,31 @@ def moments_of(target, lanes, rounds=1, **parameters):
 
 
 def made_of(base, rays, light=0.0):
-    """Moments of this ``base``, of which points take nothing off, and of splats, alike for all weightings."""
+    """Moments of this ``base``, of which points take nothing off, and of splats, alike for all candidates."""
     none, gain = np.zeros_like(base), np.ones(base.shape[1])
     isolated = np.zeros((len(base), 1 + len(GUIDED)))
     return moments.Moments(base, none, none + light, none, isolated, gain, 1.0, rays, 4096)
 
 
-def candidate(number: int, served: int, connections: str) -> Configuration:
-    """That of the weighting of this number."""
-    return Configuration.weighted(WEIGHTINGS[number], served, connections)
-
-
-def decision(weighting: Weighting, served: int, connections: str, mean=0.0):
-    chosen = Configuration.weighted(weighting, served, connections)
-    return Decision.of(chosen, first_pass=0, cost=1.0, variance=1.0, mean=mean)
+def decision(way: Configuration, mean=0.0):
+    return Decision.of(way, first_pass=0, cost=1.0, variance=1.0, mean=mean)
 
 
 def forced(*decisions, **parameters):
     return bdpt(decisions=json.dumps([d.record() for d in decisions]), **parameters)
 
 
-ALONE = Weighting(1, 1, 0, 0)
-ALL_ALONE = [candidate(number, 1, "none") for number in range(3)]
-CANDIDATES = {
-    "n0c0": (ALONE, 1, "none"),
-    "n0c0, kappa of s=1": (Weighting(1, 1 / 16, 0, 0), 1, "none"),
-    "n1c0": (Weighting(1, 1, 1 / 16, 0), 4, "none"),
-    "n1c1": (Weighting(1, 1, 1, 1), 1, "all"),
-    "n1c1, one": (Weighting(1, 1, 1 / 4, 1), 4, "one"),
+ALONE = Configuration(0.0, "none", 1.0, 1.0)
+SPLATS = Configuration(1 / 2, "none", 1 / 8, 1.0)
+CONNECTED = Configuration(1 / 4, "one", 1 / 16, 1.0)
+FEW = Configuration(1 / 16, "one", 1 / 4, 1.0)
+BOTH = Configuration(1.0, "one", 1.0, 1.0)
+PREDICTED = {
+    "n0c0": ALONE,
+    "n0c0, kappa of s=1": replace(ALONE, kappa_direct=1 / 16),
+    "n1c0": SPLATS,
+    "n1c1": replace(BOTH, connections="all"),
+    "n1c1, one": CONNECTED,
 }
 
 
@@ -162,7 +160,7 @@ def foretold(make):
     return target, moments_of(target, 1 << 14, rounds=8, **OF_PATHS)
 
 
-@pytest.mark.parametrize("name", CANDIDATES)
+@pytest.mark.parametrize("name", PREDICTED)
 @pytest.mark.parametrize("make", [cornell, lit_caustic, sky])
 def test_predicted_variance(make, name):
     """Rationale: everything chosen rests on it, and it comes from samples that were made in another way.
@@ -172,16 +170,18 @@ def test_predicted_variance(make, name):
     predicted and measured variance agree within 15 %; path tracing alone in the caustic: renders miss most of
     its variance (a few paths in a million carry it), so the prediction may be up to 20 times what they show.
     """
-    weighting, served, connections = CANDIDATES[name]
+    way = PREDICTED[name]
     target, found = foretold(make)
-    number = WEIGHTINGS.index(weighting)
-    base, light = found.variance(found.draw if connections == "one" else 0)[:, :, number].mean(axis=0)
-    predicted = base + served * light
-    integrator = forced(decision(weighting, served, connections), **OF_PATHS)
+    if way.connections == "all":
+        found, number = replace(found, draw=0), BOTH.number
+    else:
+        number = way.number
+    predicted = found.variance()[:, number].mean()
+    integrator = forced(decision(way), **OF_PATHS)
     seeds = range(64 if make is lit_caustic else 32)
     images = np.stack([np.array(integrator.render(target, seed=s, spp=8))[..., :3].mean(-1) for s in seeds])
     measured = 8 * relative_variance(images.astype(float), images.mean(axis=0))
-    if make is lit_caustic and weighting.light == 0:
+    if make is lit_caustic and not way.light_paths:
         assert 0.5 * measured < predicted < 20 * measured
     else:
         assert predicted == pytest.approx(measured, rel=0.15)
@@ -192,7 +192,7 @@ def test_choice(make, light, monkeypatch):
     """Expected: path tracing alone where nothing is to be gained, light subpaths where they pay, with the
     reason in ``skipped`` and ``explain``, for pilots of five seeds. (Under a sky a pilot is asked in long
     renders only; here in this one.)"""
-    monkeypatch.setattr(even_sky, "UNIFORM_SAMPLES", 0)
+    monkeypatch.setattr(uniform, "UNIFORM_SAMPLES", 0)
     target = make(128)
     integrator = bdpt()
     for seed in range(5):
@@ -235,8 +235,10 @@ def test_rare_paths_count_by_how_often_they_are_made():
     for share, expected in ((1 / 160, 160), (1 / 10240, 1024)):
         shares = mi.Vector4f(*({"light": share, "inner": 1 - share}.get(kind, 0) for kind in mis.CLASSES))
         _, parts = sink._parts(mi.Float(1), SimpleNamespace(shares=shares, kind="inner"))
-        lit = [w for w in WEIGHTINGS if w.light]
-        found = [p[0] for w, p in zip(lit, parts["light"], strict=True) if not w.inner]
+        lit = [c for c in CANDIDATES if c.light_paths]
+        found = [
+            p[0] * c.light_paths for c, p in zip(lit, parts["light"], strict=True) if c.connections == "none"
+        ]
         assert len(found) > 1 and found == pytest.approx([expected] * len(found), rel=1e-4)
 
 
@@ -376,19 +378,19 @@ def test_gain_of_points_is_what_nets_leave():
     assert (moments._gain(np.ones((64, 2)), np.ones(64)) == 1).all()  # no variance, nothing to gain
 
 
-def test_gain_of_single_weightings_is_mostly_that_of_all():
-    """Rationale: some 128 pairs of nets know what points leave of all weightings together, and hardly of
+def test_gain_of_single_candidates_is_mostly_that_of_all():
+    """Rationale: some 128 pairs of nets know what points leave of all candidates together, and hardly of
     each. Expected: 0.65 of all leaves 0.65^2 (what 64 points leave over what nets do is 0.65 again); of one
-    weighting that seems to gain ten times as much `OWN_GAIN` counts; one that is ruled out does not."""
-    made = made_of(np.ones((moments.GROUPS, len(WEIGHTINGS))), {})
-    even = replace(made, gain=np.full(len(WEIGHTINGS), 0.65))
-    np.testing.assert_allclose(even.variance(0, True)[:, 0], 0.65**2, rtol=1e-12)
+    candidate that seems to gain ten times as much `OWN_GAIN` counts; one that is ruled out does not."""
+    made = made_of(np.ones((moments.GROUPS, len(CANDIDATES))), {})
+    even = replace(made, gain=np.full(len(CANDIDATES), 0.65))
+    np.testing.assert_allclose(even.variance(True), 0.65**2, rtol=1e-12)
     base = made.base.copy()
     base[:, 0] = np.inf
-    gain = np.where(np.arange(len(WEIGHTINGS)) == 1, 0.05, 0.5)
+    gain = np.where(np.arange(len(CANDIDATES)) == 1, 0.05, 0.5)
     gain[0] = 1
-    seen = replace(made, base=base, gain=gain).variance(0, True)[0, 0]
-    common = (0.05 + 8 * 0.5) / 9
+    seen = replace(made, base=base, gain=gain).variance(True)[0]
+    common = gain[1:].mean()
     expected = 0.05**moments.OWN_GAIN * common ** (1 - moments.OWN_GAIN)
     assert np.isinf(seen[0]) and seen[1] == pytest.approx(expected ** (1.35 + expected))
 
@@ -402,7 +404,8 @@ def test_direct_light_is_never_rare():
     view = camera(64) | {"to_world": T().look_at([0, 2, 4], [0, 1, -4], [0, 1, 0])}
     target = mi.load_dict({"type": "scene", "sensor": view, "floor": floor, "sun": sun})
     found = moments_of(target, 1 << 12, max_depth=3)
-    assert (found.light[:, 3:].mean(axis=0) > 0).all() and (found.rare == 0).all()
+    lit = [c.number for c in CANDIDATES if c.light_paths]
+    assert (found.light[:, lit].mean(axis=0) > 0).all() and (found.rare == 0).all()
 
 
 def test_light_subpaths_from_infinity_cost_more():
@@ -414,9 +417,8 @@ def test_light_subpaths_from_infinity_cost_more():
         target = mi.load_dict({"type": "scene", "sensor": camera(16), **emitters})
         assert of(target).prepared.emitters.far_share == share
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    way = Configuration.weighted(Weighting(1, 1, 1 / 16, 0), 4, "none")
-    more = choice.cost(way, rays) - choice.cost(way, rays | {"far": 0.0})
-    assert more == pytest.approx(choice.COSTS["far"] / 4 / 2)
+    more = choice.cost(SPLATS, rays) - choice.cost(SPLATS, rays | {"far": 0.0})
+    assert more == pytest.approx(choice.COSTS["far"] / 2 / 2)
 
 
 @pytest.mark.parametrize("make, least, most", [(sky, 0.05, 0.5), (cornell, 0.4, 0.9)])
@@ -428,12 +430,12 @@ def test_measured_gain_of_points(make, least, most):
     target, variances = make(), {}
     found = moments_of(target, 1 << 13, rounds=8, hide_emitters=True)
     for points in ("sobol", "independent"):
-        integrator = forced(decision(ALONE, 1, "none"), points=points, hide_emitters=True)
+        integrator = forced(decision(ALONE), points=points, hide_emitters=True)
         renders = (integrator.render(target, seed=seed, spp=NET) for seed in range(64))
         images = np.stack([np.array(image)[..., :3].mean(-1) for image in renders]).astype(float)
         variances[points] = relative_variance(images, images.mean(axis=0))
     measured = variances["sobol"] / variances["independent"]
-    predicted = found.gain[WEIGHTINGS.index(ALONE)]
+    predicted = found.gain[ALONE.number]
     assert least < measured < most and measured / 1.5 < predicted < 1.5 * measured
 
 
@@ -470,7 +472,7 @@ def test_small_caustics_get_their_light(name, monkeypatch):
 def test_decisions_in_explain():
     """Expected: what is replayed is explained, without a pilot."""
     target = cornell(128)
-    text = forced(decision(ALONE, 1, "none")).explain(target, spp=64)
+    text = forced(decision(ALONE)).explain(target, spp=64)
     assert "no light subpaths" in text and "pilot: time" not in text and "(by hand): t<=1: decisions" in text
 
 
@@ -483,7 +485,7 @@ def surroundings(bright=1.0, **emitters):
     return mi.load_dict({"type": "scene", "ground": ground, "map": lit, "sensor": camera(32), **emitters})
 
 
-def test_an_even_sky_decides_without_a_pilot(monkeypatch):
+def test_an_uniform_decides_without_a_pilot(monkeypatch):
     """Expected: under a constant sky, or a map without bright spots, a short render traces camera subpaths
     alone, also one that is too short for a pilot; its record says so and can be replayed, and it is the sky
     scene of `path` in the mean. A sun in the map (the bright pixel is 200 times the mean), another emitter,
@@ -500,29 +502,29 @@ def test_an_even_sky_decides_without_a_pilot(monkeypatch):
         decisions = integrator.statistics["decisions"]
         assert [d["light_paths"] for d in decisions] == [0.0] * alone
         assert (integrator.statistics["rays"]["light"] == 0) == alone
-        assert ("even sky" in integrator.explain(target, spp=4)) == alone
+        assert ("uniform environment" in integrator.explain(target, spp=4)) == alone
     monkeypatch.setattr(pilot, "measure", None)
     integrator = bdpt()
     integrator.render(sky(), spp=1 << 9, develop=False)
-    assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == even_sky.SKY_DIRECT
+    assert integrator.statistics["decisions"][0]["coefficients"]["s=1"] == uniform.UNIFORM_DIRECT
     monkeypatch.undo()
     for target, samples in (
-        (sky(), even_sky.UNIFORM_SAMPLES),
+        (sky(), uniform.UNIFORM_SAMPLES),
         (surroundings(bright=10.0), budget.CHEAP_SAMPLES),
     ):
         render = of(target)
         asked = [
-            even_sky.decision(render.prepared, render.plan, bdpt().settings, n, least) is None
+            uniform.without_pilot(render.prepared, render.plan, bdpt().settings, n, least) is None
             for n, least in ((samples - 1, 0), (samples, 0), (samples, samples + 1))
         ]
         assert asked == [False, True, False]
     for bright, kappa in (
-        (1.5, even_sky.SKY_DIRECT),
+        (1.5, uniform.UNIFORM_DIRECT),
         (10.0, 1.0),
     ):
         # A map worth sampling gets its full weight.
         render = of(surroundings(bright=bright))
-        made = even_sky.decision(render.prepared, render.plan, bdpt().settings, 1 << 14, 0)
+        made = uniform.without_pilot(render.prepared, render.plan, bdpt().settings, 1 << 14, 0)
         assert made.kappa_direct == kappa
     by_hand = bdpt(light_paths=1)
     by_hand.render(sky(), spp=4, develop=False)
@@ -545,15 +547,14 @@ def test_what_costs_more_has_to_gain(connections):
     """
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "far"), 1.0)
     rays["kinds"] = 1
-    inner = float(connections != "none")
-    alone, light = (WEIGHTINGS.index(w) for w in (ALONE, Weighting(1, 1, 1 / 16, inner)))
-    possible = [candidate(alone, 1, "none"), candidate(light, 4, connections)]
-    cost = choice.cost(possible[1], rays)
+    light = {"none": SPLATS, "one": CONNECTED}[connections]
+    possible = [ALONE, light]
+    cost = choice.cost(light, rays)
     needed = cost**choice.CAUTION
     assert needed > 1.02
     for gain, chosen in ((0.99 * needed, False), (1.01 * needed, True)):
-        base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
-        base[:, light] = 1 / (gain * cost)
+        base = np.ones((moments.GROUPS, len(CANDIDATES)))
+        base[:, light.number] = 1 / (gain * cost)
         table = choice.choose(made_of(base, rays), Alternatives(possible, True))
         assert bool(table[0].candidate.light_paths) == chosen
         assert len(table) == 2
@@ -572,22 +573,13 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     random, needed, met = np.random.default_rng(1), re.compile(r"to gain (.*)x, and gains? (.*)x"), set()
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined"), 1.0)
     rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "aimed": 0.01}
-    possible = [
-        Configuration.weighted(w, served, "one" if w.inner else "none")
-        for w in WEIGHTINGS
-        for served in ((1, 2, 4, 8, 16) if w.light else (1,))
-        if served * w.light <= 1
-    ]
-    even = [
-        1 / choice.cost(candidate(n, 16, "one" if w.inner else "none"), rays)
-        for n, w in enumerate(WEIGHTINGS)
-    ]
+    even = [1 / choice.cost(c, rays) for c in CANDIDATES]
     for number in range(200):
-        base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(WEIGHTINGS)))
+        base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(CANDIDATES)))
         found = made_of(np.tile(base, (moments.GROUPS, 1)), rays, light=np.exp(random.uniform(-8, 0)))
         if number % 4 == 0:
             found.isolated[:, 0] = 100.0
-        some = [c for c in possible if c.light_paths or number % 2]
+        some = [c for c in CANDIDATES if c.light_paths or number % 2]
         table = choice.choose(found, Alternatives(some, True, guidable=True))
         for row in table:
             why = choice.why_not(row, table[0])
@@ -598,12 +590,12 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     assert met == {"", "a", "its", "without"}
 
 
-@pytest.mark.parametrize("name, depth", [("veach_bidir", 7)])
-def test_explained_tables_say_why(name, depth):
+def test_explained_tables_say_why(monkeypatch):
     """Expected: in the text of `explain` the first candidate of the table is the chosen one, and those that
-    take less time have their reason beside them; there are some."""
-    target = mi.load_file(str(SCENES / f"{name}.xml"), resolution=64, parallel=False, optimize=False)
-    text = bdpt(max_depth=depth).explain(target, spp=64)
+    take less time have their reason beside them; there are some where costs count four times."""
+    monkeypatch.setattr(choice, "CAUTION", 3.0)
+    target = mi.load_file(str(SCENES / "veach_bidir.xml"), resolution=64, parallel=False, optimize=False)
+    text = bdpt(max_depth=7).explain(target, spp=64)
     rows = re.findall(r"^ +([\d.]+)  light_paths=[^;\n]*(; not chosen: \S+)?", text, re.MULTILINE)
     assert rows[0] == ("1.00", "")
     assert any(why for _, why in rows) and all(why for ratio, why in rows if float(ratio) < 1)
@@ -657,20 +649,23 @@ def test_light_that_only_connections_find():
     def combinations(**scene):
         render = of(mi.load_dict({"type": "scene", "floor": floor, "lamp": lamp, **scene}))
         found = candidates(render.prepared, render.plan, render.settings)
-        return {c.weighting.combination for c in found}
+        return {(c.light_paths > 0, c.connections) for c in found}
 
-    assert combinations(sensor=camera(16)) == {"n0c0", "n1c0", "n1c1"}
-    assert combinations(sensor=camera(16), ball=ball) == {"n1c1"}
-    assert combinations(sensor=lens) == {"n1c0", "n1c1"}
+    alone, splats, connected = (False, "none"), (True, "none"), (True, "one")
+    assert combinations(sensor=camera(16)) == {alone, splats, connected}
+    assert combinations(sensor=camera(16), ball=ball) == {connected}
+    assert combinations(sensor=lens) == {splats, connected}
 
 
-def test_candidates_draw_their_connections():
-    """Rationale: all connections gain nothing over a drawn one in any scene of the benchmark, and what a
-    pilot finds of the outliers of drawing is noisy. Expected: they are no candidate."""
+def test_all_candidates_are_possible_in_a_plain_scene():
+    """Expected: in the box all of them, none twice, and the parameter ``decisions`` takes each; the last one
+    weights strategies as the pilot's samples do, by which their brightness is known."""
     render = of(cornell())
-    found = candidates(render.prepared, render.plan, render.settings)
-    assert {c.connections for c in found} == {"none", "one"}
-    assert len(set(found)) == len(found) == 30
+    assert candidates(render.prepared, render.plan, render.settings) == list(CANDIDATES)
+    assert len(set(CANDIDATES)) == len(CANDIDATES)
+    assert set(CANDIDATES[-1].weights.values()) == {1.0}
+    for way in CANDIDATES:
+        assert forced(decision(way)).settings.decisions == (decision(way),)
 
 
 @cache
@@ -679,12 +674,12 @@ def brightness_of_the_box():
     return np.array(bdpt(skip="none").render(cornell(64), seed=90, spp=512))[..., :3].mean()
 
 
-@pytest.mark.parametrize("name", CANDIDATES)
+@pytest.mark.parametrize("name", PREDICTED)
 def test_decisions_are_unbiased(name):
     """Expected: with any decision, an odd coefficient included, the box has the same brightness (means of
     2^22 samples: standard error 0.1 %, 0.5 % allowed)."""
     target = cornell(64)
-    made = decision(*CANDIDATES[name], mean=0.1)
+    made = decision(PREDICTED[name], mean=0.1)
     if made.light_paths:
         made = replace(made, kappa_light=0.37, kappa_direct=3.3)
     found = np.array(forced(made).render(target, seed=91, spp=1024))[..., :3].mean()
@@ -746,7 +741,7 @@ def test_changed_decisions_change_the_points():
     Expected: the image's own sequence before the change, another one after it, none where nothing changes.
     """
     render = of(cornell())
-    path, full = decision(ALONE, 1, "none"), decision(Weighting(1, 1, 1 / 4, 1), 4, "one")
+    path, full = decision(ALONE), decision(CONNECTED)
     changes = []
     for made in (full, full, path, path, full):
         render.planner.adopt(made, ())
@@ -767,27 +762,27 @@ def test_changed_decisions_change_the_points():
         ("[1]", "writes: entry 0: 1 is no decision"),
         ("{}", "a list of decisions is needed"),
         ('""', "a list of decisions is needed"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": n} for n in (3, 1)]), "[3, 1] must rise"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": 0.5}]), "pass=0.5"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"pass": False}]), "pass=False"),
+        (json.dumps([decision(ALONE).record() | {"pass": n} for n in (3, 1)]), "[3, 1] must rise"),
+        (json.dumps([decision(ALONE).record() | {"pass": 0.5}]), "pass=0.5"),
+        (json.dumps([decision(ALONE).record() | {"pass": False}]), "pass=False"),
         (
-            json.dumps([decision(ALONE, 1, "none").record() | {"light_paths": True}]),
+            json.dumps([decision(ALONE).record() | {"light_paths": True}]),
             "light_paths=True must be",
         ),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"cost": "1"}]), "entry 0: cost='1' must be"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"colour": 0}]), "colour is no part"),
+        (json.dumps([decision(ALONE).record() | {"cost": "1"}]), "entry 0: cost='1' must be"),
+        (json.dumps([decision(ALONE).record() | {"colour": 0}]), "colour is no part"),
         ("[{}]", "writes: entry 0 lacks 'light_paths'"),
-        (json.dumps([decision(ALONE, 1, "none").record(), {}]), "writes: entry 1 lacks 'light_paths'"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": {}}]), "entry 0 lacks 't<=1'"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": 1}]), "is no decision"),
+        (json.dumps([decision(ALONE).record(), {}]), "writes: entry 1 lacks 'light_paths'"),
+        (json.dumps([decision(ALONE).record() | {"coefficients": {}}]), "entry 0 lacks 't<=1'"),
+        (json.dumps([decision(ALONE).record() | {"coefficients": 1}]), "is no decision"),
         ("[" * 100000, "maximum recursion depth"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"mean": 10**400}]), "too large to convert"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"mean": 1e300}]), "mean=1e+300"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"light_paths": 0.3}]), "light_paths=0.3"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "some"}]), "connections='some'"),
-        (json.dumps([decision(ALONE, 1, "none").record() | {"connections": "all"}]), "without light paths"),
+        (json.dumps([decision(ALONE).record() | {"mean": 10**400}]), "too large to convert"),
+        (json.dumps([decision(ALONE).record() | {"mean": 1e300}]), "mean=1e+300"),
+        (json.dumps([decision(ALONE).record() | {"light_paths": 0.3}]), "light_paths=0.3"),
+        (json.dumps([decision(ALONE).record() | {"connections": "some"}]), "connections='some'"),
+        (json.dumps([decision(ALONE).record() | {"connections": "all"}]), "without light paths"),
         (
-            json.dumps([decision(ALONE, 1, "none").record() | {"coefficients": {"t<=1": 1, "s=1": 0}}]),
+            json.dumps([decision(ALONE).record() | {"coefficients": {"t<=1": 1, "s=1": 0}}]),
             "kappa_direct=0.0",
         ),
     ],
@@ -801,7 +796,7 @@ def test_bad_decisions(text, words):
 def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     """Rationale: a sky alone is seen directly, which pilots leave out; `explain` printed a
     table of equals beside a plan that was not the first of them. Expected: no decision, and no table."""
-    monkeypatch.setattr(even_sky, "UNIFORM_SAMPLES", 0)
+    monkeypatch.setattr(uniform, "UNIFORM_SAMPLES", 0)
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "sensor": camera(24)})
     integrator = bdpt()
     assert "time to the same error" not in integrator.explain(scene, spp=1024)
@@ -824,7 +819,7 @@ def test_pilots_without_a_finite_value_say_so():
 
 def test_decisions_that_never_begin_are_named():
     """Expected: one warning names the passes that the render does not have; none where all begin."""
-    made = decision(ALONE, 1, "none")
+    made = decision(ALONE)
     for integrator, late in ((forced(made), ""), (forced(made, replace(made, first_pass=7)), "pass 7 on")):
         with Warned() as warnings:
             integrator.render(cornell(8), spp=2)
@@ -832,7 +827,7 @@ def test_decisions_that_never_begin_are_named():
 
 
 def test_decisions_by_two_hands():
-    text = json.dumps([decision(ALONE, 1, "none").record()])
+    text = json.dumps([decision(ALONE).record()])
     with pytest.raises(RuntimeError, match="decisions together with light_paths, connections, skip"):
         bdpt(decisions=text, light_paths=1)
     with pytest.raises(RuntimeError, match="skip or layers=strategies is contradictory"):
@@ -859,39 +854,30 @@ def test_weights_by_class():
 
 def test_recording_counts_in_short_renders():
     """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
-    subpaths. Expected: with 0.57 of the variance for a sixth more per sample light subpaths are taken for a
+    subpaths. Expected: with 0.6 of the variance for a third more per sample light subpaths are taken for a
     million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
-    light = WEIGHTINGS.index(Weighting(1, 1, 1 / 16, 0))
-    alone = WEIGHTINGS.index(ALONE)
-    possible = [
-        candidate(alone, 1, "none"),
-        candidate(light, 16, "none"),
-    ]
+    possible = [ALONE, FEW]
     rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0, "far": 0.0}
-    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
-    base[:, light] = 0.57
+    rays |= {"joined": 0.0, "evaluated": 0.0, "kinds": 1}
+    base = np.ones((moments.GROUPS, len(CANDIDATES)))
+    base[:, FEW.number] = 0.6
     for samples, lit in ((1 << 20, True), (1 << 16, False)):
         table = choice.choose(made_of(base, rays), Alternatives(possible, True, samples))
         assert bool(table[0].candidate.light_paths) == lit
     fixed = choice.FIXED
-    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16
-    expected = 1 + (extra + fixed["light"] / 2**16) / (4 + fixed["start"] / 2**16)
-    assert choice.cost(possible[1], rays, 1 << 16) == pytest.approx(expected)
-    assert choice.cost(possible[0], rays, 1 << 16) == 1 == choice.cost(possible[0], rays)
+    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16 + choice.COSTS["inner"]
+    more = extra + (fixed["light"] + fixed["inner"]) / 2**16
+    assert choice.cost(FEW, rays, 1 << 16) == pytest.approx(1 + more / (4 + fixed["start"] / 2**16))
+    assert choice.cost(ALONE, rays, 1 << 16) == 1 == choice.cost(ALONE, rays)
 
 
 def test_certainty():
     """Expected: where all parts of a pilot agree the choice is certain; where one of sixteen has seen what
     decides, in about the share 1 - (15/16)^16 = 0.64 of its resamplings (100 of them: 0.05 is its standard
     error, three allowed)."""
-    light = Weighting(1, 1, 1 / 16, 0)
-    alone, lit = (WEIGHTINGS.index(w) for w in (ALONE, light))
-    possible = [
-        candidate(alone, 1, "none"),
-        candidate(lit, 16, "none"),
-    ]
+    possible, alone = [ALONE, SPLATS], ALONE.number
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    base = np.ones((moments.GROUPS, len(WEIGHTINGS)))
+    base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, alone] = 10
     assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == 1
     base[:, alone] = 0.5
@@ -901,19 +887,18 @@ def test_certainty():
     )
 
 
-def test_weightings_in_order():
-    """Rationale: sums are added to the last weightings that have a class. Expected: each class is in use from
-    some weighting on, all of them in the last."""
+def test_candidates_in_order():
+    """Rationale: sums are added to the last candidates that have a class. Expected: each class is in use from
+    some candidate on, all of them in the last."""
     for kind in mis.CLASSES:
-        used = [w.of(kind) > 0 for w in WEIGHTINGS]
+        used = [c.weights[kind] > 0 for c in CANDIDATES]
         assert used == sorted(used) and used[-1]
 
 
 def test_threshold_of_roulette():
     """Expected: a tenth of the mean, less where there is little noise, 0 in a black image."""
-    way = Weighting(1, 1, 1 / 64, 1)
     for variance, mean, expected in ((1.0, 0.5, 0.05), (0.01, 0.5, 0.001), (1.0, 0.0, 0.0)):
-        made = replace(decision(way, 16, "one", mean), variance=variance)
+        made = replace(decision(CONNECTED, mean), variance=variance)
         assert made.threshold == pytest.approx(expected)
 
 
@@ -941,8 +926,7 @@ def test_roulette_follows_the_noise():
     known to 5 %); both images have the same mean. Tolerance of the means: five of the standard errors that
     follow."""
     target, renders = furnace(), {}
-    way = Weighting(1, 1, 1 / 64, 1)
-    usual = decision(way, 16, "one", mean=0.3)
+    usual = decision(FEW, mean=0.3)
     for variance in (1.0, 1e-3):
         integrator = forced(replace(usual, variance=variance), max_depth=-1)
         renders[variance] = np.array(integrator.render(target, seed=1, spp=64))[..., 0].astype(float)

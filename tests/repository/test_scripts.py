@@ -60,7 +60,7 @@ def by_user(monkeypatch, command, *arguments):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("candidates.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
+        ("choices.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         (
             "compare bdpt path --scenes nowhere",
             "scene='nowhere' is neither a scene file nor the name of one",

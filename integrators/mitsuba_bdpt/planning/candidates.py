@@ -1,23 +1,36 @@
-"""The configurations among which a pilot chooses."""
+"""The configurations among which a pilot chooses, and the one under a uniform environment without a pilot."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from ..scene.prepared import PreparedScene
-from ..settings import LIGHT_PATHS, Settings
+from ..settings import Settings
 from ..transport.plan import Plan
-from .configuration import WEIGHTINGS, Configuration
+from .budget import CHEAP_SAMPLES, EVEN
+from .configuration import CANDIDATES, Configuration, Decision
 from .possible import UnreachablePaths, unreachable_paths
 
-SERVED = tuple(round(1 / n) for n in LIGHT_PATHS if n)
+# kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
+# has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
+UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 1 / 2, 2, 1 << 20
+
+# Multiple of the least length of a render with a pilot from which on the pilot's gain there pays for it.
+UNIFORM_TIMES = 10
+
+# As in ``statistics["skipped"]``.
+LEFT_OUT = [
+    {
+        "class": name,
+        "level": "not worth its cost here",
+        "why": "all light comes from a uniform environment, and the render is too short for a pilot",
+    }
+    for name in ("t<=1", "inner")
+]
 
 
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
-    """All configurations that sample the light that ``full`` samples.
-
-    With one inner connection or none: all connections hardly gain (experiments, "Choice of strategies").
-    """
+    """Those of `CANDIDATES` that sample the light that ``full`` samples."""
 
     def lost_without_arrival(plan: Plan) -> tuple[UnreachablePaths, ...]:
         """Paths that are not sampled, when neither t = 0 nor merging counts.
@@ -26,16 +39,36 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
         """
         return unreachable_paths(prepared, replace(plan, arrival=False, merging=False), settings)
 
-    found: list[Configuration] = []
+    def is_possible(candidate: Configuration) -> bool:
+        if candidate.connections != "none" and full.connections == "none":
+            return False
+        return (candidate.light_paths > 0 or not tied) and lost_without_arrival(candidate.plan(full)) == lost
+
     lost = lost_without_arrival(full)
     # A sensor with area sees delta emitters only by light subpaths.
     tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
-    for weighting in WEIGHTINGS:
-        if (weighting.inner and full.connections == "none") or (tied and not weighting.light):
-            continue
-        connections = "one" if weighting.inner else "none"
-        if lost_without_arrival(Configuration.weighted(weighting, 1, connections).plan(full)) != lost:
-            continue
-        most = 1 / weighting.light if weighting.light else 1  # a larger coefficient is of no use
-        found += [Configuration.weighted(weighting, n, connections) for n in SERVED if n <= most]
-    return found
+    return [candidate for candidate in CANDIDATES if is_possible(candidate)]
+
+
+def usual_direct(prepared: PreparedScene) -> float:
+    """kappa of s = 1 with path tracing alone, unless a pilot finds a better one."""
+    return UNIFORM_DIRECT if prepared.emitters.contrast <= UNIFORM else 1.0
+
+
+def without_pilot(
+    prepared: PreparedScene, full: Plan, settings: Settings, samples: int, least: int
+) -> Decision | None:
+    """Decision for a render of ``samples`` samples that needs no pilot, or None.
+
+    Path tracing alone under a uniform environment in a render too short for a pilot (``least`` samples
+    elsewhere): camera subpaths hit the environment wherever its light enters, caustics included, and light
+    subpaths rarely find the way in.
+    """
+    contrast = prepared.emitters.contrast
+    most = max(UNIFORM_TIMES * least, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
+    if samples >= most or not contrast <= EVEN:  # also if it is NaN
+        return None
+    if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
+        return None
+    alone = Configuration(0.0, "none", 1.0, usual_direct(prepared))
+    return Decision.of(alone, first_pass=0, cost=1.0, variance=0.0, mean=0.0)

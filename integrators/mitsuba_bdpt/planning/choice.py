@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..transport.plan import GUIDED, EmissionTables
-from .configuration import WEIGHTINGS, Configuration, Decision
-from .even_sky import SKY_DIRECT
+from .configuration import Configuration, Decision
 from .moments import GROUPS, Moments
 
 # Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
@@ -72,8 +71,8 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
 # experiments, "Choice of strategies".
 CAUTION = 0.15
 
-# With path tracing alone a coefficient of s = 1 other than 1 (uniform environment: `SKY_DIRECT`) has to gain
-# this factor. Without it `veach_mis` takes 1.16 times the time.
+# With path tracing alone a coefficient of s = 1 other than the usual one (`Alternatives.usual_direct`) has to
+# gain this factor. Without it `veach_mis` takes 1.16 times the time.
 DIRECT_GAIN = 1.15
 
 # `certainty` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
@@ -98,13 +97,15 @@ class Alternatives:
     """The ``candidates`` for a render with ``samples`` samples still to come.
 
     ``stratified``: whether its points are stratified, see `moments.Moments.variance`; ``guidable``: whether
-    photon-guided BSDF sampling is possible.
+    photon-guided BSDF sampling is possible; ``usual_direct``: kappa of s = 1 in the absence of a reason for
+    another, see `candidates.usual_direct`.
     """
 
     candidates: list[Configuration]
     stratified: bool
     samples: float = math.inf
     guidable: bool = False
+    usual_direct: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -205,10 +206,9 @@ def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
         for c, v in zip(candidates, variances.tolist(), strict=True)
         if math.isfinite(v)
     ]
-    usual = SKY_DIRECT if moments.rays.get("uniform") else 1
 
     def score(row: Prediction) -> float:
-        is_usual = row.candidate.light_paths or row.candidate.kappa_direct == usual
+        is_usual = row.candidate.light_paths or row.candidate.kappa_direct == alternatives.usual_direct
         return row.score * (1 if is_usual else DIRECT_GAIN)
 
     return sorted(table, key=score)
@@ -216,13 +216,7 @@ def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
     """Variance of each candidate by group of the pilot, shape (`GROUPS`, candidates)."""
-    drawn = moments.variance(moments.draw, stratified)
-    every = moments.variance(0, stratified)
-    columns = [
-        (drawn if c.connections == "one" else every)[:, :, WEIGHTINGS.index(c.weighting)] for c in candidates
-    ]
-    parts = np.stack(columns, axis=1)
-    return parts[:, :, 0] + parts[:, :, 1] * [c.camera_paths_per_light_path for c in candidates]
+    return moments.variance(stratified)[:, [candidate.number for candidate in candidates]]
 
 
 def certainty(moments: Moments, alternatives: Alternatives) -> float:

@@ -1,7 +1,7 @@
 """Configurations of a render: light subpaths, connections, coefficients.
 
-A pilot estimates the variance of each of `WEIGHTINGS`. A `Configuration` adds the numbers of subpaths and
-connections. A `Decision` is a configuration in use with its predictions; it has a JSON form.
+A pilot estimates the variance of each of `CANDIDATES`. A `Decision` is a configuration in use with its
+predictions; it has a JSON form.
 """
 
 from __future__ import annotations
@@ -14,33 +14,6 @@ from .. import components
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
 from ..transport.plan import GUIDED, JOINED, EmissionTables, Plan
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """Coefficients kappa of the classes `mis.CLASSES`, relative to one sample each."""
-
-    hit: float
-    direct: float
-    light: float
-    inner: float
-
-    def of(self, kind: str) -> float:
-        """Coefficient kappa of the class ``kind``."""
-        return getattr(self, kind)
-
-    @property
-    def combination(self) -> str:
-        """``n0c0`` path tracing, ``n1c0`` with light tracing, ``n1c1`` with connections."""
-        return f"n{int(self.light > 0)}c{int(self.inner > 0)}"
-
-
-# In this order each class, once in use, stays in use.
-WEIGHTINGS = (
-    *(Weighting(1, direct, 0, 0) for direct in (1 / 16, 1 / 2, 1)),
-    *(Weighting(1, 1, light, 0) for light in (1 / 64, 1 / 16, 1 / 4)),
-    *(Weighting(1, 1, light, 1) for light in (1 / 64, 1 / 16, 1 / 4, 1)),
-)
 
 
 @dataclass(frozen=True)
@@ -61,21 +34,21 @@ class Configuration:
     emission: EmissionTables | None = field(default=None, kw_only=True)
     joined: int = field(default=1, kw_only=True)
 
-    @classmethod
-    def weighted(cls, weighting: Weighting, served: int, connections: str) -> Configuration:
-        """The configuration of a ``weighting`` with S = ``served``."""
-        return cls(
-            light_paths=1 / served if weighting.light else 0.0,
-            connections=connections,
-            kappa_light=weighting.light * served if weighting.light else 1.0,
-            kappa_direct=float(weighting.direct),
-        )
+    @property
+    def weights(self) -> dict[str, float]:
+        """Coefficient kappa times number of samples of each of `mis.CLASSES`; 0: not in use."""
+        inner = float(self.connections != "none")
+        return {
+            "hit": 1.0,
+            "direct": self.kappa_direct,
+            "light": self.kappa_light * self.light_paths,
+            "inner": inner,
+        }
 
     @property
-    def weighting(self) -> Weighting:
-        """The weighting with the variance of this configuration, up to subpath counts."""
-        inner = float(self.connections != "none")
-        return Weighting(1, self.kappa_direct, self.kappa_light * self.light_paths, inner)
+    def number(self) -> int:
+        """Index of the candidate that this is, whatever was decided beside it."""
+        return CANDIDATES.index(replace(self, guided=0, emission=None, joined=1))
 
     @property
     def camera_paths_per_light_path(self) -> int:
@@ -101,6 +74,26 @@ class Configuration:
         emission = self.emission if adopted.light else None
         return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)
 
+
+# Configurations of which a pilot estimates variances. Each class of strategies, once in use, stays in use; in
+# the last one strategies have the pilot's own weights. See experiments, "Choice of strategies".
+CANDIDATES = tuple(
+    Configuration(*row)
+    for row in (
+        # light subpaths per camera subpath, connections, kappa of t <= 1 over its count, kappa of s = 1
+        (0.0, "none", 1.0, 1 / 16),
+        (0.0, "none", 1.0, 1 / 2),
+        (0.0, "none", 1.0, 1.0),
+        (1 / 2, "none", 1 / 8, 1.0),
+        (1.0, "none", 1 / 4, 1.0),
+        (1 / 16, "one", 1 / 4, 1.0),
+        (1 / 4, "one", 1 / 16, 1.0),
+        (1 / 2, "one", 1 / 32, 1.0),
+        (1.0, "one", 1 / 16, 1.0),
+        (1 / 2, "one", 1 / 2, 1.0),
+        (1.0, "one", 1.0, 1.0),
+    )
+)
 
 # Contributions below a share of the image's mean play roulette before their shadow ray is traced: the smaller
 # of this share and this multiple of a sample's relative variance. It bounds the variance that roulette adds.

@@ -6,6 +6,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
 from .choice import NEAR, Prediction, why_not
+from .configuration import Configuration
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {
@@ -106,31 +107,28 @@ def _aimed(p: Plan) -> str:
     )
 
 
+def _named(candidate: Configuration) -> str:
+    """Describe a candidate by parameters and coefficients."""
+    if not candidate.light_paths:
+        return f"light_paths=0, coefficient of s=1 {candidate.kappa_direct:g}"
+    guided = f", guided={candidate.guided}" if candidate.guided else ""
+    light = f"light_paths=1/{candidate.camera_paths_per_light_path}, connections={candidate.connections}"
+    return f"{light}{guided}, coefficient of t<=1 {candidate.kappa_light:g}"
+
+
 def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> list[str]:
-    """Describe the best prediction of each combination and number of light subpaths."""
+    """Describe the predictions, and the confidence in the first."""
     if not table:
         return []
     head = (
-        "pilot: time to the same error, over that of the chosen (cost of a sample; variance as relMSE, with "
-        "what points take off it):"
+        "pilot: time to the same error, over that of the chosen (cost of a sample; its relMSE, including the "
     )
-    lines = [head]
-    shown: set[tuple[str, str, int, str]] = set()
+    lines = [head + "stratification gain):"]
     for row in table:
-        candidate = row.candidate
-        served, guided = (
-            candidate.camera_paths_per_light_path,
-            f", guided={candidate.guided}" * (candidate.guided > 0),
-        )
-        key = candidate.weighting.combination, candidate.connections, served, guided
-        if key in shown:
-            continue
-        shown.add(key)
-        light = f"light_paths=1/{served}" if candidate.light_paths else "light_paths=0"
         why = why_not(row, table[0])
         lines.append(
-            f"  {row.time / table[0].time:8.2f}  {light}, connections={candidate.connections}{guided} "
-            f"({row.cost:.2f}, {row.variance:.3g})" + (f"; not chosen: {why}" if why else "")
+            f"  {row.time / table[0].time:8.2f}  {_named(row.candidate)} ({row.cost:.2f}, {row.variance:.3g})"
+            + (f"; not chosen: {why}" if why else "")
         )
     if table[0].candidate.guided:
         lines.append(

@@ -1,4 +1,4 @@
-"""Statistics of a pilot: variances of all weightings, and stratification gains.
+"""Statistics of a pilot: variances of all candidates, and stratification gains.
 
 NumPy arithmetic on the arrays of a `pilot.Pilot`, whose module has the equations. `SAMPLE` and `SPLAT` are
 the rows that a pilot stores.
@@ -17,7 +17,7 @@ import numpy as np
 from ..transport import mis
 from ..transport.batch import NET, NETS
 from ..transport.plan import GUIDED
-from .configuration import WEIGHTINGS
+from .configuration import CANDIDATES
 
 if TYPE_CHECKING:
     from ..sensors.records import Region
@@ -52,17 +52,17 @@ class Layout:
         return [x for name in self.parts for x in values[name]]
 
 
-# Number of weightings that use a class of strategies: the last ones.
-_USERS = {kind: sum(w.of(kind) > 0 for w in WEIGHTINGS) for kind in mis.CLASSES}
+# Number of candidates that use a class of strategies: the last ones.
+_USERS = {kind: sum(c.weights[kind] > 0 for c in CANDIDATES) for kind in mis.CLASSES}
 
-# Per camera sample, for each weighting: estimate, and second moments of contributions without t<=1, less
-# their squares; for each weighting with t<=1 the second moments due to t<=1; for each weighting with inner
+# Per camera sample, for each candidate: estimate, and second moments of contributions without t<=1, less
+# their squares; for each candidate with t<=1 the second moments due to t<=1; for each candidate with inner
 # connections the variance of drawing one. Then the number of connected vertices; the tile; in scenes with
 # media the number of evaluated pairs, else 0.
 SAMPLE = Layout(
     {
-        "estimate": len(WEIGHTINGS),
-        "moment": len(WEIGHTINGS),
+        "estimate": len(CANDIDATES),
+        "moment": len(CANDIDATES),
         "light": _USERS["light"],
         "draw": _USERS["inner"],
         "joined": 1,
@@ -79,8 +79,8 @@ SUMS = ("estimate", "moment", "light", "draw")
 SPLAT = Layout(
     {
         "size": 1,
-        "moment": len(WEIGHTINGS),
-        "rare": len(WEIGHTINGS),
+        "moment": len(CANDIDATES),
+        "rare": len(CANDIDATES),
         "light": _USERS["light"],
     }
 )
@@ -102,10 +102,10 @@ LEAST_GAIN = 1e-3
 PER_PIXEL = 2
 
 
-# Weightings of a larger relative variance are ruled out, see `pilot.LOST`.
+# Candidates of a larger relative variance are ruled out, see `pilot.LOST`.
 RULED_OUT = 1e15
 
-# Weight of a weighting's own log stratification gain, from some 128 pairs of nets, against the mean of all.
+# Weight of a candidate's own log stratification gain, from some 128 pairs of nets, against the mean of all.
 OWN_GAIN = 0.3
 
 
@@ -118,11 +118,11 @@ _ARRAYS = (*_OF_GROUPS, "gain", "emission")
 class Moments:
     """What a pilot measured: relative squared error per sample and pixel.
 
-    Variance with independent numbers: ``base`` + S ``light``, plus ``draw`` if one inner connection is drawn.
+    Variance with independent numbers: ``base`` + ``light`` + ``draw``.
 
-    * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, weightings). ``rare``: the part of ``base`` on
-      paths too rare for stratification.
-    * ``gain`` by weighting: the factor that the points of a net leave of ``base`` - ``rare``.
+    * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, candidates). ``rare``: the part of ``base`` on
+      paths too rare for stratification; ``light``: of splats; ``draw``: by drawing one inner connection.
+    * ``gain`` by candidate: the factor that the points of a net leave of ``base`` - ``rare``.
     * ``isolated``, shape (`GROUPS`, numbers): variance of the paths on which s = 0 can be guided, excluded
       from all others: unguided, then with each of `plan.GUIDED` (no columns: not measured).
     * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
@@ -143,20 +143,16 @@ class Moments:
     lanes: int
     emission: np.ndarray = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
-    def variance(self, draw: np.ndarray | float, stratified: bool = False) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, 2, weightings).
-
-        First the part independent of S, including ``draw`` (`Moments.draw`, or 0 for all connections), then
-        the part proportional to S, that of splats. ``stratified``: includes the stratification gain.
-        """
+    def variance(self, stratified: bool = False) -> np.ndarray:
+        """Relative variance per sample, shape (`GROUPS`, candidates); with the stratification gain or not."""
         base = self.base
         if stratified:
             # Not of splats, which land in pixels by chance; see experiments, "Choice of strategies".
             base = self.rare + self._left_by_points() * (base - self.rare)
-        return np.stack([base + draw, self.light], axis=1)
+        return base + self.draw + self.light
 
     def _left_by_points(self) -> np.ndarray:
-        """Stratification gain of the points of a pixel, by weighting.
+        """Stratification gain of the points of a pixel, by candidate.
 
         Extrapolates that of nets of `NET` points (`OWN_GAIN`) to 64; see experiments, "Choice of strategies".
         """
@@ -188,7 +184,7 @@ class Moments:
 class Samples:
     """Camera samples of a pilot, one row each.
 
-    ``estimate`` by weighting; sums of second moments (``moment`` without t <= 1, less the squares that are in
+    ``estimate`` by candidate; sums of second moments (``moment`` without t <= 1, less the squares that are in
     the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; fine ``tile``. Each
     `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
     """
@@ -270,7 +266,7 @@ def moments(
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
     def summed(values: np.ndarray | None, of_splats: str | None = None) -> np.ndarray:
-        """Sums by group and weighting; weightings without ``values`` come first."""
+        """Sums by group and candidate; candidates without ``values`` come first."""
         total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
         if values is not None:
             of_samples = _by_group(values * of_sample) * (GROUPS / count)
@@ -385,7 +381,7 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
 def _gain(estimate: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Variance of a sample in a net over that of an independent one, at most 1.
 
-    By weighting. ``estimate`` of the samples in nets, ``inverse`` of their norms. Unbiased: the squared
+    By candidate. ``estimate`` of the samples in nets, ``inverse`` of their norms. Unbiased: the squared
     difference of two nets' means is twice the variance of a mean; the mean square less the product of the two
     means is the variance of a sample.
     """

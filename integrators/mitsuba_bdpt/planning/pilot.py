@@ -1,7 +1,7 @@
 """A pilot: a few thousand bidirectional samples that estimate all variances.
 
 `choice.choose` decides per image whether light subpaths and inner connections pay, by cost times variance of
-the candidates: path tracing alone, with light tracing, with inner connections, each with several numbers S of
+`CANDIDATES`: path tracing alone, with light tracing, with inner connections, each with several numbers S of
 camera subpaths per light subpath and several coefficients.
 
 All variances come from the *same* samples, which use all strategies (S = 1, all inner connections, balance
@@ -44,8 +44,7 @@ from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan
 from . import isolated, moments
-from .configuration import WEIGHTINGS, Weighting
-from .even_sky import UNIFORM
+from .configuration import CANDIDATES
 from .moments import (
     FINE,
     GROUPS,
@@ -70,7 +69,7 @@ if TYPE_CHECKING:
     from ..transport.subpaths import CameraSample
     from ..transport.walk import Vertex
 
-    # One number for each of the last weightings; a camera sample has one by name of a part of its row.
+    # One number for each of the last candidates; a camera sample has one by name of a part of its row.
     Row = list[mi.Float64]
     Total = dict[str, Row | mi.UInt32]
 
@@ -79,8 +78,8 @@ if TYPE_CHECKING:
 # experiments, "Choice of strategies".
 RAREST = 1024
 
-# Factor of the squared size of a path that a weighting cannot sample; `moments.RULED_OUT` then rules out
-# weightings that miss a millionth of a pixel or more. Smaller misses must pass: rounding leaves cosines of
+# Factor of the squared size of a path that a candidate cannot sample; `moments.RULED_OUT` then rules out
+# candidates that miss a millionth of a pixel or more. Smaller misses must pass: rounding leaves cosines of
 # 1e-20 between points of one plane, and densities that are 0 in single precision.
 LOST = 1e30
 
@@ -231,29 +230,31 @@ class Pilot:
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
 
-        Estimates of the weightings that use its class, and a dictionary of what it adds to ``moment`` and
+        Estimates of the candidates that use its class, and a dictionary of what it adds to ``moment`` and
         ``light``, see `moments.SAMPLE`.
         """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
         own, squares, lights = [], [], []
-        for w in WEIGHTINGS:
-            total = _dot(w, shares, 1)
+        for candidate in CANDIDATES:
+            weights = candidate.weights
+            total = _dot(weights, shares, 1)
             # With inner connections all classes are in use; others may be unable to sample the path.
-            possible = mi.Bool(True) if w.inner else total > 0
+            possible = mi.Bool(True) if weights["inner"] else total > 0
             # Rate of the path relative to the pilot: see `RAREST`.
-            seldom = dr.maximum(1, self._least / _dot(w, shares, 0))
+            seldom = dr.maximum(1, self._least / _dot(weights, shares, 0))
             scale = size / (total * seldom)
             square = dr.square(scale) * seldom
-            moment = dr.select(possible, square * _dot(w, shares | {"light": 0}, 2), lost)
-            if w.of(c.kind):
-                estimate = scale if w.of(c.kind) == 1 else w.of(c.kind) * scale
+            moment = dr.select(possible, square * _dot(weights, shares | {"light": 0}, 2), lost)
+            if weight := weights[c.kind]:
+                estimate = scale if weight == 1 else weight * scale
                 own.append(estimate)
                 if c.kind != "light":
                     moment -= dr.square(estimate)
             squares.append(moment)
-            if w.light:
-                lights.append(dr.select(possible, square * (w.light**2 * shares["light"]), 0))
+            if light := weights["light"]:
+                each = light**2 / candidate.light_paths
+                lights.append(dr.select(possible, square * (each * shares["light"]), 0))
         return own, {"moment": squares, "light": lights}
 
     def _rare(self, size: mi.Float64, c: Contribution, squares: Row) -> Row:
@@ -265,8 +266,8 @@ class Pilot:
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
         return [
-            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(w, shares, 0))))
-            for w, square in zip(WEIGHTINGS, squares, strict=True)
+            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(candidate.weights, shares, 0))))
+            for candidate, square in zip(CANDIDATES, squares, strict=True)
         ]
 
     def _size(self, c: Contribution) -> mi.Float64:
@@ -334,7 +335,6 @@ def measure(
         found = replace(found, isolated=found.isolated[:, :0])
     known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
     known["media"] = float(prepared.space is not None)
-    known["uniform"] = float(prepared.emitters.contrast <= UNIFORM)
     return replace(found, rays=found.rays | known)
 
 
@@ -367,7 +367,7 @@ def _none(n: int) -> Row:
 
 
 def _sums(total: Row, more: Row) -> Row:
-    """Add ``more``, of the last weightings only, to ``total``.
+    """Add ``more``, of the last candidates only, to ``total``.
 
     Entries without an addend stay the same object, so that loops do not store them (see `walk.Walk`).
     """
@@ -375,9 +375,9 @@ def _sums(total: Row, more: Row) -> Row:
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 
 
-def _dot(w: Weighting, shares: Mapping[str, mi.Float | int], power: int):
-    """sum_i kappa_i^power share_i over the classes in use."""
-    terms = [(w.of(kind) and w.of(kind) ** power, share) for kind, share in shares.items()]
+def _dot(weights: Mapping[str, float], shares: Mapping[str, mi.Float | int], power: int):
+    """sum_i weight_i^power share_i over the classes in use."""
+    terms = [(weights[kind] and weights[kind] ** power, share) for kind, share in shares.items()]
     used = [
         share if factor == 1 else factor * share
         for factor, share in terms

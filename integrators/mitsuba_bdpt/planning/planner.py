@@ -17,8 +17,8 @@ from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import LIGHT_PATHS, Settings
 from ..transport.plan import JOINED, EmissionTables, Plan
-from . import budget, choice, even_sky, pilot
-from .candidates import candidates
+from . import budget, choice, pilot
+from .candidates import LEFT_OUT, candidates, usual_direct, without_pilot
 from .configuration import Decision, replayed
 from .explain import words
 from .findings import Findings
@@ -130,7 +130,7 @@ class Planner:
         if not passes and self._settings.decisions is None:
             self.decided = replace(self.decided, no_pilot=settled)
         if decision and not passes:
-            self.adopt(decision, even_sky.LEFT_OUT)
+            self.adopt(decision, LEFT_OUT)
         return not settled
 
     def is_repeat_due(self, passes: tuple[int, ...]) -> bool:
@@ -329,7 +329,7 @@ class Planner:
         samples = self._expected(passes)
         whole = sum(passes) * self._pixels + samples
         least = budget.least_samples(self._prepared.traits)
-        if decision := even_sky.decision(self._prepared, self.full, self._settings, whole, least):
+        if decision := without_pilot(self._prepared, self.full, self._settings, whole, least):
             return "the scene alone decides in a render as short as this", decision
         if samples < least:
             return f"{samples} samples are too few, it takes {least}", None
@@ -338,7 +338,13 @@ class Planner:
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """The alternatives for ``samples`` samples still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
-        return choice.Alternatives(possible, self._settings.points == "sobol", samples, self.full.guidable)
+        return choice.Alternatives(
+            possible,
+            self._settings.points == "sobol",
+            samples,
+            self.full.guidable,
+            usual_direct(self._prepared),
+        )
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Expected number of samples still to come."""
