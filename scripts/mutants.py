@@ -676,8 +676,8 @@ MUTANTS = (
     Mutant(
         "media: the last volume vertex is not joined",
         "media/phase.py",
-        "asked = active | evaluated",
-        "asked = active",
+        "queried = active | evaluated",
+        "queried = active",
         ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[nested]",),
     ),
     Mutant(
@@ -697,8 +697,8 @@ MUTANTS = (
     Mutant(
         "media: lamps start outside",
         "media/light_media.py",
-        "np.where(asked.found, asked.number, self.outside)",
-        "np.where(asked.found, self.outside, self.outside)",
+        "np.where(sides.found, sides.number, self.outside)",
+        "np.where(sides.found, self.outside, self.outside)",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
     Mutant(
@@ -1318,8 +1318,8 @@ MUTANTS = (
     Mutant(
         "guided emission: both halves of a pilot teach and judge",
         "guided_emission/learning.py",
-        "halves = [_fitted(half, times) for half in heard]",
-        "halves = [_fitted(heard[1 - i], times) for i in range(HALVES)]",
+        "halves = [_fitted(half, times) for half in statistics]",
+        "halves = [_fitted(statistics[1 - i], times) for i in range(HALVES)]",
         ("tests/images/test_guided_emission.py::test_noise_teaches_nothing[24]",),
     ),
     Mutant(
@@ -1360,7 +1360,7 @@ MUTANTS = (
         "planning/pilot.py",
         "self._hear(c, size * np.sqrt(self._weight), c.position, c.active)",
         "self._hear(c, size, c.position, c.active)",
-        ("tests/images/test_guided_emission.py::test_what_a_pilot_hears",),
+        ("tests/images/test_guided_emission.py::test_what_a_pilot_accumulates",),
     ),
     Mutant(
         "joined light subpaths: what is drawn evenly is forgotten",

@@ -175,20 +175,20 @@ def test_weights_are_those_of_explicit_densities(lamps, heuristic):
 # -- what a pilot learns --------------------------------------------------------------------------------
 
 
-def heard_of(squares, odds, seed=0, noise=0.0):
+def statistics_of(squares, odds, seed=0, noise=0.0):
     """What two halves of a pilot hear of these second moments (side, side), in one class of ``odds``."""
     rng = np.random.default_rng(seed)
-    heard = np.zeros((2, squares.size, learning.COLUMNS))
+    statistics = np.zeros((2, squares.size, learning.COLUMNS))
     kind = int(np.clip(np.log2(odds) / 2 + CLASSES / 2, 0, CLASSES - 1))
     share = learning.ODDS[kind] / (1 + learning.ODDS[kind])
     for half in range(2):
         found = (squares * np.exp(noise * rng.standard_normal(squares.shape))).ravel()
-        heard[half, :, kind], heard[half, :, CLASSES], heard[half, :, CLASSES + 1] = (
+        statistics[half, :, kind], statistics[half, :, CLASSES], statistics[half, :, CLASSES + 1] = (
             found,
             share * found,
             found,
         )
-    return heard
+    return statistics
 
 
 def test_the_best_table_of_paths_that_emission_alone_makes():
@@ -198,7 +198,7 @@ def test_the_best_table_of_paths_that_emission_alone_makes():
     """
     x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 16))
     squares = np.exp(4 * x + 2 * y)
-    learnt = learning.learn(heard_of(squares, 4.0**4), 16, [1])
+    learnt = learning.learn(statistics_of(squares, 4.0**4), 16, [1])
     root = np.sqrt(squares)
     expected = 0.25 + 0.75 * root / root.mean()
     np.testing.assert_allclose(learnt.tables.densities()[0], expected, rtol=0.08)
@@ -210,8 +210,8 @@ def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
     """Expected: no tables where emission has a 256th part in the densities, whatever the moments are."""
     squares = np.ones((16, 16))
     squares[3:5, 7:9] = 1e4
-    assert learning.learn(heard_of(squares, 4.0**-4), 16, [1]).whole > 0.95
-    few = heard_of(squares, 4.0**4) * 1e-3 + heard_of(np.full((16, 16), 1e4), 4.0**-4)
+    assert learning.learn(statistics_of(squares, 4.0**-4), 16, [1]).whole > 0.95
+    few = statistics_of(squares, 4.0**4) * 1e-3 + statistics_of(np.full((16, 16), 1e4), 4.0**-4)
     assert learning.learn(few, 16, [1]).whole > 0.95
 
 
@@ -221,23 +221,23 @@ def test_the_best_table_of_unequal_shares():
     """
     squares = np.ones((16, 16))
     squares[:, :8] = 3.0
-    often, seldom = heard_of(squares, 4.0**1), heard_of(squares, 4.0**-3)
-    heard = np.where((np.arange(256) % 16 < 8)[None, :, None], seldom, often)
+    often, seldom = statistics_of(squares, 4.0**1), statistics_of(squares, 4.0**-3)
+    statistics = np.where((np.arange(256) % 16 < 8)[None, :, None], seldom, often)
     share = learning.ODDS / (1 + learning.ODDS)
-    whole = heard.sum(axis=0).reshape(16, 16, -1)[..., :CLASSES]
+    whole = statistics.sum(axis=0).reshape(16, 16, -1)[..., :CLASSES]
 
     def moment(high):
         density = np.where(np.arange(16) < 8, high, 2 - high)[None, :, None]
         return (whole / (1 - share + density * share)).sum()
 
     least = min(moment(high) for high in np.linspace(0.05, 1.95, 400))
-    fitted = learning._fitted(heard.sum(axis=0).reshape(1, 16, 16, -1), 1)[0]
+    fitted = learning._fitted(statistics.sum(axis=0).reshape(1, 16, 16, -1), 1)[0]
     found = (whole / (1 - share + fitted[..., None] * share)).sum()
     assert found < 1.02 * least
     assert moment(1.0) > 1.02 * least
 
 
-def test_what_a_pilot_hears():
+def test_what_a_pilot_accumulates():
     """Rationale: of the second moments of light tracing and of camera subpaths each counts once per sample.
     Expected: for the floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the
     number of light subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves).
@@ -257,13 +257,13 @@ def test_what_a_pilot_hears():
         }
     )
     render = rendering.Render(scene, scene.sensors()[0], mi.load_dict({"type": "bdpt"}).settings, 0, 64)
-    heard = []
+    statistics = []
     for times in (1, 4):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(pilot, "LIGHT_TIMES", times)
             found = pilot.measure(render.prepared, render.plan, render.settings, mi.UInt32(5), 1 << 15)
-        heard.append(found.emission.sum(axis=(0, 1))[[CLASSES, CLASSES + 1]])
-    np.testing.assert_allclose(heard[0], heard[1], rtol=0.15)
+        statistics.append(found.emission.sum(axis=(0, 1))[[CLASSES, CLASSES + 1]])
+    np.testing.assert_allclose(statistics[0], statistics[1], rtol=0.15)
 
 
 @pytest.mark.parametrize("side", [24, 16])
@@ -274,8 +274,8 @@ def test_noise_teaches_nothing(side):
     even, odd = np.ones((side, side)), np.ones((side, side))
     odd[side // 4 : side // 2, side // 4 : side // 2] = 400
     for seed in range(20):
-        assert learning.learn(heard_of(even, 16.0, seed, noise=2.0), side, [1]).tables is None
-        assert learning.learn(heard_of(odd, 16.0, seed, noise=1.0), side, [1]).tables is not None
+        assert learning.learn(statistics_of(even, 16.0, seed, noise=2.0), side, [1]).tables is None
+        assert learning.learn(statistics_of(odd, 16.0, seed, noise=1.0), side, [1]).tables is not None
 
 
 def hill(side, height):
@@ -290,11 +290,11 @@ def test_detail_is_kept_where_it_pays():
     the half that judges.
     """
     squares = hill(24, 50)
-    heard = heard_of(squares, 16.0, seed=4, noise=1.2)
+    statistics = statistics_of(squares, 16.0, seed=4, noise=1.2)
     narrow, wide = learning.BLURS[24]
-    ways = [learning._learnt(heard.reshape(2, 1, 24, 24, -1), times, [1]) for times in (narrow, wide)]
+    ways = [learning._learnt(statistics.reshape(2, 1, 24, 24, -1), times, [1]) for times in (narrow, wide)]
     assert narrow < wide and ways[1].left < ways[0].left < learning.PAYS
-    assert learning.learn(heard, 24, [1]) == ways[0]
+    assert learning.learn(statistics, 24, [1]) == ways[0]
 
 
 def test_noise_is_blurred_where_it_would_not_pay():
@@ -304,12 +304,12 @@ def test_noise_is_blurred_where_it_would_not_pay():
     narrow, wide = learning.BLURS[24]
     pays = {narrow: 0, wide: 0}
     for seed in range(20):
-        heard = heard_of(hill(24, 20), 16.0, seed, noise=2.0)
-        ways = {n: learning._learnt(heard.reshape(2, 1, 24, 24, -1), n, [1]) for n in pays}
+        statistics = statistics_of(hill(24, 20), 16.0, seed, noise=2.0)
+        ways = {n: learning._learnt(statistics.reshape(2, 1, 24, 24, -1), n, [1]) for n in pays}
         for n, learnt in ways.items():
             pays[n] += learnt.tables is not None
         both = all(learnt.tables is not None for learnt in ways.values())
-        assert learning.learn(heard, 24, [1]) == ways[narrow if both else wide]
+        assert learning.learn(statistics, 24, [1]) == ways[narrow if both else wide]
     assert pays[wide] >= 2 * pays[narrow] > 0
 
 
@@ -317,7 +317,7 @@ def test_outliers_alone_teach_nothing():
     """Expected: no tables where all that is gained is in the cells with most, and the rest loses."""
     squares = np.exp(np.random.default_rng(2).standard_normal((16, 16)))
     squares[2, 3] = 1e5
-    assert learning.learn(heard_of(squares, 64.0), 16, [1]).tables is None
+    assert learning.learn(statistics_of(squares, 64.0), 16, [1]).tables is None
 
 
 def test_emitters_without_a_part_are_left_alone():
@@ -325,16 +325,16 @@ def test_emitters_without_a_part_are_left_alone():
     squares = np.ones((2, 16, 16))
     squares[0, 4:8, 4:8] = 400
     squares[1] = 1e-3
-    learnt = learning.learn(heard_of(squares, 64.0), 16, [1, 1])
+    learnt = learning.learn(statistics_of(squares, 64.0), 16, [1, 1])
     densities = learnt.tables.densities()
     assert densities[0].std() > 0.5 and (densities[1] == 1).all()
 
 
 @pytest.mark.parametrize("value", [0.0, np.inf, np.nan])
-def test_nothing_heard(value):
+def test_no_statistics(value):
     """Expected: no tables of nothing, and none of what is no number."""
-    heard = np.full((2, 256, learning.COLUMNS), value)
-    assert learning.learn(heard, 16, [1]) == learning.Learnt(None)
+    statistics = np.full((2, 256, learning.COLUMNS), value)
+    assert learning.learn(statistics, 16, [1]) == learning.Learnt(None)
 
 
 # -- renders --------------------------------------------------------------------------------------------

@@ -100,15 +100,15 @@ class _Sampled(Enum):
     BY_SHAPE = 3
 
     @staticmethod
-    def of(emitter, ask_shapes: bool) -> _Sampled:
-        """Choose the sampling of an emitter's points. ``ask_shapes``: see `Context`."""
+    def of(emitter, by_shapes: bool) -> _Sampled:
+        """Choose the sampling of an emitter's points. ``by_shapes``: see `Context`."""
         if not is_textured(emitter):
             return _Sampled.UNIFORMLY
         if not is_sampled_by_texture(emitter):
             return _Sampled.BY_SHAPE
         if is_mapped(emitter.get_shape()):
             return _Sampled.BY_MAP
-        return _Sampled.BY_SHAPE if ask_shapes else _Sampled.BY_TEXTURE
+        return _Sampled.BY_SHAPE if by_shapes else _Sampled.BY_TEXTURE
 
 
 class AreaEmitters(Group):
@@ -133,7 +133,7 @@ class AreaEmitters(Group):
         self._emitters = emitters
         spheres = spheres_of(emitters, context)
         pairs = list(zip(emitters, spheres, strict=True))
-        how = rows(emitters, None, lambda e: _Sampled.of(e, context.ask_shapes))
+        how = rows(emitters, None, lambda e: _Sampled.of(e, context.by_shapes))
         mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
         by_shape = rows(how, None, lambda h: h is _Sampled.BY_SHAPE)
         self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))

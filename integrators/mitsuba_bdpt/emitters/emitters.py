@@ -76,7 +76,7 @@ class Emitters:
         self._starts = Mask([t.supports_emission for t in types])
         self._lights = Mask([t.supports_next_event for t in types])
         redrawn = [group.redraws for group in self.groups if group.redraws]
-        self._asks = Mask([not any(of[i] for of in redrawn) for i in range(self.count)])
+        self._drawn_by_mitsuba = Mask([not any(of[i] for of in redrawn) for i in range(self.count)])
         self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
         dr.make_opaque(self._group, self._pmf, self._inverse)
 
@@ -141,7 +141,7 @@ class Emitters:
         def where(group: Group, mask: mi.Bool):
             return group.place(index, p, d, mask), group.factor(index, p, d, cos, side, mask)
 
-        return self._ask(where, self._supporting("guidable"), index, active)
+        return self._query(where, self._supporting("guidable"), index, active)
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -157,7 +157,7 @@ class Emitters:
         pmf = dr.gather(mi.Float, self._pmf, index, active) if self.count > 1 else mi.Float(1)
         return Chosen(emitter, index, pmf)
 
-    def _ask(
+    def _query(
         self,
         question: Callable[[Group, mi.Bool], Any],
         answering: Sequence[Group],
@@ -203,7 +203,7 @@ class Emitters:
         """
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
-        e = self._ask(
+        e = self._query(
             lambda group, mask: group.sample_emission(chosen, u_point, u_direction, shared, mask),
             self._supporting("supports_emission"),
             chosen.index,
@@ -226,7 +226,7 @@ class Emitters:
         infinity): on surfaces the solid-angle density at the hit times the geometric cosine at y_0.
         """
         chosen = self._chosen(emission.index, active)
-        return self._ask(
+        return self._query(
             lambda group, mask: group.connection_density(chosen, emission, si, mask),
             self._supporting("supports_emission"),
             emission.index,
@@ -236,7 +236,7 @@ class Emitters:
     def direction_density(self, emission: Emission, p, d, active):
         """Density of emission from y_0 along ``d`` to ``p``, in ``pdf_second``'s measure."""
         chosen = self._chosen(emission.index, active)
-        return self._ask(
+        return self._query(
             lambda group, mask: group.direction_density(chosen, emission, p, d, mask),
             self._supporting("connectible_to_sensor"),
             emission.index,
@@ -246,7 +246,7 @@ class Emitters:
     def radiance_towards(self, emission: Emission, d, active):
         """Radiance, intensity (point) or irradiance (delta direction) of y_0 along ``d``."""
         chosen = self._chosen(emission.index, active)
-        return self._ask(
+        return self._query(
             lambda group, mask: group.radiance_towards(chosen, emission, d, mask),
             self._supporting("connectible_to_sensor"),
             emission.index,
@@ -259,9 +259,9 @@ class Emitters:
         """Sample y_0 for the camera vertex ``si``; ``u`` in [0, 1)^2 also selects."""
         chosen, u_x = self._select(u.x, active)
         u = mi.Point2f(u_x, u.y)
-        sampled = active if self._asks.all else self._asks.at(chosen.index, active)
+        sampled = active if self._drawn_by_mitsuba.all else self._drawn_by_mitsuba.at(chosen.index, active)
         ds, weight = chosen.emitter.sample_direction(si, u, sampled)
-        direct = self._ask(
+        direct = self._query(
             lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask),
             self._supporting("supports_next_event"),
             chosen.index,
@@ -309,6 +309,6 @@ class Emitters:
         before.p, before.time, before.wavelengths = previous, si.time, si.wavelengths
         hit = Hit(self.scene, si, before)
         hittable = [group for group in self.groups if type(group) in self._hittable_types]
-        return self._ask(
+        return self._query(
             lambda group, mask: group.hit_densities(chosen, hit, mask), hittable, index, active, hittable
         )

@@ -19,12 +19,12 @@ from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 class Context:
     """Arguments common to all groups of a scene's emitters.
 
-    ``ask_shapes``: points are sampled by the shapes, since emitters' `sample_position` cannot be called.
+    ``by_shapes``: points are sampled by the shapes, since emitters' `sample_position` cannot be called.
     """
 
     scene: mi.Scene
     facts: ShapeFacts
-    ask_shapes: bool
+    by_shapes: bool
 
     @property
     def shape_errors(self) -> rounding.ShapeErrors:

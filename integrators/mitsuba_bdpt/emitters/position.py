@@ -173,13 +173,13 @@ class Projectors:
 
     def sample(self, index, u, active):
         """Sample a direction (world, unit length) and its density (solid angle)."""
-        return self._ask("sample", (mi.Vector3f(0, 0, 1), mi.Float(1)), index, u, active)
+        return self._query("sample", (mi.Vector3f(0, 0, 1), mi.Float(1)), index, u, active)
 
     def pdf_w(self, index, d, active):
         """Density (solid angle) of ``d`` from the projector ``index``; 0 for others."""
-        return self._ask("pdf_w", mi.Float(0), index, d, active)
+        return self._query("pdf_w", mi.Float(0), index, d, active)
 
-    def _ask(self, method, found, index, argument, active):
+    def _query(self, method, found, index, argument, active):
         for number, projector in self._rows:
             mask = active & (index == number)
             found = dr.select(mask, getattr(projector, method)(argument, mask), found)

@@ -57,7 +57,7 @@ class Surfaces:
         mapped = self._textured.chosen
         self.own = Mask(
             [
-                None if e is None else context.ask_shapes or s or m
+                None if e is None else context.by_shapes or s or m
                 for e, s, m in zip(emitters, by_shape, mapped, strict=True)
             ]
         )

@@ -66,8 +66,8 @@ class SmoothMeshes:
         if off > OFF:
             raise UsageError(
                 f"{off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
-                "or measures, are not on the faces that its areas tell: after an edit of faces Mitsuba keeps "
-                f"its table of areas; update {' or '.join(renamed.POSITIONS)} with them, or load the scene "
+                "or measures, are not on the faces of its table of areas, which Mitsuba keeps after an edit "
+                f"of faces; update {' or '.join(renamed.POSITIONS)} with them, or load the scene "
                 "anew"
             )
 

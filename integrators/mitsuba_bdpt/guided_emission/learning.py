@@ -57,7 +57,7 @@ BLURS = {24: (1, 3), 16: (1, 2), 8: (1,), 4: (1,)}
 _STEPS = 16
 
 
-class Listener:
+class EmissionStatistics:
     """Accumulates emission statistics of a pilot, per film tile and cell of the tables.
 
     Per cell: v^2 / D by class, then v^2 without tables, times l and whole (`BEFORE`).
@@ -68,7 +68,7 @@ class Listener:
         self._sums = dr.zeros(mi.Float64, int(np.prod(self._shape)))
         dr.make_opaque(self._sums)
 
-    def hear(
+    def accumulate(
         self,
         shares: mi.Vector4f,
         cell: Cell,
@@ -111,26 +111,26 @@ class Learnt:
     whole: float = 1.0
 
 
-def learn(heard: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
-    """Fit tables to the emission statistics ``heard``, shape (`HALVES`, cells, `COLUMNS`).
+def learn(statistics: np.ndarray, side: int, counts: Sequence[int]) -> Learnt:
+    """Fit tables to emission statistics of shape (`HALVES`, cells, `COLUMNS`).
 
     Tables have ``side`` x ``side`` cells; ``counts``: number of tables per emitter. Uses the first of `BLURS`
     that pays, if the last one pays.
     """
-    heard = heard.reshape(HALVES, -1, side, side, COLUMNS)
-    if not heard.any() or not np.isfinite(heard).all():
+    statistics = statistics.reshape(HALVES, -1, side, side, COLUMNS)
+    if not statistics.any() or not np.isfinite(statistics).all():
         return Learnt(None)
-    ways = [_learnt(heard, times, counts) for times in BLURS[side]]
+    ways = [_learnt(statistics, times, counts) for times in BLURS[side]]
     return ways[-1] if ways[-1].tables is None else next(way for way in ways if way.tables is not None)
 
 
-def _learnt(heard: np.ndarray, times: int, counts: Sequence[int]) -> Learnt:
+def _learnt(statistics: np.ndarray, times: int, counts: Sequence[int]) -> Learnt:
     """Fit tables to statistics blurred ``times`` times."""
-    halves = [_fitted(half, times) for half in heard]
-    guided = _worth_a_table(heard, halves, counts)
+    halves = [_fitted(half, times) for half in statistics]
+    guided = _worth_a_table(statistics, halves, counts)
     judged: dict[float, Learnt] = {}
     for a in LEAST:
-        found = [_left(heard[1 - i], a + (1 - a) * halves[i], guided) for i in range(HALVES)]
+        found = [_left(statistics[1 - i], a + (1 - a) * halves[i], guided) for i in range(HALVES)]
         left, whole = np.mean(found, axis=0)
         if left.max() < 1:
             judged[a] = Learnt(None, float(np.sqrt(left.prod())), float(np.sqrt(whole.prod())))
@@ -138,17 +138,17 @@ def _learnt(heard: np.ndarray, times: int, counts: Sequence[int]) -> Learnt:
     if best.left >= PAYS:
         return best
     least = next(a for a, learnt in judged.items() if learnt is best)
-    densities = least + (1 - least) * _fitted(heard.sum(axis=0), times)
+    densities = least + (1 - least) * _fitted(statistics.sum(axis=0), times)
     densities[~guided] = 1
     return replace(best, tables=EmissionTables.of(densities, best.left))
 
 
-def _worth_a_table(heard: np.ndarray, halves: list[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+def _worth_a_table(statistics: np.ndarray, halves: list[np.ndarray], counts: Sequence[int]) -> np.ndarray:
     """Mask of the tables whose emitter contributes to the gain, cross-validated."""
     a = LEAST[-1]
     saved = sum(
         half[..., CLASSES] - _light_side(half, a + (1 - a) * taught)
-        for half, taught in zip(heard, halves[::-1], strict=True)
+        for half, taught in zip(statistics, halves[::-1], strict=True)
     )
     last = np.cumsum(counts)
     own = [max(saved[end - count : end].sum(), 0) for count, end in zip(counts, last, strict=True)]
@@ -164,20 +164,20 @@ def left_out(learnt: Learnt) -> list[dict[str, str]]:
     return [{"class": "guided emission", "level": "not worth its cost here", "why": why}]
 
 
-def left_by(tables: EmissionTables, heard: np.ndarray) -> float:
-    """Second moment of the light-side strategies that ``tables`` leave of ``heard``."""
-    whole = heard.reshape(HALVES, -1, tables.side, tables.side, COLUMNS).sum(axis=0)
+def left_by(tables: EmissionTables, statistics: np.ndarray) -> float:
+    """Second moment of the light-side strategies that ``tables`` leave of ``statistics``."""
+    whole = statistics.reshape(HALVES, -1, tables.side, tables.side, COLUMNS).sum(axis=0)
     densities = tables.densities()
     guided = (densities != 1).any(axis=(1, 2))
     return float(np.sqrt(_left(whole, densities, guided)[0].prod()))
 
 
-def _fitted(heard: np.ndarray, times: int) -> np.ndarray:
-    """The best densities for the statistics ``heard``, blurred ``times`` times.
+def _fitted(statistics: np.ndarray, times: int) -> np.ndarray:
+    """The best densities for ``statistics`` blurred ``times`` times.
 
     Shape (tables, side, side, `COLUMNS`); 1 in tables without statistics.
     """
-    squares = heard[..., :CLASSES]
+    squares = statistics[..., :CLASSES]
     for _ in range(times):
         squares = _blurred(squares)
     known = squares.any(axis=-1)  # under a sky 5 % of the cells
@@ -209,21 +209,21 @@ def _totals(density: np.ndarray) -> np.ndarray:
     return 1 - _SHARES + density[..., None] * _SHARES
 
 
-def _light_side(heard: np.ndarray, density: np.ndarray) -> np.ndarray:
+def _light_side(statistics: np.ndarray, density: np.ndarray) -> np.ndarray:
     """Second moments of the light-side strategies with these densities."""
-    return (heard[..., :CLASSES] * _SHARES / _totals(density)).sum(axis=-1)
+    return (statistics[..., :CLASSES] * _SHARES / _totals(density)).sum(axis=-1)
 
 
-def _left(heard: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
+def _left(statistics: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
     """What tables ``guided`` by their densities leave of second moments, shape (2, 2).
 
     Times l and whole; of all cells, and of all but `WORST` of the nonempty ones.
     """
-    whole = (heard[..., :CLASSES] / _totals(density)).sum(axis=-1)
-    before = [heard[..., CLASSES + i] for i in range(BEFORE)]
+    whole = (statistics[..., :CLASSES] / _totals(density)).sum(axis=-1)
+    before = [statistics[..., CLASSES + i] for i in range(BEFORE)]
     after = [
         np.where(guided[:, None, None], changed, same)
-        for changed, same in zip((_light_side(heard, density), whole), before, strict=True)
+        for changed, same in zip((_light_side(statistics, density), whole), before, strict=True)
     ]
     some = np.flatnonzero(before[0])
     kept = some[np.argsort(before[0].ravel()[some])[: int(len(some) * (1 - WORST))]]

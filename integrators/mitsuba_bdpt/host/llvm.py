@@ -62,7 +62,7 @@ class Machine:
     system_name: str = "Linux"
     architecture: str = "x86_64"
     has_cuda: Callable[[], bool] = lambda: False
-    """Whether a driver of CUDA can be loaded; asked only where no LLVM is found, since that takes a while."""
+    """Whether a driver of CUDA can be loaded; called only where no LLVM is found, since it is slow."""
 
     @classmethod
     def here(cls) -> Machine:

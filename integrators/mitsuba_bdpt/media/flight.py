@@ -200,7 +200,7 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     if media.gray and not media.scatters:
         return dr.select(collided, 0, throughput), edge
     mei = interaction(ray(dr.select(collided, t, 0)), ray.d, ray)
-    sigma_s, sigma_t = media.ask(edge.medium, coefficients, mei, collided)
+    sigma_s, sigma_t = media.query(edge.medium, coefficients, mei, collided)
     albedo = sigma_s / dr.mean(sigma_t)
     if media.gray:
         return dr.select(collided, polarization.scaled(throughput, albedo), throughput), edge

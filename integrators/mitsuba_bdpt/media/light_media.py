@@ -52,7 +52,7 @@ class LightMedia:
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
         self._space, self._emitters = space, emitters
         rays = _rays_around(sensor, _PROBES, 0)
-        around = _Asked.of(boundaries.near_side(space, rays, mi.Bool(True)), _PROBES)
+        around = _NearSides.of(boundaries.near_side(space, rays, mi.Bool(True)), _PROBES)
         bounds = _bounding_shapes(space.scene)
         leaving = _Leaving.of(space, bounds) if bounds else None
         self.outside = _outside(space, around, leaving)
@@ -90,8 +90,8 @@ class LightMedia:
         number = dr.select(e.infinite, self._outside, number)
         if not self.mixed:
             return number
-        asked = dr.gather(mi.Bool, self._mixed, e.index) & ~e.infinite
-        found = self._near_side(e, asked)
+        traced = dr.gather(mi.Bool, self._mixed, e.index) & ~e.infinite
+        found = self._near_side(e, traced)
         number = dr.select(found.escaped, self._outside, number)
         return dr.select(found.found, found.number, number)
 
@@ -112,9 +112,9 @@ class LightMedia:
         shared = Shared(mi.Float(0), zeros, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(u_point, mi.Point2f(u[1], u[2]), shared, mi.Bool(True))
         target = leaving.points(n, rng) if leaving else None
-        asked = _Asked.of(self._near_side(e, mi.Bool(True), target), n)
-        number = np.where(asked.found, asked.number, self.outside)
-        known = asked.found | asked.escaped
+        sides = _NearSides.of(self._near_side(e, mi.Bool(True), target), n)
+        number = np.where(sides.found, sides.number, self.outside)
+        known = sides.found | sides.escaped
         index = np.array(e.index + dr.zeros(mi.UInt32, n))
         order = np.argsort(index, kind="stable")
         parts = np.split(order, np.searchsorted(index[order], np.arange(1, count)))
@@ -159,7 +159,7 @@ def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _NearSides:
     """A `boundaries.NearSide` as NumPy arrays."""
 
     number: np.ndarray
@@ -167,7 +167,7 @@ class _Asked:
     escaped: np.ndarray
 
     @classmethod
-    def of(cls, side: boundaries.NearSide, count: int) -> _Asked:
+    def of(cls, side: boundaries.NearSide, count: int) -> _NearSides:
         dr.eval(side)  # one kernel
         return cls(*(np.broadcast_to(np.array(x), count) for x in (side.number, side.found, side.escaped)))
 
@@ -209,7 +209,7 @@ class _Leaving:
         local.z = dr.select(dr.arange(mi.UInt32, count) % 2 == 0, local.z, -local.z)
         sides = boundaries.leaving(space, _through_scene(space, through, rng), through, local)
         dr.eval(sides)
-        met = _Asked.of(boundaries.near_side(space, sides.ray, sides.known), count)
+        met = _NearSides.of(boundaries.near_side(space, sides.ray, sides.known), count)
         number, known = (np.broadcast_to(np.array(x), count) for x in (sides.number, sides.known))
         if not known.any():
             return None
@@ -222,7 +222,7 @@ class _Leaving:
         return mi.Point3f(self.p[:, rng.integers(self.p.shape[1], size=count)])
 
 
-def _outside(space: Space, around: _Asked, leaving: _Leaving | None) -> int:
+def _outside(space: Space, around: _NearSides, leaving: _Leaving | None) -> int:
     """The medium of most rays that leave the scene; the sensor's if none does."""
     numbers = np.full(around.escaped.sum(), space.media.sensor)
     if leaving is not None:
@@ -274,7 +274,7 @@ _AT_ONE_POINT = frozenset("PerspectiveCamera ThinLensCamera RadianceMeter".split
 
 
 def _contradiction_of_media(
-    space: Space, sensor: mi.Sensor, around: _Asked, outside: int, bounds: list
+    space: Space, sensor: mi.Sensor, around: _NearSides, outside: int, bounds: list
 ) -> str:
     """Why sensor and boundaries disagree on the media between them; or empty.
 

@@ -113,7 +113,7 @@ class Media:
         """
         if self._extinction is not None and not self.directional:
             return dr.gather(type(self._extinction), self._extinction, number)
-        answer = self.ask(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
+        answer = self.query(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
         return dr.select(active & (number != 0), answer, 0)
 
     def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool):
@@ -125,7 +125,7 @@ class Media:
         majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
         return majorant[0] if self.gray else majorant
 
-    def ask(self, number: mi.UInt32, question, *args):
+    def query(self, number: mi.UInt32, question, *args):
         """Evaluate ``question(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
         *others, active = args
         active = active & (number != 0)
@@ -150,7 +150,7 @@ def interaction(p: mi.Point3f, d: mi.Vector3f, shared) -> mi.MediumInteraction3f
 
 
 def coefficients(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
-    """sigma_s and sigma_t of a medium (1 / scene unit), for `Media.ask`."""
+    """sigma_s and sigma_t of a medium (1 / scene unit), for `Media.query`."""
     sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei, active)
     return mi.UnpolarizedSpectrum(sigma_s), mi.UnpolarizedSpectrum(sigma_t)
 

@@ -74,7 +74,7 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
 def evaluate(space: Space, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
     """Evaluate the phase function of ``medium`` (index) towards the local ``wo``."""
     mei = interaction(si.p, -si.to_world(si.wi), si)
-    return Evaluation(*space.media.ask(medium, _evaluated, mei, si.to_world(wo), active))
+    return Evaluation(*space.media.query(medium, _evaluated, mei, si.to_world(wo), active))
 
 
 def sample(
@@ -93,10 +93,10 @@ def sample(
     wo = si.to_world(target.wo) if target else mi.Vector3f(0, 0, 1)
     evaluated = target.active if target else mi.Bool(False)
     # Subpaths that end here are still connected.
-    asked = active | evaluated
+    queried = active | evaluated
 
-    d, weight, pdf, pdf_rev, joined = space.media.ask(
-        medium, questions, mei, u1, u2, active, wo, evaluated, asked
+    d, weight, pdf, pdf_rev, joined = space.media.query(
+        medium, questions, mei, u1, u2, active, wo, evaluated, queried
     )
     step = Step(
         # Otherwise its length would drift along subpaths: frames are built from directions.

@@ -51,7 +51,7 @@ def _within(media: Media, number, ray, end, active):
     def box(medium: mi.Medium, ray, active):
         return medium.intersect_aabb(ray)
 
-    meets, low, high = media.ask(number, box, ray, active)
+    meets, low, high = media.query(number, box, ray, active)
     low, high = dr.maximum(low, 0), dr.minimum(high, end)
     return low, high, active & meets & (low < high)
 
@@ -73,7 +73,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
         rest = dr.select(going & ~tentative, rest - left, rest)
         t = dr.select(tentative, t + rest / majorant, t)
         mei = interaction(ray(t), ray.d, ray)
-        _, sigma_t = media.ask(number, coefficients, mei, tentative)
+        _, sigma_t = media.query(number, coefficients, mei, tentative)
         null = dr.mean(majorant - sigma_t)
         u, word = sequential(word)
         # The probability of a real collision is the mean over channels; the channels' ratios remain.
@@ -109,7 +109,7 @@ def ratio(media: Media, number, ray, end, word, active):
         going &= t < high
         collisions += dr.select(going, mi.UInt32(1), 0)
         mei = interaction(ray(dr.select(going, t, 0)), ray.d, ray)
-        _, sigma_t = media.ask(number, coefficients, mei, going)
+        _, sigma_t = media.query(number, coefficients, mei, going)
         transmittance = dr.select(going, transmittance * (1 - sigma_t / majorant), transmittance)
         going &= ~dr.all(transmittance == 0)
     depth = dr.select(inside, media.mean(number) * (high - low), 0)

@@ -252,7 +252,7 @@ def moments(
     """The moments of a pilot of independent ``samples`` and ``nets``.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
-    ``isolated`` light is in no sample; ``heard``: see `guided_emission.Listener`.
+    ``isolated`` light is in no sample; ``heard``: see `guided_emission.EmissionStatistics`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]

@@ -60,7 +60,7 @@ from .moments import (
 )
 
 if TYPE_CHECKING:
-    from ..guided_emission import Listener
+    from ..guided_emission import EmissionStatistics
     from ..sampling.points import Stream
     from ..sensors.records import CameraStart, Region
     from ..transport.contribution import Contribution
@@ -116,7 +116,7 @@ class Pilot:
         batch: Batch,
         rarest: float,
         media: bool = False,
-        listener: Listener | None = None,
+        listener: EmissionStatistics | None = None,
     ):
         self._listener = listener
         # Weight of a splat relative to a camera sample.
@@ -201,7 +201,7 @@ class Pilot:
             half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
             tile = tile_of(self._region, position, HEARD_TILES)
             square, active = dr.square(size), active & (size > 0)
-            self._listener.hear(c.shares, c.emission, tile, half, square, active)
+            self._listener.accumulate(c.shares, c.emission, tile, half, square, active)
 
     def evaluate(self, counts: mi.UInt64):
         """Evaluate the recorded kernel together with ``counts``."""
@@ -316,7 +316,7 @@ def measure(
     if everything.teachable and everything.emission is None:
         kernel.cells = components.guided_emission.Cells(prepared.emitters)
         kernel.emitters = kernel.cells.emitters
-        listener = components.guided_emission.Listener(HEARD_TILES**2, kernel.cells.count)
+        listener = components.guided_emission.EmissionStatistics(HEARD_TILES**2, kernel.cells.count)
     pixels = int(region.size.prod())
     stratified = settings.points == "sobol"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0

@@ -338,7 +338,7 @@ def _check_medium(medium: mi.Medium, scene, media) -> Iterator[str]:
         )
     if above > 0:
         yield (
-            f"get_majorant() is less than the extinction at {above:.0%} of the points asked, but flights "
+            f"get_majorant() is less than the extinction at {above:.0%} of the points, but flights "
             "take it for the largest. Return the largest extinction."
         )
 

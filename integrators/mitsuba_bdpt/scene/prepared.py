@@ -62,9 +62,9 @@ def _prepare_bitmaps(found):
     si = dr.zeros(mi.SurfaceInteraction3f)
     held = (v for owner in draws.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
     for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
-        for ask in (texture.eval, texture.eval_1, texture.eval_3):
+        for evaluate in (texture.eval, texture.eval_1, texture.eval_3):
             try:
-                ask(si)
+                evaluate(si)
                 break
             except RuntimeError:  # the implemented call depends on channels, ``raw`` and the variant
                 continue

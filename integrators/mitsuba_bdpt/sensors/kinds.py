@@ -73,7 +73,7 @@ def _meter(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sen
     film = sensor.film()
     if film.sample_border():
         raise UnsupportedError(
-            f"film of irradiance meter {named(sensor)} has sample_border, which asks for points beyond "
+            f"film of irradiance meter {named(sensor)} has sample_border, which needs points beyond "
             "its shape; set it to false"
         )
     shape = sensor.get_shape()
