@@ -26,42 +26,23 @@ from .settings import PARAMETERS, UNLIMITED, Settings, manual
 
 DOCUMENTATION = f"""Bidirectional path tracer (plugin ``bdpt``).
 
-Every path of k edges can be made in k + 2 ways (s, t) with s light vertices and t camera vertices,
-s + t = k + 1 (E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
-All of them are combined by multiple importance sampling.
+Combines all strategies (s, t), with s light and t camera vertices, by multiple importance sampling (E. Veach,
+"Robust Monte Carlo Methods for Light Transport Simulation", 1997, chapter 10).
 
 {manual()}
 
-Values that are not finite, of textures or of plugins of yours, do not enter the image: a contribution that
-is NaN or infinite, or whose weight does not follow from densities that are, counts as zero in a sample that
-counts like any other, so that the rest of the image is as if it were zero in truth.
-``statistics["non_finite"]`` counts them, ``statistics["non_finite_in_pilot"]`` those of the pilots, which
-decide from the rest, and one message of Mitsuba's log (``Warn``) after the render names the parameters that
-hold such numbers. One before the first render of a scene names BSDFs that reflect more light than they
-receive. Another one names lamps without area whose light is missing where it is seen through glass, if that
-is more than a hundredth of the image's: before the first pass where the brightness of the image is known from
-a pilot or from ``decisions``, else after a first pass of one sample per pixel. ``statistics["lost_light"]``
-has the estimated shares by the number of the emitter; they are estimated at the first render, and again after
-edits.
+Non-finite contributions count as zero; ``statistics["non_finite"]`` is their number, and a warning names the
+parameters that hold such values. Other warnings name BSDFs that reflect more light than they receive, and
+light that no strategy samples. Entries of ``statistics``: see `mitsuba_bdpt.Statistics`.
 
-Layers of the film come in this order: colours and alpha, Stokes vectors, features, denoised colours,
-variance, strategies.
+Layers of the film, in this order: colours and alpha, Stokes vectors, features, denoised colours, variance,
+strategies.
 
-``statistics["decisions"]`` is what was decided, by a pilot, by the scene alone or as given, and
-``statistics["no_pilot"]`` why no pilot was asked, or none decided: an empty text where one did, and where
-``decisions`` were given. ``statistics["pilots"]``: how many were asked, and of how many it was remembered
-what they found. They draw the same numbers for all seeds, so that all renders of a scene decide alike.
-
-Attributes: ``statistics``, a dictionary about the last render; ``on_pass``, ``None`` or a function
-that is called with a `rendering.PassReport` after each pass.
-
-Not supported, and refused in words: scalar and Metal variants, derivatives (all other methods of
-``integrator`` ignore gradients), renders under ``dr.freeze``, all ``layers`` but ``variance`` on
-a ``specfilm``. In
-scenes with participating media edges count as in ``volpath``; the medium that an emitter declares is ignored,
-as by ``volpath``: it is found from the boundaries around it. Threads need a scene each: Mitsuba's film
-belongs to it. Emitters and sensors of every kind take part; where one cannot have a strategy (a sensor of a
-class that is not Mitsuba's has no t = 1), it is skipped, and ``explain`` says so.
+Scalar and Metal variants, derivatives, renders under ``dr.freeze``, and ``layers`` but ``variance`` on a
+``specfilm`` raise an error. With participating media edges count as in ``volpath``, and the medium that an
+emitter declares is ignored, as by ``volpath``: it follows from the boundaries around the emitter. Threads
+need a scene each, since Mitsuba's film belongs to it. ``explain`` lists the strategies that an emitter or
+sensor lacks.
 """
 
 
