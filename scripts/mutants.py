@@ -92,7 +92,7 @@ MUTANTS = (
     ),
     Mutant(
         "small arrays are not kept",
-        "host/edits.py",
+        "host/notices.py",
         "kept.append(dr.copy(value))",
         "pass",
         ("tests/host/test_edits.py::test_two_edits_in_between_are_seen",),
@@ -106,7 +106,7 @@ MUTANTS = (
     ),
     Mutant(
         "contents of large arrays do not count",
-        "host/edits.py",
+        "host/notices.py",
         "zlib.crc32(data.view(np.uint8))",
         "0",
         (

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.host import notices
-from mitsuba_bdpt.host.edits import State, _checksum
+from mitsuba_bdpt.host.notices import State, _checksum
 from mitsuba_bdpt.planning import budget, lost_light, pilot
 
 SPP = budget.LEAST_SAMPLES // 32**2

@@ -9,6 +9,7 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -147,7 +148,8 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
         if job.statistics is not None:
             write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
-        say(summary(job.output, outcome, sensor.film().crop_size(), target_error_of(integrator)))
+        target = integrator.settings.target_error if is_ours(integrator) else 0
+        say(summary(job.output, outcome, sensor.film().crop_size(), target))
     finally:
         ending.patient = False
     if outcome.error is not None:
@@ -248,18 +250,15 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
     """Render into the sensor's film, with progress."""
     film = choose_sensor(scene, options.sensor).film()
+    if not is_ours(integrator):
+        return render_foreign(scene, integrator, options, spp)
     watchers = [] if options.preview is None else [Preview(options, film)]
     if options.scheduler is None:
-        if options.time is not None and not hasattr(integrator, "on_pass"):
-            return render_repeatedly(scene, integrator, options, spp)
         return render_here(scene, integrator, options, spp, watchers)
     started = time.perf_counter()
-    shown = display(options.progress)
-    try:
+    with closing(display(options.progress)) as shown:
         watch = all_of([shown, *watchers])
         statistics, ended = cluster.render(scene, integrator, options, spp, watch)
-    finally:
-        shown.close()
     seconds, done = time.perf_counter() - started, sum(statistics["passes"])
     error = ended if isinstance(ended, Exception) else None
     return Outcome(seconds, done, ended is not None, statistics=statistics, error=error)
@@ -286,21 +285,15 @@ class Preview:
         self._last = time.monotonic()
 
 
-def all_of(watchers: Iterable[Callable]) -> Callable[[PassReport], None]:
+def all_of(watchers: list[Callable]) -> Callable[[PassReport], object]:
     """Return a function that calls all ``watchers`` with a report."""
-
-    def watch(report: PassReport) -> None:
-        for watcher in watchers:
-            watcher(report)
-
-    return watch
+    return lambda report: [watcher(report) for watcher in watchers]
 
 
 def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
     """Render in this process, with checkpoints if requested."""
     started, interrupted = time.perf_counter(), False
-    if hasattr(integrator, "statistics"):
-        integrator.statistics = {}  # not those of the previous render
+    integrator.statistics = {}  # not those of the previous render
     kept, limit = None, options.time
     start = checkpoints.start(options, options.output)
     if start is not None:
@@ -309,29 +302,20 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, options.output)
         watchers = [kept.after_pass, *watchers]
-    shown = display(options.progress, limit, is_open_ended(options))
-    try:
-        if hasattr(integrator, "on_pass"):
-            integrator.on_pass = all_of([*watchers, shown])
-        arguments = {} if start is None else {"start": start}
-        integrator.render(scene, options.sensor, options.seed, spp, not is_ours(integrator), **arguments)
-        dr.sync_thread()
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        shown.close()
-        if hasattr(integrator, "on_pass"):
+    with closing(display(options.progress, limit, is_open_ended(options))) as shown:
+        integrator.on_pass = all_of([*watchers, shown])
+        try:
+            integrator.render(scene, options.sensor, options.seed, spp, develop=False, start=start)
+            dr.sync_thread()
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
             integrator.on_pass = None
-    statistics = getattr(integrator, "statistics", None) or {}
-    done = spp
-    if "passes" in statistics:
-        done = int(sum(statistics["passes"]))
-    elif interrupted:
-        # Mitsuba's own integrators leave no partial image.
-        done = 0
+    statistics, target = integrator.statistics, integrator.settings.target_error
+    done = int(sum(statistics.get("passes", ())))
     outcome = Outcome(time.perf_counter() - started, done, interrupted, statistics=statistics)
     if kept is not None:
-        whole = done == spp or reached(target_error_of(integrator), statistics)
+        whole = done == spp or (0 < target and statistics.get("error", math.inf) <= target)
         # A finished render keeps it until the image is written.
         if whole and not interrupted:
             outcome.written = kept.remove
@@ -341,41 +325,33 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
 
 
 def is_ours(integrator: mi.Integrator) -> bool:
-    """Return whether this is `bdpt`, which need not develop; `prb` renders only then."""
+    """Return whether this is `bdpt`."""
     return hasattr(integrator, "assemble")
 
 
-def target_error_of(integrator) -> float:
-    """Return the parameter ``target_error``; 0 for other integrators than `bdpt`."""
-    return getattr(getattr(integrator, "settings", None), "target_error", 0)
+def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
+    """Render by an integrator of Mitsuba's.
 
-
-def reached(target_error: float, statistics: Mapping) -> bool:
-    """Return whether the ``target_error``, if not 0, is reached."""
-    return 0 < target_error and statistics["error"] <= target_error
-
-
-def render_repeatedly(scene, integrator, options: Namespace, spp: int) -> Outcome:
-    """Render with consecutive seeds until the time limit; the film has the mean.
-
-    Mitsuba's integrators ignore their timeout in vectorised variants.
+    They ignore their timeout in vectorised variants: under a time limit, renders with consecutive seeds until
+    it is over; the film has the mean.
     """
     started, done, total, interrupted = time.perf_counter(), 0, 0.0, False
-    film = choose_sensor(scene, options.sensor).film()
-    shown = display(options.progress, options.time, is_open_ended(options))
-    try:
-        while done < spp and (done == 0 or time.perf_counter() - started < options.time):
-            size, seed = min(PASS_SPP, spp - done), options.seed + done // PASS_SPP
-            integrator.render(scene, options.sensor, seed, size)
-            # Raw sums include their weights, so passes of any size add up.
-            total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
-            done += size
-            shown(Report(done, spp, time.perf_counter() - started, 0, None))
-    except KeyboardInterrupt:
-        interrupted = True
-    finally:
-        shown.close()
-    if done:
+    film, limit = choose_sensor(scene, options.sensor).film(), options.time
+    size = spp if limit is None else min(PASS_SPP, spp)
+    with closing(display(options.progress, limit, is_open_ended(options))) as shown:
+        try:
+            while done < spp and (done == 0 or time.perf_counter() - started < limit):
+                size, seed = min(size, spp - done), options.seed + done // PASS_SPP
+                integrator.render(scene, options.sensor, seed, size)
+                dr.sync_thread()
+                if limit is not None:
+                    # Raw sums include their weights, so passes of any size add up.
+                    total = total + size * np.array(film.develop(raw=True), dtype=np.float64)
+                done += size
+                shown(Report(done, spp, time.perf_counter() - started, 0, None))
+        except KeyboardInterrupt:
+            interrupted = True
+    if done and limit is not None:
         film.prepare(integrator.aov_names())
         mean = mi.TensorXf((total / done).astype(np.float32))
         film.put_block(mi.ImageBlock(mean, film.crop_offset(), border=False))

@@ -13,7 +13,6 @@ from ..geometry.boxes import scene_box
 from ..geometry.mitsubas_choices import (
     TEXTURE_SAMPLED,
     check_densities,
-    is_sampled_by_direction,
     is_sampled_by_texture,
     is_textured,
 )
@@ -46,7 +45,7 @@ class _Sphere:
     @staticmethod
     def of(emitter, sphere, extent) -> _Sphere:
         """Parameters of an emitter in a scene of diameter ``extent``."""
-        if sphere is None or not is_sampled_by_direction(emitter):
+        if sphere is None or is_textured(emitter):  # a texture is sampled from every position
             return _Sphere()
         return _Sphere(
             center=sphere.center,

@@ -13,7 +13,7 @@ texture
 texture coordinates of rectangles, disks and  `textured.TexturedPoints`            `check_densities`, here
 spheres
 spheres seen from inside: by area, up to      `quadrics.Sphere.inner_radius`,      `check_densities`, here
-``RayEpsilon`` beyond the radius              `is_sampled_by_direction`, here
+``RayEpsilon`` beyond the radius              `area._Sphere`
 spheres seen from outside: a uniform          `quadrics.cone_pdf_w`                none: Mitsuba's formula
 direction in their cone                                                            without its cancellation
 turned spheres: the point is rotated by       `quadrics.Sphere.turned`,            none: normals follow
@@ -73,14 +73,6 @@ def is_sampled_by_texture(emitter) -> bool:
         return math.isfinite(number(children(emitter)["radiance"].mean()))
     except RuntimeError:  # a texture without a mean
         return True
-
-
-def is_sampled_by_direction(emitter) -> bool:
-    """Whether next-event estimation of a light on a sphere samples a direction.
-
-    It does if the light has no texture; a texture is sampled from every position.
-    """
-    return not is_textured(emitter)
 
 
 def check_densities(emitters, emitter, index: int, by_mitsuba: bool = True):

@@ -8,9 +8,8 @@ from typing import TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from ..host.edits import State
 from ..host.introspection import all_shapes
-from ..host.notices import cached
+from ..host.notices import State, cached
 from .rounding import ShapeErrors
 from .to_world import check_inverse
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -125,7 +126,7 @@ class Media:
         majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
         return majorant[0] if self.gray else majorant
 
-    def query(self, number: mi.UInt32, question, *args):
+    def query(self, number: mi.UInt32, question, *args) -> Any:
         """Evaluate ``question(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
         *others, active = args
         active = active & (number != 0)

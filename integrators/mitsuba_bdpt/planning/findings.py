@@ -7,8 +7,7 @@ from typing import TypeVar
 
 import mitsuba as mi
 
-from ..host.edits import State
-from ..host.notices import cached
+from ..host.notices import State, cached
 from ..scene.prepared import PreparedScene
 
 Found = TypeVar("Found")

@@ -19,9 +19,8 @@ from ..errors import UsageError
 from ..geometry.boxes import is_finite, points_in, scene_box
 from ..geometry.directions import random_directions, symmetric_frame
 from ..geometry.mitsubas_choices import spread_points
-from ..host.edits import State
 from ..host.introspection import children, named
-from ..host.notices import cached
+from ..host.notices import State, cached
 
 _COUNT = 4096  # samples of a plugin
 
