@@ -451,7 +451,7 @@ def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
     assert main(["compare", "bdpt", "path", *words]) == 2
     assert f"'project/references': File exists{remedy}" in capsys.readouterr().err
     assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
-    assert f"'file': File exists{remedy}" in capsys.readouterr().err
+    assert "output='file/rows.csv' cannot be written (File exists)" in capsys.readouterr().err
     assert not (here / "project" / "renders").exists()
 
 

@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError, behind
-from ..files.images import check_channels, check_png, prepare_output, write_images, write_png
+from ..files.images import check_channels, check_output, check_png, write_images, write_png
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
@@ -66,7 +66,7 @@ def _run(options: Namespace, ending: Ending) -> int:
     check_file(options.scene)  # before creating the image's folder
     jobs = jobs_of(options)
     for job in jobs:
-        prepare_output(job.output)
+        check_output(job.output, ".exr")
         if job.statistics is not None:
             job.statistics.parent.mkdir(parents=True, exist_ok=True)
             check_writable(job.statistics)

@@ -49,24 +49,6 @@ def check_png(film: mi.Film) -> None:
         )
 
 
-def prepare_output(output: Path) -> None:
-    """Create the folder of `output`; raise an error now if it is not writable."""
-    if output.suffix.lower() != ".exr":
-        raise CommandError(
-            f"output={str(output)!r} must end in .exr; a PNG is written beside it in any case."
-        )
-    for path in (output, output.with_suffix(".png")):
-        check_format(path, output)
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        for path in (output, output.with_suffix(".png")):
-            check_writable(path)
-    except OSError as error:
-        raise CommandError(
-            f"output={str(output)!r} cannot be written ({error.strerror}); name another with -o."
-        ) from error
-
-
 def attribute(path: Path, name: str) -> str | None:
     """Return a text of an EXR header; None if it is missing, or the file is no EXR."""
     if not path.is_file():
@@ -150,19 +132,26 @@ def two_threads():
 
 
 def check_output(path: Path, suffix: str) -> None:
-    """Raise an error, before the render, if an output cannot be written.
+    """Create the folder of an output; raise an error now if the output cannot be written.
 
     That is an output of another ``suffix``, not writable, or one that would overwrite an image of another
-    format (the EXR, or the PNG of its name). Creates the output's folder.
+    format (the EXR, or the PNG beside it).
     """
-    if suffix == ".exr":
-        prepare_output(path)
-        return
+    is_exr = suffix == ".exr"
     if path.suffix.lower() != suffix:
-        raise CommandError(f"output={str(path)!r} must end in {suffix}")
-    check_format(path, path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(path)
+        more = "; a PNG is written beside it in any case." if is_exr else ""
+        raise CommandError(f"output={str(path)!r} must end in {suffix}{more}")
+    files = [path, path.with_suffix(".png")] if is_exr else [path]
+    for file in files:
+        check_format(file, path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for file in files:
+            check_writable(file)
+    except OSError as error:
+        raise CommandError(
+            f"output={str(path)!r} cannot be written ({error.strerror}); name another with -o."
+        ) from error
 
 
 def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):

@@ -122,6 +122,18 @@ class _Faces:
         return _Faces(normals, corners, np.array(chosen.cdf), dr.slice(chosen.sum()))
 
 
+def _arrays(params) -> list[np.ndarray]:
+    """Faces, vertex positions and normals of a mesh, (n, 3).
+
+    By parameters: a shape that Python first met as an emitter's has no mesh methods.
+    """
+    parts = renamed.faces(params), renamed.positions(params), renamed.normals(params)
+    return [
+        np.array(part, dtype=kind).reshape(-1, 3)
+        for part, kind in zip(parts, (int, float, float), strict=True)
+    ]
+
+
 def _curved_faces(shape):
     """Cross products of faces' edges, (faces, 3), on the side of hits' normals.
 
@@ -133,9 +145,7 @@ def _curved_faces(shape):
     # Rectangles have no vertices; other meshes may have no vertex normals.
     if not renamed.holds_a_mesh(params) or not len(renamed.normals(params)):
         return None
-    faces = np.array(renamed.faces(params)).reshape(-1, 3)
-    p = np.array(renamed.positions(params), dtype=np.float64).reshape(-1, 3)
-    n = np.array(renamed.normals(params), dtype=np.float64).reshape(-1, 3)
+    faces, p, n = _arrays(params)
     if faces.max(initial=0) >= len(p):
         raise UsageError(
             f"the emitting mesh {named(shape)} has a face with vertex {faces.max()} of {len(p)}; "
@@ -161,12 +171,7 @@ def is_flat(shape: mi.Shape) -> bool:
         return True
     if shape.shape_type() != mi.ShapeType.Mesh.value:
         return False
-    # By parameters: a shape that Python first met as an emitter's has no mesh methods.
-    params = own_parameters(shape)
-    faces = np.array(renamed.faces(params), dtype=np.int64).reshape(-1, 3)
-    vertices, normals = (
-        np.array(of(params), dtype=float).reshape(-1, 3) for of in (renamed.positions, renamed.normals)
-    )
+    faces, vertices, normals = _arrays(own_parameters(shape))
     if not len(faces) or faces.max() >= len(vertices):
         return False
     a, b, c = vertices[faces].transpose(1, 0, 2)

@@ -126,30 +126,23 @@ class PassPoints:
 
         ``changes``: number of changes of the plan before, see `Planner.adopt`.
         """
-        seed = self.seed
-        number = step.replicate + (CHANGED + changes if changes else 0)
-        if number:
-            seed = sequence_seed(self.seed, number)
-        return Points(self._kind, seed)
+        return Points(self._kind, self._seed_of(step, changes, self.seed))
 
     def wavelengths(self, step: Step, done: int, changes: int) -> WavelengthSets:
         """Return the wavelengths of a merging pass, after ``done`` passes of its image."""
-        start, _ = sequential(self._seed_beside(WAVELENGTHS, step, changes))
+        start, _ = sequential(self._seed_of(step, changes, sequence_seed(self.seed, WAVELENGTHS)))
         return WavelengthSets.of(start, done)
 
-    def _seed_beside(self, sequence: int, step: Step, changes: int) -> mi.UInt32:
-        """Return the seed of a ``sequence``, distinct by replicate and change of plan."""
-        seed = sequence_seed(self.seed, sequence)
-        if number := step.replicate + (CHANGED + changes if changes else 0):
-            seed = sequence_seed(seed, number)
-        return seed
+    def _seed_of(self, step: Step, changes: int, seed: mi.UInt32) -> mi.UInt32:
+        """Return a seed from ``seed`` that is distinct by replicate and change of plan."""
+        number = step.replicate + (CHANGED + changes if changes else 0)
+        return sequence_seed(seed, number) if number else seed
 
     def of_photons(self, step: Step, done: int, changes: int) -> Points:
         """Return the points of the photons of a pass, after ``done`` passes of its image."""
-        seed = self._seed_beside(PHOTONS + done, step, changes)
-        return Points(self._kind, seed)
+        seed = sequence_seed(self.seed, PHOTONS + done)
+        return Points(self._kind, self._seed_of(step, changes, seed))
 
     def of_guide(self) -> Points:
         """Return the points of the photons that guide BSDF sampling."""
-        seed = sequence_seed(self.seed, GUIDE)
-        return Points(self._kind, seed)
+        return Points(self._kind, sequence_seed(self.seed, GUIDE))
