@@ -24,6 +24,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import CommandError, FailureError, UnsupportedError
 from mitsuba_bdpt.files import images
 from mitsuba_bdpt.files.loading import in_proportion, load
+from mitsuba_bdpt.progress import Report
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "render.py"
 
@@ -65,31 +66,33 @@ def read(path):
 
 
 class Passes(mi.SamplingIntegrator):
-    """Two passes of 3 and 2 spp with reports; ``stop_after`` interrupts after so many of them."""
+    """Two passes of 3 and 2 spp with reports, as bdpt's; ``stop_after`` interrupts after so many of them."""
+
+    assemble = None
 
     def __init__(self, props):
         super().__init__(props)
-        self.settings = {key: props[key] for key in props.keys()}
+        self.given = {key: props[key] for key in props.keys()}
+        self.settings = SimpleNamespace(target_error=0)
         self.stop_after = props.get("stop_after", 2)
         self.on_pass = None
         self.statistics = {}
         self.calls = []
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        assert develop, "as integrators do that are not asked by bdpt's attributes"
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True, start=None):
         passes, film = [], scene.sensors()[sensor].film()
         film.prepare([])
         for spp_of_pass in (3, 2)[: self.stop_after]:
             passes.append(spp_of_pass)
             rays = 1000 * len(passes)
-            self.on_pass(SimpleNamespace(spp_done=sum(passes), spp_total=5, seconds=0.1, rays=rays))
+            self.on_pass(Report(sum(passes), 5, 0.1, rays, None))
         block = film.create_block()
         block.put(mi.Point2f(3, 2), [mi.Float(0.5), mi.Float(0.5), mi.Float(0.5), mi.Float(1)])
         film.put_block(block)
         self.statistics = {
             "passes": passes,
             "rays": {"camera": 1500, "light": 500},
-            "settings": self.settings | {"spp": spp, "seed": seed},
+            "settings": self.given | {"spp": spp, "seed": seed},
         }
         if self.stop_after < 2:
             raise KeyboardInterrupt
