@@ -21,8 +21,7 @@ import mitsuba_bdpt  # noqa: F401  (chooses LLVM before Dr.Jit is imported)
 import numpy as np
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import write_text
-from mitsuba_bdpt.measure.report import replace_part
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.tables import replace_part, table
 
 import mitsuba as mi  # isort: skip
 

@@ -34,8 +34,7 @@ from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_json, write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.report import replace_part
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.tables import replace_part, table
 from mitsuba_bdpt.settings import HEURISTICS
 
 import mitsuba as mi  # isort: skip

@@ -2,14 +2,13 @@
 
     python scripts/gpu.py --output docs/reports/cuda.json            # all scenes of the benchmark
     python scripts/gpu.py --output docs/reports/cuda.json --report   # the page of the file that is there
-    python scripts/gpu.py --ablation --output docs/reports/cuda_ablation.json   # where time goes: ablation.py
 
 Every scene has a process of its own, eight at a time. First they render all methods once, side by side, which
 compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed. (Thirty
 side by side run out of memory: each keeps stacks for all threads of the GPU.) 128^2 pixels, as many
 samples per pixel for every method; `path` (`volpath` in media) with the sampler `multijitter`. An error is
 the median relMSE over seeds against the reference that is committed, raw and without the worst pixels; the
-ratio over `path` that of errors times seconds. Bias: `bias_check` of 16 renders against the reference.
+ratio over `path` that of errors times seconds. Bias: `compare_means` of 16 renders against the reference.
 """
 
 from __future__ import annotations
@@ -18,23 +17,22 @@ import argparse
 import json
 import multiprocessing
 import time
+from functools import partial
 from pathlib import Path
 
 import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import ablation
 import numpy as np
 import repository
-from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
-from mitsuba_bdpt.measure.efficiency import equal_time_speedup
-from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.measure.analysis import speedup
+from mitsuba_bdpt.measure.results import relative_errors
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import ratio, table
-from mitsuba_bdpt.measure.timing import timed
+from mitsuba_bdpt.measure.timing import Timed, alternating, timed
 
 SPP, SEEDS = 256, 16
 METHODS = {
@@ -60,23 +58,21 @@ def subject(name: str) -> tuple[dict, int]:
     return made, depth
 
 
-def row(name: str, reference, method: str, scene, integrator) -> dict:
-    """What one method does in a scene."""
-    found = [timed(scene, integrator, SPP, seed) for seed in range(1, SEEDS + 1)]
-    images = [image for image, _ in found]
-    errors = [rel_mse(image, reference.image) for image in images]
-    trimmed = [rel_mse(image, reference.image, TRIM) for image in images]
+def row(name: str, reference, method: str, found: list[Timed]) -> dict:
+    """What the renders of one method do in a scene."""
+    errors = [relative_errors(one.image, reference) for one in found]
     judged = None
     if reference.means is not None:
-        check = compare_means(Means.of([tile_columns(image) for image in images]), reference.means)
+        means = Means.of([tile_columns(one.image) for one in found])
+        check = compare_means(means, reference.means)
         judged = {"passed": bool(check.passed), "p": float(check.p)}
     return {
         "scene": name,
         "method": method,
-        "seconds": float(np.median([seconds for _, seconds in found])),
-        "rel_mse": float(np.median(errors)),
-        "trimmed": float(np.median(trimmed)),
-        "mean": float(np.mean(images)),
+        "seconds": float(np.median([one.seconds for one in found])),
+        "rel_mse": float(np.median([error["rel_mse"] for error in errors])),
+        "trimmed": float(np.median([error["rel_mse_trimmed"] for error in errors])),
+        "mean": float(np.mean([one.image for one in found])),
         "bias": judged,
     }
 
@@ -86,16 +82,16 @@ def measure(name: str, variant: str, compiled, turn, results) -> None:
     mi.set_variant(variant)
     try:
         methods, depth = subject(name)
-        first = {}
-        for method, (scene, integrator) in methods.items():
-            first[method] = timed(scene, integrator, SPP, 0)[1]
+        renders = [partial(timed, *made, SPP) for made in methods.values()]
+        first = [render(0).seconds for render in renders]
         wait(compiled)
         reference = repository.load_reference(name, repository.RESOLUTION, depth)
         with turn:
-            rows = [
-                row(name, reference, method, *made) | {"first_seconds": first[method]}
-                for method, made in methods.items()
-            ]
+            turns = list(alternating(renders, SEEDS, is_warm=True))
+        rows = [
+            row(name, reference, method, list(found)) | {"first_seconds": seconds}
+            for method, found, seconds in zip(methods, zip(*turns, strict=True), first, strict=True)
+        ]
         results.put((name, rows, versions()))
     except Exception as error:  # the others go on; it is in the file
         results.put((name, f"{type(error).__name__}: {error}", versions()))
@@ -157,8 +153,8 @@ def page(found: dict) -> str:
                 f"{1e3 * ours['seconds']:.0f}",
                 f"{1e3 * path['seconds']:.0f}",
                 f"{ours['trimmed']:.3g}",
-                *(ratio(over(path, ours, which)) for which in ("trimmed", "rel_mse")),
-                ratio(over(none, ours, "trimmed")),
+                *(ratio(speedup(ours, path, which)) for which in ("trimmed", "rel_mse")),
+                ratio(speedup(ours, none, "trimmed")),
                 f"{ours['first_seconds']:.0f}",
                 bias,
             ]
@@ -170,11 +166,6 @@ def page(found: dict) -> str:
     return table(head, lines)
 
 
-def over(other: dict, ours: dict, which: str) -> float:
-    """By how much ours is more efficient than the other."""
-    return equal_time_speedup(*((one["seconds"], one[which]) for one in (ours, other)))
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_line.parser(__doc__)
@@ -183,31 +174,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="", help="name of the GPU, for the file")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.json")
     parser.add_argument("--report", action="store_true", help="print the table of the file")
-    group = parser.add_argument_group("where the time of a sample goes")
-    group.add_argument("--ablation", action="store_true", help="one thing changed at a time")
-    group.add_argument("--profile", action="store_true", help="some of its renders, for a profiler; no file")
-    group.add_argument(
-        "--size", type=number(int, 1), default=1024, metavar="N", help="pixels in a row (1024)"
-    )
-    group.add_argument(
-        "--spp", type=number(int, 0), default=0, help="samples per pixel of long renders; 0: chosen"
-    )
-    group.add_argument("--seconds", type=number(float, 0), default=600, metavar="S", help="in all (600)")
-    group.add_argument("--beside", type=number(int, 1), default=12, metavar="N", help="processes (12)")
     return parser
 
 
 def main(arguments=None) -> None:
     """Measure, or write the page."""
     options = build_parser().parse_args(arguments)
-    if options.profile:
-        ablation.profile(options)
-        return
-    if options.ablation:
-        if not options.report:
-            ablation.measure(options)
-        print(ablation.page(json.loads(options.output.read_text())))
-        return
     if not options.report:
         found = {"variant": options.variant, "device": options.device, "spp": SPP, "rows": [], "failed": {}}
         for names in batched(options.scenes or repository.benchmark_scenes(), BESIDE):

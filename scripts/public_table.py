@@ -8,8 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 from mitsuba_bdpt.measure import analysis, report
-from mitsuba_bdpt.measure.analysis import OWN, NotJudged, Refused, Results, geometric_mean
-from mitsuba_bdpt.measure.efficiency import refused_share
+from mitsuba_bdpt.measure.analysis import OWN, NotJudged, Refused, Results, geometric_mean, refused_share
 from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.tables import ratio, said, table
 from public_checks import DEFAULT, OURS, Check, check

@@ -8,7 +8,7 @@ from pathlib import Path
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import read_json, write_json, write_text
 from mitsuba_bdpt.files.whole import check_own
-from mitsuba_bdpt.measure import page, report, rows
+from mitsuba_bdpt.measure import page, results
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import reference_path
@@ -69,11 +69,11 @@ class Texts:
         Rows of other runs stay, until one of the whole folder ``is_over``.
         """
         if not (self.whole and is_over):
-            table = self._current(rows.beside(table, self.order, self.folder))
+            table = self._current(results.beside(table, self.order, self.folder))
         write_json(self.folder / SAID, {"left_out": self.left_out, "notes": self.notes})
         if table:
-            rows.write_tables(table, self.folder)
-            loaded = report.load(Project(self.folder), self.folder)
+            results.write_tables(table, self.folder)
+            loaded = results.load(Project(self.folder), self.folder)
         else:
             for name in ("rows.csv", "rows.parquet", "page.html"):
                 (self.folder / name).unlink(missing_ok=True)

@@ -1,17 +1,13 @@
 """Rooms of many materials, as people model them: for what a kernel's size depends on, and for decisions.
 
-python scripts/room.py                # efficiency over `path` (multijitter) in a room of each light
-python scripts/room.py ceiling 12     # in one with things of so many materials
+room = lit_room("window", 21)
+print(measure.compare_integrators(room, "bdpt", {"type": "path", "sampler": "multijitter"}))
 """
 
 from __future__ import annotations
 
-import time
-
-import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
-from mitsuba_bdpt.measure.metrics import TRIM, spread
 
 import mitsuba as mi  # isort: skip
 
@@ -130,6 +126,30 @@ def room(materials: int, size: int = 128) -> dict:
     return scene
 
 
+def crowd(lamps: int, bsdfs: int) -> dict:
+    """A scene of many lamps and of balls with a BSDF each, for ``mi.load_dict``."""
+    t = mi.ScalarTransform4f()
+    view = t.look_at([0, 3, 8], [0, 0, 0], [0, 1, 0])
+    scene: dict = {
+        "type": "scene",
+        "sensor": {"type": "perspective", "to_world": view, "film": {"type": "hdrfilm"}},
+    }
+    for i in range(lamps):
+        place = t.translate([i % 20 - 10, 4, i // 20 - 7]).rotate([1, 0, 0], 90).scale(0.1)
+        emitter = {"type": "area", "radiance": 1.0 + i}
+        scene[f"lamp{i}"] = {"type": "rectangle", "to_world": place, "emitter": emitter}
+    for i in range(bsdfs):
+        bsdf = (
+            {"type": "diffuse", "reflectance": 0.2 + 0.005 * i},
+            {"type": "roughconductor", "alpha": 0.1 + 0.002 * i},
+            {"type": "plastic", "int_ior": 1.3 + 0.001 * i},
+            {"type": "dielectric", "int_ior": 1.3 + 0.002 * i},
+        )[i % 4]
+        ball = {"type": "sphere", "center": [i % 10 - 5, 0, i // 10 - 5], "radius": 0.4, "bsdf": bsdf}
+        scene[f"ball{i}"] = ball
+    return scene
+
+
 def _shell(scene: dict, opening: tuple[float, float, float, float] | None = None):
     """Add a room of 8 x 3 x 8 units to ``scene``, with an ``opening`` (z, z, y, y) in its right wall."""
     t = mi.ScalarTransform4f()
@@ -242,49 +262,3 @@ def lit_room(light: str, materials: int, width: int = 256, height: int = 144) ->
             shape = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([x, r, z]).scale(r)}
         scene[f"thing{i}"] = shape | {"bsdf": KINDS[i % len(KINDS)](i % MOST)}
     return scene
-
-
-def efficiency(scene: dict, seeds: int = 3, spp: int = 64) -> tuple[float, float, list]:
-    """Trimmed and raw efficiency of the second and later renders by `bdpt` over `path`, and its decisions.
-
-    Processor time times relMSE by the spread over ``seeds``, weighted by the mean of all images.
-    """
-    made = {
-        "path": mi.load_dict(scene | {"sensor": scene["sensor"] | {"sampler": {"type": "multijitter"}}}),
-        "bdpt": mi.load_dict(scene),
-    }
-    integrators = {name: mi.load_dict({"type": name, "max_depth": 8}) for name in made}
-    images: dict = {name: [] for name in made}
-    seconds: dict = {name: [] for name in made}
-    for seed in range(seeds + 1):
-        for name, loaded in made.items():
-            started = time.process_time()
-            image = np.array(integrators[name].render(loaded, spp=spp, seed=seed))[..., :3]
-            if seed:  # the first compiles
-                seconds[name].append(time.process_time() - started)
-                images[name].append(image.astype(float))
-    reference = np.mean([np.mean(of, axis=0) for of in images.values()], axis=0)
-    ratios = []
-    for trim in (TRIM, 0):
-        ours, path = (
-            np.median(seconds[n]) * np.mean(spread(images[n], reference, trim)) for n in ("bdpt", "path")
-        )
-        ratios.append(float(path / ours))
-    return *ratios, integrators["bdpt"].statistics["decisions"]
-
-
-def main() -> None:
-    """Print efficiencies."""
-    parser = command_line.parser(__doc__)
-    parser.add_argument("light", nargs="?", choices=LIGHTS)
-    parser.add_argument("materials", nargs="?", type=int, default=18)
-    options = parser.parse_args()
-    mi.set_variant("llvm_ad_rgb")
-    for light in [options.light] if options.light else LIGHTS:
-        trimmed, raw, decisions = efficiency(lit_room(light, options.materials))
-        chosen = [(d["light_paths"], d["connections"], d["joined"], d["guided"]) for d in decisions]
-        print(f"{light} {options.materials}: {trimmed:.2f}x trimmed, {raw:.2f}x raw; {chosen}", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -31,8 +31,7 @@ import repository
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.report import replace_part
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.tables import replace_part, table
 
 from stress_cases import cases
 from stress_cases.case import Case, Outcome

@@ -21,6 +21,7 @@ import subprocess
 import sys
 import tempfile
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 
 import command_line
@@ -33,6 +34,7 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.loading import in_proportion
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.timing import Timed, alternating
 
 import mitsuba as mi  # isort: skip
 
@@ -52,15 +54,14 @@ for line in sys.stdin:
         # With optimize Mitsuba puts objects without id in another order in each process.
         scene = mi.load_file(asked['scene'], parallel=False, optimize=False, **asked['definitions'])
         bdpt = mi.load_dict(asked['integrator'])
-        bdpt.render(scene, seed=1 << 20, spp=asked['spp'])
         answer = mitsuba_bdpt.__file__
     else:
-        dr.sync_thread(); started = time.perf_counter()
+        dr.sync_thread(); started, cpu_started = time.perf_counter(), time.process_time()
         image = np.array(bdpt.render(scene, seed=asked['seed'], spp=asked['spp']))[..., :3]
-        seconds = time.perf_counter() - started
+        taken = time.perf_counter() - started, time.process_time() - cpu_started
         np.save(asked['image'], image)
         made = [[d['light_paths'], d['connections'], d['coefficients']] for d in bdpt.statistics['decisions']]
-        answer = [seconds, made]
+        answer = [*taken, made]
     print('ANSWER', json.dumps(answer), flush=True)
 """
 
@@ -68,7 +69,7 @@ for line in sys.stdin:
 class Checkout:
     """A process that renders with the plugin of the checkout in a folder.
 
-    Raises ``CommandError`` if there is none.
+    ``decisions``: those of the last render. Raises ``CommandError`` if there is no plugin.
     """
 
     def __init__(self, folder: Path, images: Path):
@@ -79,6 +80,7 @@ class Checkout:
             )
         self._image, self._sources = images / f"{len(list(images.iterdir()))}.npy", sources.resolve()
         self._image.touch()
+        self.decisions: list = []
         environment = os.environ | {"PYTHONPATH": str(self._sources)}
         command = [sys.executable, "-c", CHILD]
         pipe = subprocess.PIPE
@@ -93,18 +95,18 @@ class Checkout:
                 return json.loads(answer)
         raise RuntimeError(f"the process of {self._sources} has ended; its error stands above")
 
-    def load(self, name: str, integrator: dict, spp: int):
-        """Load a scene and compile."""
+    def load(self, name: str, integrator: dict):
+        """Load a scene."""
         scene = repository.scene_file(name)
         definitions = in_proportion(scene, {"resolution": repository.RESOLUTION})
-        found = self._ask(scene=str(scene), definitions=definitions, integrator=integrator, spp=spp)
+        found = self._ask(scene=str(scene), definitions=definitions, integrator=integrator)
         if not Path(found).is_relative_to(self._sources):
             raise RuntimeError(f"{found} was imported in place of {self._sources}")
 
-    def render(self, seed: int, spp: int) -> tuple[np.ndarray, float, list]:
-        """Image, seconds, decisions."""
-        seconds, made = self._ask(seed=seed, spp=spp, image=str(self._image))
-        return np.load(self._image).astype(np.float64), seconds, made
+    def render(self, spp: int, seed: int) -> Timed:
+        """A render of the scene."""
+        *taken, self.decisions = self._ask(seed=seed, spp=spp, image=str(self._image))
+        return Timed(np.load(self._image).astype(np.float64), *taken)
 
     def close(self):
         """End the process."""
@@ -116,20 +118,17 @@ def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: in
     depth = repository.benchmark_depth(name)
     expected = repository.load_reference(name, repository.RESOLUTION, depth).image
     for side in sides:
-        side.load(name, {"type": "bdpt", "max_depth": depth} | parameters, spp)
+        side.load(name, {"type": "bdpt", "max_depth": depth} | parameters)
     apart, rows, same = 0.0, [], True
-    for seed in range(pairs):
-        turn = [0, 1] if seed % 2 else [1, 0]
-        found = {number: sides[number].render(seed, spp) for number in turn}
-        (old, old_seconds, before), (new, new_seconds, now) = found[0], found[1]
-        apart = max(apart, np.abs(new - old).max() / old.mean())
-        same &= before == now
-        errors = [rel_mse(image, expected, trim) for trim in (TRIM, 0.0) for image in (old, new)]
-        rows.append([new_seconds / old_seconds, *errors])
+    for old, new in alternating([partial(side.render, spp) for side in sides], pairs):
+        apart = max(apart, np.abs(new.image - old.image).max() / old.image.mean())
+        same &= sides[0].decisions == sides[1].decisions
+        errors = [rel_mse(found.image, expected, trim) for trim in (TRIM, 0.0) for found in (old, new)]
+        rows.append([new.seconds / old.seconds, *errors])
     rows = np.array(rows)
     time, (old, new, old_raw, new_raw) = np.median(rows[:, 0]), rows[:, 1:].mean(axis=0)
     figures = [time, new / old, new_raw / old_raw, time * new / old, time * new_raw / old_raw]
-    decided = " → ".join(_named(made) for made in (before, now))
+    decided = " → ".join(_named(side.decisions) for side in sides)
     return [f"`{name}`", f"{apart:.1g}", *(f"{x:.3g}" for x in figures), decided], bool(
         same and apart < ROUNDING
     )

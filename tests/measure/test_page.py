@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.measure import page
+from mitsuba_bdpt.measure import page, tables
 from mitsuba_bdpt.measure.analysis import Biased, NotJudged, Summary
 from patience import PATIENCE
 
@@ -88,7 +88,7 @@ def fake_scene(name, **images):
 def written(tmp_path, rows, scenes):
     data = json.dumps({"columns": list(page.COLUMNS), "rows": rows, "scenes": scenes}).replace("</", "<\\/")
     text = page.FRAME.read_text()
-    for name in ("TITLE", "INTRODUCTION", "ANSWERS", "PLOTS", "MACHINE"):
+    for name in ("TITLE", "ANSWERS", "REPORT"):
         text = text.replace(f"@{name}@", f"<b>{name.lower()}</b>" if name != "TITLE" else "A sweep")
     text = (
         text.replace("@DATA@", data).replace("<head>", f"<head>{WATCH}").replace("</body>", f"{PROBE}</body>")
@@ -155,9 +155,7 @@ def test_images_are_half_precision():
     assert back[1, 1, 2] == 65504
 
 
-def results(outcome, statistics):
-    row = {"statistics": json.dumps(statistics)}
-
+def results(outcome):
     def against_path(scene):
         if isinstance(outcome, Exception):
             raise outcome
@@ -165,9 +163,6 @@ def results(outcome, statistics):
 
     return SimpleNamespace(
         against_path=against_path,
-        of=lambda *_: [row],
-        methods=["bdpt"],
-        deciding=64,
         standard_in=lambda _: ["path", "path multijitter"],
     )
 
@@ -183,20 +178,21 @@ def results(outcome, statistics):
     ],
 )
 def test_answers_in_words(outcome, ratio, words):
-    found = page.answer(results(outcome, {}), "a")
+    found = page.answer(results(outcome), "a")
     assert words in found[1]
     np.testing.assert_equal(found[0], ratio)
 
 
-def test_reasons_in_words():
-    decision = {"light_paths": 0.25, "connections": "one"}
-    skipped = [
-        {"class": "t=0", "level": "impossible", "why": "the sensor has no area"},
-        {"class": "inner", "level": "not worth its cost here", "why": "1.5 times as long"},
-    ]
-    text = page.why(results(None, {"decisions": [decision], "skipped": skipped}), "a")
-    assert "one light subpath per 4 camera subpaths, one inner connection drawn" in text
-    assert "Left out: inner (1.5 times as long)." in text and "t=0" not in text
-    alone = page.why(results(None, {"decisions": [decision | {"light_paths": 0.0}]}), "a")
-    assert alone == "Camera subpaths alone."
-    assert "No pilot" in page.why(results(None, {"decisions": []}), "a")
+def test_the_page_holds_the_report():
+    """Expected: the report's tables and text as HTML, escaped, without its title; its plots are in the page,
+    not beside it."""
+
+    def draw(folder):
+        (folder / "seconds.png").write_bytes(b"a plot")
+
+    table = tables.table(["scene", "`a<b`"], [["x", "1"]])
+    text = f"# Benchmark\n\nMade.\n\n## Cost\n\n{table}\n![over seconds](seconds.png)\n"
+    made = page.reported(SimpleNamespace(text=lambda: text, draw=draw))
+    assert "Benchmark" not in made and "<h2>Cost</h2>" in made and "<code>a&lt;b</code></th>" in made
+    assert "<td>1</td>" in made and base64.b64encode(b"a plot").decode() in made and ".png" not in made
+    assert 'alt="over seconds"' in made

@@ -15,11 +15,11 @@ from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.measure import given, making, metrics, sweep
 from mitsuba_bdpt.measure.agreement import Means, apart, compare_means
 from mitsuba_bdpt.measure.analysis import ALONE, NONE, Results
-from mitsuba_bdpt.measure.bench import Bench
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.scenes import SceneFile
+from mitsuba_bdpt.measure.sweep import Bench
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
 BROKEN = """<scene version="3.0.0">
@@ -39,8 +39,8 @@ class Clock(Bench):
     """Renders take 1 ms per sample, those of `path` half of it: the same samples each time, and no chance."""
 
     def timed(self, cell, spp, seed):
-        image, _ = super().timed(cell, spp, seed)
-        return image, spp * (0.5e-3 if cell.method == "path" else 1e-3)
+        seconds = spp * (0.5e-3 if cell.method == "path" else 1e-3)
+        return super().timed(cell, spp, seed)._replace(seconds=seconds)
 
 
 def test_the_command_on_scenes_of_this_project(tmp_path, capsys, monkeypatch):

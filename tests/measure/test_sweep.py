@@ -19,13 +19,12 @@ from mitsuba_bdpt.files import whole
 from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import agreement, analysis, making, metrics, probes, reference, scenes, sweep
-from mitsuba_bdpt.measure import bench as bench_module
-from mitsuba_bdpt.measure import halves as halves_module
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import Cells, read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
-from mitsuba_bdpt.measure.rows import errors
+from mitsuba_bdpt.measure.results import errors
 from mitsuba_bdpt.measure.scenes import path_tracers
+from mitsuba_bdpt.measure.timing import Timed
 from patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -141,29 +140,29 @@ def test_halves_estimate_the_error_of_their_mean(folder):
     """Rationale: the halves differ by twice the standard error of their mean. Expected: for halves r + e and
     r - e the mean is r and the error that of r + e against r: e^2 / (r^2 + 0.01 r^2).
     """
-    halves = halves_module.Halves(folder / "sums.npz", "key")
+    halves = making.Halves(folder / "sums.npz", "key")
     r, e = np.full((4, 4, 3), 2.0), 0.1
     for _ in range(4):
         halves.add([r + e, r - e])
     made = halves.reference({})
     assert made.error == pytest.approx(e**2 / (4 * 1.01))
     assert made.means.columns.error == pytest.approx(e / np.sqrt(7))
-    again = halves_module.Halves(folder / "sums.npz", "key")
+    again = making.Halves(folder / "sums.npz", "key")
     assert again.rounds == 4 and again.reference({}).error == pytest.approx(made.error)
-    assert halves_module.Halves(folder / "sums.npz", "another").rounds == 0
+    assert making.Halves(folder / "sums.npz", "another").rounds == 0
 
 
 def test_windows_of_halves_have_more_samples(folder):
     """Expected: each pixel is the mean of all renders it is in, weighted by their samples; sums kept before
     there were windows count as whole images. The tile means are those of whole images alone.
     """
-    halves = halves_module.Halves(folder / "sums.npz", "key")
+    halves = making.Halves(folder / "sums.npz", "key")
     for value in (1.0, 3.0):
         halves.add([np.full((4, 4, 3), value)] * 2)
     kept = dict(np.load(folder / "sums.npz"))
     del kept["counts"]
     np.savez(folder / "sums.npz", **kept)
-    halves = halves_module.Halves(folder / "sums.npz", "key")
+    halves = making.Halves(folder / "sums.npz", "key")
     halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
     image, difference = halves.mean()
     expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
@@ -179,19 +178,16 @@ def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
     (2^-11 of a value); seeds that were used do not come again; after another round all have one more.
     """
     rng = np.random.default_rng(3)
-    halves, window = halves_module.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
+    halves, window = making.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
     for _ in range(agreement.FEWEST_RUNS):
         halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
     halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
-    spp = {
-        name: round(2 * halves_module.PASS_SPP * count)
-        for name, count in (("spp", 8), ("spp_in_windows", 12))
-    }
+    spp = {name: round(2 * making.PASS_SPP * count) for name, count in (("spp", 8), ("spp_in_windows", 12))}
     reference.write(folder / "a.exr", halves.reference(spp | {"sources": ["x"]}))
     (image, difference), header = read_layers(folder / "a.exr", "", "difference.")
     kept = json.loads(header["provenance"])
     stored = reference.Reference(image, difference, reference.means_of(kept["means"]), kept)
-    again = halves_module.Halves(folder / "other.npz", "key")
+    again = making.Halves(folder / "other.npz", "key")
     again.go_on_from(stored, [window])
     np.testing.assert_allclose(again.counts, halves.counts)
     assert again.rounds >= halves.rounds and "x" in again.sources
@@ -199,7 +195,7 @@ def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
     for images in more:
         halves.add(images)
         again.add(images)
-    again = halves_module.Halves(folder / "other.npz", "key")
+    again = making.Halves(folder / "other.npz", "key")
     np.testing.assert_allclose(again.sums, halves.sums, rtol=2**-10)
     for name in ("mean", "error", "nonzero", "freedom"):
         for part in ("columns", "whole"):
@@ -240,7 +236,7 @@ def test_references_go_on_where_they_stopped(project, job):
     has nothing to do.
     """
     first, reached = making.make(job(2, seconds=0))
-    assert not reached and first.provenance["spp"] == 2 * halves_module.PASS_SPP
+    assert not reached and first.provenance["spp"] == 2 * making.PASS_SPP
     assert reference_of(project, 2).means is None
     second, reached = making.make(job(2))
     assert reached and second.provenance["spp"] > first.provenance["spp"]
@@ -285,12 +281,12 @@ def test_a_reference_with_merging_replaces_one_without(project, job):
 def test_sums_stay_finite_and_say_what_they_are_of(folder, capsys):
     """Expected: a value that is not finite is refused before it is added; sums of something else are not
     used, and it is said."""
-    halves = halves_module.Halves(folder / "sums.npz", "key")
+    halves = making.Halves(folder / "sums.npz", "key")
     halves.add([np.ones((4, 4, 3))] * 2)
     with pytest.raises(ValueError, match=r"sums.npz: round 1 has values that are not finite"):
         halves.add([np.ones((4, 4, 3)), np.full((4, 4, 3), np.inf)])
-    assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
-    assert halves_module.Halves(folder / "sums.npz", "another").rounds == 0
+    assert making.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
+    assert making.Halves(folder / "sums.npz", "another").rounds == 0
     assert "sums.npz: of another scene, integrator or number of" in capsys.readouterr().out
 
 
@@ -405,7 +401,7 @@ def test_one_scene_of_a_preset_anew(folder, job, swept):
         swept(*words)
 
 
-class Clock(bench_module.Bench):
+class Clock(sweep.Bench):
     """Renders take 1 ms per sample by `ours` and 0.25 ms by others, and 1 s more the first time."""
 
     calls = []
@@ -414,7 +410,7 @@ class Clock(bench_module.Bench):
         first = (cell.method, spp) not in self.calls
         self.calls.append((cell.method, spp))
         seconds = spp * (1e-3 if cell.method == "ours" else 0.25e-3) + first
-        return np.ones((8, 8, 3)) + 0.1 * seed, seconds
+        return Timed(np.ones((8, 8, 3)) + 0.1 * seed, seconds, seconds)
 
 
 def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
@@ -466,9 +462,11 @@ def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
     cannot judge, since it is of another scene, it names before that too, and leaves it as it is."""
     words, began = (preset_file(folder), "-o", folder / "out"), []
 
+    measured = sweep.measure
+
     def measure(bench, cell):
         began.append(reference.reference_path(project, "cornell_box", 8, 3).is_file())
-        return bench_module.measure(bench, cell)
+        return measured(bench, cell)
 
     monkeypatch.setattr(sweep, "measure", measure)
     assert swept(*words) == 0 and began == [True] * 8
@@ -490,7 +488,7 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
     """
     file = folder / "kept.json"
     write_json(file, [1, 2])
-    before = halves_module.Halves(folder / "sums.npz", "key")
+    before = making.Halves(folder / "sums.npz", "key")
     before.add([np.ones((4, 4, 3))] * 2)
 
     def killed(*args):
@@ -502,7 +500,7 @@ def test_files_are_replaced_at_once(folder, monkeypatch):
             write()
     assert not list(folder.glob(".*"))
     assert json.loads(file.read_text()) == [1, 2]
-    assert halves_module.Halves(folder / "sums.npz", "key").rounds == 1
+    assert making.Halves(folder / "sums.npz", "key").rounds == 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")

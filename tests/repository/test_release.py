@@ -32,5 +32,5 @@ def test_the_extra_of_measuring_is_what_is_looked_for():
     """Expected: the modules that the commands look for are those of the packages of the extra `[measure]`."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     packages = [re.match(r"[\w-]+", text)[0] for text in project["optional-dependencies"]["measure"]]
-    modules = {name.replace("-", "_").removesuffix("_science") for name in packages}
+    modules = {re.sub("_(science|py)$", "", name.replace("-", "_")) for name in packages}
     assert modules == set(measuring.NEEDED)

@@ -18,7 +18,9 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import CommandError, UnsupportedError, UsageError
 from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.measure import compare, equal_time
+from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.scenes import depth_of
+from mitsuba_bdpt.measure.timing import Timed
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -134,8 +136,8 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
         "public_scenes.py x --seeds 1",
         "reference x --seconds nan",
         "reference x --spp 0",
-        "startup.py --rooms 0 --rounds 0",
-        "startup.py --rooms 0 --spp 0",
+        "startup.py --rounds 0",
+        "startup.py --spp 0",
         "startup.py --rooms -1",
         "pyramid x --spp 0",
         "pyramid x --seed -1",
@@ -161,14 +163,6 @@ def test_integrators_of_command_lines_are_checked(here, monkeypatch, capsys, wor
     assert "which must have the form" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--spp", "--rounds"])
-def test_options_of_rooms_want_rooms(here, monkeypatch, capsys, option):
-    """Rationale: scenes of many emitters or BSDFs, which are the default, have sample counts of their own.
-    Expected: the usage, that the option is of rooms, status 2."""
-    assert by_user(monkeypatch, "startup.py", option, "4") == 2
-    assert "add --rooms" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("command", "taken"),
     [
@@ -190,14 +184,12 @@ def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, 
     assert sorted(Path().iterdir()) == before
 
 
-def test_a_comparison_with_what_has_no_error_is_refused(monkeypatch):
+def test_a_comparison_with_what_has_no_error_is_refused():
     """Rationale: 0 / 0 and 1 / 0 stood in the table. Expected: words instead of figures, in a whole line."""
 
-    class Exact:
-        image, share_of = np.ones((8, 8, 3)), None
-
-    monkeypatch.setattr(compare, "timed", lambda *what: (Exact.image, 1.0))
-    line = compare.line("furnace_white", [compare.Side(None, None)] * 2, Exact(), 4, 2)
+    image = np.ones((8, 8, 3))
+    exact = Reference(image, 0 * image, None, {})
+    line = compare.line("furnace_white", [lambda spp, seed: Timed(image, 1.0, 1.0)] * 2, exact, 4, 2)
     assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
     assert "exactly that of the reference" in line[2]
 

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -154,7 +155,12 @@ def check_output(path: Path, suffix: str) -> None:
         ) from error
 
 
-def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
+def write_layers(
+    path: Path,
+    layers: Mapping[str, np.ndarray],
+    header: dict[str, str],
+    dtype: type[np.floating] = np.float16,
+) -> None:
     """Write an EXR of layers {prefix: (height, width, 3)}, by `replacing`."""
     channels = {
         f"{layer}{c}": np.ascontiguousarray(pixels[..., i]).astype(dtype)
@@ -173,7 +179,7 @@ def write_layers(path: Path, layers: dict, header: dict, dtype=np.float16):
             raise OSError(errno.ENOSPC, why, str(path)) from error
 
 
-def read_layers(path: Path, *layers: str):
+def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, Any]]:
     """Return images (height, width, 3) of an EXR's layers, and its header.
 
     ``layers``: prefixes as in `write_layers`. Raises ``CommandError`` for other files.

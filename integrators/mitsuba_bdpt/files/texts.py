@@ -6,12 +6,13 @@ import json
 import re
 import tomllib
 from pathlib import Path
+from typing import Any, cast
 
 from ..errors import CommandError
 from .whole import replacing
 
 
-def read_toml(path: Path) -> dict:
+def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; raises ``CommandError`` naming it if invalid, or ``OSError``."""
     try:
         return tomllib.loads(path.read_text())
@@ -19,7 +20,7 @@ def read_toml(path: Path) -> dict:
         raise CommandError(f"{path} is not TOML: {error}") from error
 
 
-def read_json(path: Path, remedy: str):
+def read_json(path: Path, remedy: str) -> Any:
     """Read a JSON file; raises ``CommandError`` with the ``remedy`` if it is damaged."""
     try:
         return json.loads(path.read_text())
@@ -27,28 +28,29 @@ def read_json(path: Path, remedy: str):
         raise CommandError(f"{str(path)!r} is damaged ({error}); {remedy}") from error
 
 
-def table_of(path: Path, key: str, value) -> dict:
+def table_of(path: Path, key: str, value: Any) -> dict[str, Any]:
     """Return ``value`` if it is a table, else raise ``CommandError``."""
     if not isinstance(value, dict):
         raise CommandError(f"{path}: {key}={value!r} must be a table: write [{key}] and its keys below")
-    return value
+    return cast(dict[str, Any], value)
 
 
-def list_of(path: Path, key: str, value, kind: type, what: str) -> list:
+def list_of(path: Path, key: str, value: Any, kind: type, what: str) -> list[Any]:
     """Return ``value`` if it is a non-empty list of ``kind``, called ``what``."""
-    if not isinstance(value, list) or not value or not all(isinstance(entry, kind) for entry in value):
+    found = cast(list[Any], value) if isinstance(value, list) else []
+    if not found or not all(isinstance(entry, kind) for entry in found):
         raise CommandError(f"{path}: {key}={value!r} must be a list with at least one entry, all {what}")
-    return value
+    return found
 
 
-def text_of(path: Path, key: str, value) -> str:
+def text_of(path: Path, key: str, value: Any) -> str:
     """Return ``value`` if it is a non-empty text, else raise ``CommandError``."""
     if not isinstance(value, str) or not value:
         raise CommandError(f"{path}: {key}={value!r} must be a text in quotes that is not empty")
     return value
 
 
-def whole_of(path: Path, key: str, value) -> int:
+def whole_of(path: Path, key: str, value: Any) -> int:
     """Return ``value`` if it is an integer of at least 1, else raise ``CommandError``."""
     if type(value) is not int or value < 1:
         raise CommandError(f"{path}: {key}={value!r} must be a whole number of at least 1")
@@ -62,7 +64,7 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text)
 
 
-def write_json(path: Path, value) -> None:
+def write_json(path: Path, value: Any) -> None:
     """Write JSON by `replacing`, lists of numbers on one line; creates the folder."""
     text = json.dumps(value, indent=1)
     text = re.sub(r'\[\n[^][{}"]*\]', lambda found: re.sub(r"\n\s*", " ", found[0]), text)

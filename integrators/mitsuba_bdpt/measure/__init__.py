@@ -18,14 +18,15 @@ gets one that says what is in it, unless it is given as ``measure.SceneDict(name
 Needs the extra ``[measure]``. Within the package nothing but the commands import it (see `cli.measuring`).
 
 * For Python: `api`; options, their defaults and bounds: `options`.
-* What is measured: `metrics` (errors, colour differences), `agreement` (bias), `efficiency`, `timing`.
-* What of: `project` (the user's folder), `scenes` (any scene file, at any size).
-* Against what: `reference` (stored ones), `making` and `halves` (how they come about).
-* Sweeps: `preset` (what is rendered: cells), `bench` (renders), `rows` (what is kept), `sweep`, `probes`.
-* What they show: `analysis` (figures with their reasons), `tables`, `figures`, `report`, `page`.
-* Two or a few ways to render: `compare`, `equal_time`.
-* Single strategies: `pyramid`.
-* What a terminal shows meanwhile: `showing`.
+* Scenes: `project` (the user's folder), `scenes` (any scene file, at any size).
+* Renders: `timing` (a render, and several sides in turns), `probes` (renders in new processes).
+* Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
+  made), `given` (images of the user's).
+* Sweeps: `preset` (which renders), `sweep`, `results` (the record of a render, and the files of them).
+* Reports: `analysis` (figures, or why there are none), `tables`, `figures`, `report` (Markdown), `page`
+  (HTML).
+* A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.
+* Progress bars: `showing`.
 """
 
 from .api import (

@@ -7,15 +7,17 @@ normal samples; means of many pixels are nearly normal, single pixels are not.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from ..errors import CommandError
-from .checks import CONFIDENCE, Estimate, floats, image_of, number_of
+from .metrics import CONFIDENCE, Estimate, number_of
 
 # Relative differences of tile means up to this are attributed to float32 rounding.
 ROUNDING = 2e-5
@@ -33,7 +35,7 @@ TILES = 4
 SIGNIFICANCE = 1e-3
 
 
-def tile_means(image, tiles: int) -> np.ndarray:
+def tile_means(image: ArrayLike, tiles: int) -> np.ndarray:
     """Return means over ``tiles`` x ``tiles`` tiles, of (height, width, channels).
 
     Shape (tiles * tiles, channels), row by row. ``tiles`` must divide the size.
@@ -59,7 +61,7 @@ class Sample:
     nonzero: np.ndarray
 
     @staticmethod
-    def of(values) -> Sample:
+    def of(values: ArrayLike) -> Sample:
         """Return the sample of ``values`` (renders, m)."""
         values = np.asarray(values, dtype=np.float64)
         error = values.std(0, ddof=1) / np.sqrt(len(values))
@@ -75,7 +77,7 @@ class Sample:
         return Sample(mean, error, a + b - 1, (a * self.nonzero + b * other.nonzero) / (a + b))
 
     @staticmethod
-    def known(mean, error=0.0) -> Sample:
+    def known(mean: ArrayLike, error: ArrayLike = 0.0) -> Sample:
         """Return values (m,) with known standard errors."""
         mean = np.asarray(mean, dtype=np.float64)
         return Sample(mean, np.broadcast_to(error, mean.shape), np.inf, np.ones_like(mean))
@@ -125,7 +127,7 @@ def welch(a: Sample, b: Sample) -> Difference:
     return Difference(a.mean - b.mean, error, freedom, p, applies & (error > 10 * floor))
 
 
-def sidak(p) -> float:
+def sidak(p: ArrayLike) -> float:
     """Return the probability of so small a minimum of independent p-values."""
     p = np.asarray(p, dtype=np.float64)
     return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 1 - 1e-16))))
@@ -138,7 +140,7 @@ def _each(significance: float, count: int) -> float:
 
 @dataclass(frozen=True)
 class BiasCheck:
-    """Result of `bias_check`.
+    """Result of `compare_means`.
 
     ``passed``: no difference at the given significance; ``p``: the smallest p-value; ``family_p``: the same
     after Sidak's correction for all ``comparisons``; ``tile``: (row, column) of the worst tile, None for the
@@ -157,7 +159,7 @@ class BiasCheck:
     missing: Estimate
 
 
-def tile_columns(image, tiles=TILES) -> np.ndarray:
+def tile_columns(image: ArrayLike, tiles: int = TILES) -> np.ndarray:
     """Return the quantities of a bias check, (3 tiles^2 + 3,).
 
     `tile_means` by row, column and channel, then the mean of the whole image by channel.
@@ -176,22 +178,21 @@ class Means:
     whole: Sample
 
     @staticmethod
-    def of(columns, name="columns") -> Means:
+    def of(columns: Sequence[Sequence[float] | np.ndarray], name: str = "columns") -> Means:
         """Return the means of ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
-        columns = np.asarray(columns, dtype=np.float64)
-        if len(columns) < FEWEST_RUNS:
+        values = np.asarray(columns, dtype=np.float64)
+        if len(values) < FEWEST_RUNS:
             raise CommandError(
-                f"{name} has {len(columns)} renders, too few for the test's level; give {FEWEST_RUNS} or "
-                "more."
+                f"{name} has {len(values)} renders, too few for the test's level; give {FEWEST_RUNS} or more."
             )
-        return Means(Sample.of(columns), Sample.of(columns[:, -3:].mean(1, keepdims=True)))
+        return Means(Sample.of(values), Sample.of(values[:, -3:].mean(1, keepdims=True)))
 
     def joined(self, other: Means) -> Means:
         """Return the means of the renders of both."""
         return Means(self.columns.joined(other.columns), self.whole.joined(other.whole))
 
     @staticmethod
-    def known(image, tiles=TILES) -> Means:
+    def known(image: ArrayLike, tiles: int = TILES) -> Means:
         """Return the means of an exact image."""
         columns = tile_columns(image, tiles)
         return Means(Sample.known(columns), Sample.known(columns[-3:].mean(keepdims=True)))
@@ -200,33 +201,6 @@ class Means:
     def tiles(self) -> int:
         """Tiles along each side of the image."""
         return math.isqrt(len(self.columns.mean) // 3 - 1)
-
-
-def _means_of_runs(name, runs, tiles):
-    """Return `Means` of ``runs`` (seeds, height, width, 3), and the shape of one."""
-    runs = floats(name, runs, ("seeds", "height", "width", "3"))
-    return Means.of([tile_columns(run, tiles) for run in runs], name), runs.shape[1:]
-
-
-def _means_of_reference(reference, standard_error, tiles):
-    """Like `_means_of_runs`, from one image and its standard error (height, width, 3).
-
-    Assumes independent pixels, and full correlation between the channels of a pixel.
-    """
-    reference = image_of("references", reference)
-    standard_error = image_of("standard_error", standard_error)
-    if standard_error.shape != reference.shape or standard_error.min() < 0:
-        raise CommandError(
-            f"standard_error has shape {standard_error.shape} and values from {standard_error.min():g}; it "
-            f"must have the reference's shape {reference.shape} and no negative values."
-        )
-    pixels = reference.shape[0] * reference.shape[1]
-    area = np.full(3 * tiles * tiles + 3, pixels / tiles**2)
-    area[-3:] = pixels
-    errors = np.sqrt(tile_columns(standard_error**2, tiles) / area)
-    columns = tile_columns(reference, tiles)
-    whole = Sample.known(columns[-3:].mean(keepdims=True), errors[-3:].mean(keepdims=True))
-    return Means(Sample.known(columns, errors), whole), reference.shape
 
 
 def _student(value, error, freedom, confidence) -> Estimate:
@@ -249,38 +223,15 @@ def missing_energy(image: Sample, reference: Sample) -> Estimate:
     return _student(1 - x / r, math.sqrt(sum(parts)), freedom, CONFIDENCE)
 
 
-def bias_check(images, references, tiles=TILES, significance=SIGNIFICANCE, standard_error=None) -> BiasCheck:
+def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE) -> BiasCheck:
     """Test whether renders agree with the reference within their noise.
 
-    `welch` over the means of ``tiles`` x ``tiles`` tiles and of the whole image, by channel, with Sidak's
-    correction. Without bias it fails with probability ``significance``, up to 2.5 times that for 12 seeds and
-    9 times for 8; use 16.
-
-    ``images`` (seeds, height, width, 3), seeds all different; ``references`` either the same, or one image
-    (height, width, 3) with ``standard_error`` of the same shape. The latter assumes independent pixels, which
-    wide filters and shared light paths violate: then give renders.
+    `welch` over the means of tiles and of the whole image, by channel, with Sidak's correction. Without bias
+    it fails with probability ``significance``, up to 2.5 times that for 12 seeds and 9 times for 8; use 16.
 
     It detects bias of a few standard errors of a tile; noise may hide smaller bias (see the intervals). It
     cannot distinguish bias from energy in events that are rarer than the samples.
     """
-    ours, shape = _means_of_runs("images", images, tiles)
-    if np.ndim(references) == 3:
-        if standard_error is None:
-            raise CommandError("standard_error=None: with one reference, give it as an image of its shape.")
-        theirs, their_shape = _means_of_reference(references, standard_error, tiles)
-    else:
-        if standard_error is not None:
-            raise CommandError("standard_error must be None with several references: their spread gives it.")
-        theirs, their_shape = _means_of_runs("references", references, tiles)
-    if shape != their_shape:
-        raise CommandError(
-            f"images have shape {shape} and references {their_shape}; render both at one size."
-        )
-    return compare_means(ours, theirs, significance)
-
-
-def compare_means(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> BiasCheck:
-    """Like `bias_check`, from the stored means of both sides."""
     significance = number_of("significance", significance, 0, 1)
     if ours.tiles != theirs.tiles:
         raise CommandError(
@@ -319,7 +270,7 @@ class Apart(NamedTuple):
     share: float
 
 
-def apart(ours: Means, theirs: Means, significance=SIGNIFICANCE) -> list[Apart]:
+def apart(ours: Means, theirs: Means, significance: float = SIGNIFICANCE) -> list[Apart]:
     """Return the tiles that differ, the whole image last; none if unbiased."""
     significance = number_of("significance", significance, 0, 1)
     found, tiles = welch(ours.columns, theirs.columns), ours.tiles

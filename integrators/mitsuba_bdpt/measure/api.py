@@ -18,6 +18,7 @@ from .options import VARIANT
 if TYPE_CHECKING:
     from .equal_time import Shot
     from .project import Project
+    from .record import Row
     from .reference import Reference
 
 
@@ -98,7 +99,7 @@ def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dic
 
 def run_sweep(
     preset: str | Path, dictionaries: Sequence[SceneDict] = (), *, project: str | Path = ".", **options
-) -> list[dict]:
+) -> list[Row]:
     """Render the missing cells of a preset, a TOML file.
 
     ``dictionaries``: scenes by name. ``options``: those of `options.Sweep`. Returns the rows. Raises

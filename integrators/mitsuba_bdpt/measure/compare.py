@@ -9,23 +9,24 @@ Without any error there are no ratios. Equality of means is not tested here: see
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from .analysis import Refused
 from .making import Job, obtained
-from .metrics import TRIM, rel_mse
 from .options import VARIANT, Compare
 from .project import Project
+from .record import Measured
 from .reference import Reference
+from .results import relative_errors
 from .scenes import check_plugins, integrator_of
 from .showing import steps
 from .tables import table
-from .timing import timed
+from .timing import Render, Timed, alternating, timed
 
 HEADS = (
     "scene",
@@ -39,92 +40,83 @@ HEADS = (
 )
 
 
-@dataclass(frozen=True)
-class Side:
-    """A plugin with parameters, and the scene with its sampler."""
-
-    made: mi.Integrator
-    scene: mi.Scene
-
-    @staticmethod
-    def of(parameters: dict, job: Job) -> Side:
-        """Create from the plugin's ``parameters``, of which ``sampler`` is the sensor's.
-
-        Size and depth are those of the reference's ``job``.
-        """
-        own = dict(parameters)
-        sampler = own.pop("sampler", "independent")
-        return Side(integrator_of(own, job.depth), job.scene.load(job.resolution, sampler))
-
-    def measured(self, target: Reference, spp: int, seed: int) -> tuple[float, ...]:
-        """Return seconds, trimmed and raw error, and the reference's share of the former.
-
-        Raises `Refused` if the error is 0.
-        """
-        image, seconds = timed(self.scene, self.made, spp, seed)
-        trimmed = rel_mse(image, target.image, TRIM)
-        if trimmed == 0:
-            raise Refused("every value (trimmed) is exactly that of the reference")
-        return seconds, trimmed, rel_mse(image, target.image), target.share_of(image, TRIM) / trimmed
+def measured(
+    sides: Sequence[Render],
+    target: Reference,
+    rounds: int,
+    on_render: Callable[[int], object] = lambda seed: None,
+) -> Iterator[list[Measured]]:
+    """Render as `timing.alternating`; yields the records of each round."""
+    for seed, turn in enumerate(alternating(sides, rounds, on_render), 1):
+        yield [
+            Measured(
+                seed=seed,
+                seconds=found.seconds,
+                cpu_seconds=found.cpu_seconds,
+                **relative_errors(found.image, target),
+            )
+            for found in turn
+        ]
 
 
-def line(name: str, sides: list[Side], target: Reference, spp: int, pairs: int) -> list[str]:
-    """Return a scene's line of the table."""
-    try:
-        with steps(2 * (pairs + 1)) as step:
-            found = ratios(sides, target, spp, pairs, lambda seed: step(f"{name}, {spp} spp, seed {seed}"))
-        return [f"`{name}`", str(spp), *found]
-    except Refused as why:
-        return [f"`{name}`", str(spp), str(why), *["–"] * (len(HEADS) - 3)]
+def side(parameters: Mapping[str, Any], job: Job) -> Callable[[int, int], Timed]:
+    """Return what renders with samples per pixel and a seed, by a plugin with ``parameters``.
 
-
-def ratios(sides: list[Side], target: Reference, spp: int, pairs: int, on_render) -> list[str]:
-    """Return the figures of a scene's line; calls ``on_render`` before each render.
-
-    Raises `Refused` for an image without an error.
+    ``sampler`` among them is the sensor's; size and depth are those of the reference's ``job``.
     """
-    found = []
-    for seed in range(pairs + 1):
-        pair = [None, None]
-        for i in (0, 1) if seed % 2 else (1, 0):
-            on_render(seed)
-            pair[i] = sides[i].measured(target, spp, seed)
-        found.append(pair)
-    first, second = np.array(found[1:]).transpose(1, 2, 0)
-    time, error, raw, _ = first / second
-    share = max(np.median(first[3]), np.median(second[3]))
+    own = dict(parameters)
+    sampler = own.pop("sampler", "independent")
+    return partial(timed, job.scene.load(job.resolution, sampler), integrator_of(own, job.depth))
+
+
+def line(
+    name: str, sides: Sequence[Callable[[int, int], Timed]], target: Reference, spp: int, pairs: int
+) -> list[str]:
+    """Return a scene's line of the table; for an image without an error, the reason."""
+    made = [partial(render, spp) for render in sides]
+    found: list[list[Measured]] = []
+    with steps(2 * (pairs + 1)) as step:
+        for pair in measured(made, target, pairs, lambda seed: step(f"{name}, {spp} spp, seed {seed}")):
+            if not all(row["rel_mse_trimmed"] for row in pair):
+                why = "every value (trimmed) is exactly that of the reference"
+                return [f"`{name}`", str(spp), why, *["–"] * (len(HEADS) - 3)]
+            found.append(pair)
+    return [f"`{name}`", str(spp), *_figures(found)]
+
+
+def _figures(pairs: Sequence[Sequence[Measured]]) -> list[str]:
+    """Return the cells of `HEADS` after the samples."""
+    seconds, errors, raw_errors, own = (
+        np.array([[row[name] for row in pair] for pair in pairs]).T
+        for name in ("seconds", "rel_mse_trimmed", "rel_mse", "reference_rel_mse_trimmed")
+    )
+    time, error, raw = (first / second for first, second in (seconds, errors, raw_errors))
     low, middle, high = np.quantile(1 / (time * error), (0.25, 0.5, 0.75))
-    cells = [*np.median([time, error, raw], axis=1), np.median(1 / (time * raw))]
-    text = [f"{x:.3g}" for x in cells]
-    return [
-        *text[:3],
-        f"{middle:.3g} ({low:.3g}–{high:.3g})",
-        text[3],
-        f"{100 * share:.1f} %",
-    ]
+    *first, raw_efficiency = (f"{np.median(x):.3g}" for x in (time, error, raw, 1 / (time * raw)))
+    share = np.median(own / errors, axis=1).max()
+    return [*first, f"{middle:.3g} ({low:.3g}–{high:.3g})", raw_efficiency, f"{100 * share:.1f} %"]
 
 
 def lines(
-    project: Project, names: Sequence[str], ways: Sequence[dict], options: Compare | Namespace
+    project: Project, names: Sequence[str], ways: Sequence[Mapping[str, Any]], options: Compare | Namespace
 ) -> list[list[str]]:
     """Return the rows of the table, for two integrators and the scenes ``names``."""
     scenes = [project.scene(name) for name in names]
-    for side in map(dict, ways):
-        if "max_depth" in side:
+    for way in ways:
+        if "max_depth" in way:
             raise CommandError(
-                f"max_depth={side['max_depth']} of {side.get('type')!r} would compare different images; "
+                f"max_depth={way['max_depth']} of {way.get('type')!r} would compare different images; "
                 "leave it out: both sides have the depth of the reference"
             )
-    rows = []
+    rows: list[list[str]] = []
     for scene in scenes:
         job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
-        for side in ways:
-            own = dict(side)
+        for way in ways:
+            own = dict(way)
             sampler = own.pop("sampler", None)
             check_plugins(str(own.get("type")), own, sampler, job.depth)
-        target = obtained(job)
-        made = [Side.of(side, job) for side in ways]
-        rows += [line(scene.name, made, target, spp, options.pairs) for spp in options.spp]
+        target, sides = obtained(job), [side(way, job) for way in ways]
+        rows += [line(scene.name, sides, target, spp, options.pairs) for spp in options.spp]
     return rows
 
 

@@ -11,6 +11,7 @@ import math
 from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
@@ -27,7 +28,7 @@ from .options import RESOLUTION, VARIANT, EqualTime
 from .project import Project
 from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers
 from .showing import steps
-from .timing import timed
+from .timing import alternating, timed
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -75,7 +76,8 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
 
 def seconds(scene, made, spp: int) -> float:
     """Return the median seconds of renders after a warm-up, which compiles."""
-    return float(np.median([timed(scene, made, spp, seed)[1] for seed in range(TIMED + 1)][1:]))
+    turns = alternating([partial(timed, scene, made, spp)], TIMED)
+    return float(np.median([found.seconds for (found,) in turns]))
 
 
 def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
@@ -91,7 +93,7 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
             step(name)
             count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
             seconds(scene, one, count)  # Mitsuba compiles for each number of samples
-            image, taken = timed(scene, one, count, seed=7)
+            image, taken, _ = timed(scene, one, count, seed=7)
             error = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
             found.append(Shot(name, count, taken, image, error, rel_mse(image, target, TRIM)))
     return found

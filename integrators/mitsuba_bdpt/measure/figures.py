@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -131,7 +132,7 @@ def _ideal(axis, rows, against):
     axis.text(x1, y0 * x0 / x1, " −1", fontsize=7, va="center")
 
 
-def efficiencies(results: Results, rivals, path: Path):
+def efficiencies(results: Results, rivals: Sequence[str], path: Path):
     """Plot the ratio of efficiencies per scene, median and range, trimmed and raw.
 
     Integrators that fail the bias check are left out.

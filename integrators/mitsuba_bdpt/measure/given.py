@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,8 +95,8 @@ def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float) -> 
     return max(float(products[kept].mean()), 0.0)
 
 
-def judged(rows: list[dict], own: dict[str, float]) -> list[dict]:
+def judged(rows: list[dict[str, Any]], own: dict[str, float]) -> list[dict[str, Any]]:
     """Return the ``rows`` of a scene with its reference's `own_errors` filled in."""
-    known = {OWN[error]: value for error, value in own.items()}
+    known = {name: own[error] for error, name in OWN.items()}
     names = {"rel_mse": "judged", "rel_mse_trimmed": "judged_trimmed"}
     return [row | known | {names[key]: analysis.judged(own[key], row[key]) for key in OWN} for row in rows]

@@ -10,12 +10,95 @@ from __future__ import annotations
 
 import functools
 import importlib
+import math
 import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import CommandError
-from .checks import image_of, number_of, pair_of
+
+Image = ArrayLike
+"""Floats in linear sRGB of shape (height, width, 3)."""
+
+# Default confidence of intervals.
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value and its interval [low, high] at the stated confidence."""
+
+    value: float
+    low: float
+    high: float
+
+
+def image_of(name: str, value: Image) -> np.ndarray:
+    """Return ``value`` as finite float64 of shape (height, width, 3)."""
+    words = "(height, width, 3)"
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise CommandError(f"{name} holds arrays of unlike shapes; give one of shape {words}.") from error
+    if not np.issubdtype(array.dtype, np.floating):
+        raise TypeError(
+            f"{name} has values of type {array.dtype}; give linear radiance as floats of shape {words}."
+        )
+    if array.ndim != 3 or array.shape[-1] != 3 or array.size == 0:
+        raise CommandError(
+            f"{name} has shape {array.shape} and must have {words}; drop other channels with [..., :3]."
+        )
+    wrong = np.argwhere(~np.isfinite(array))
+    if len(wrong):
+        first = tuple(int(i) for i in wrong[0])
+        raise CommandError(
+            f"{name} holds {len(wrong)} values that are NaN or infinite, the first {array[first]} at index "
+            f"{first}; find what made them in the renderer: no measure is defined for such an image."
+        )
+    return array.astype(np.float64)
+
+
+def pair_of(image: Image, reference: Image) -> tuple[np.ndarray, np.ndarray]:
+    """Return both images, checked, as float64 of shape (height, width, 3)."""
+    image, reference = image_of("image", image), image_of("reference", reference)
+    if image.shape != reference.shape:
+        raise CommandError(
+            f"image has shape {image.shape} and reference {reference.shape}; render both at the same size."
+        )
+    return image, reference
+
+
+def number_of(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
+    """Return a finite float in the open interval (low, high)."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise TypeError(f"{name}={value!r} must be a number.")
+    number = float(value)
+    if not (math.isfinite(number) and low < number < high):
+        bounds = f"above {low:g}" if high == math.inf else f"between {low:g} and {high:g}, ends excluded"
+        raise CommandError(
+            f"{name}={value!r} must be finite" + (f" and {bounds}." if low > -math.inf else ".")
+        )
+    return number
+
+
+def values_of(name: str, values: Iterable[float], at_least: int, low: float = -math.inf) -> np.ndarray:
+    """Return a vector of at least ``at_least`` finite float64, each above ``low``."""
+    try:
+        array = np.asarray(list(values), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{name}={values!r} must be a row of numbers.") from error
+    if array.ndim != 1 or len(array) < at_least:
+        raise CommandError(f"{name} has shape {array.shape}; give at least {at_least} numbers in one row.")
+    if not (np.isfinite(array) & (array > low)).all():
+        bound = f" and above {low:g}" if low > -math.inf else ""
+        raise CommandError(f"{name}={array.tolist()} must be finite{bound}; leave out runs that failed.")
+    return array
+
 
 # Luminance of display white in cd/m^2, of standard-dynamic-range video: ITU-R BT.2035.
 WHITE = 100.0
@@ -27,13 +110,13 @@ TRIM = 0.001
 FLIP_DARKEST = 2.0**-23
 
 
-def mse(image, reference) -> float:
+def mse(image: Image, reference: Image) -> float:
     """Mean squared error: mean of (x - r)^2 over pixels and channels, in squared units of radiance."""
     image, reference = pair_of(image, reference)
     return float(np.mean((image - reference) ** 2))
 
 
-def rel_mse_epsilon(reference) -> float:
+def rel_mse_epsilon(reference: Image) -> float:
     """The eps of `rel_mse`: 0.01 mean(r)^2 over pixels and channels, squared radiance.
 
     Bounds the weight of dark pixels: where r is a tenth of the mean, r^2 and eps are equal.
@@ -44,7 +127,7 @@ def rel_mse_epsilon(reference) -> float:
     return epsilon
 
 
-def rel_mse(image, reference, trim=0.0) -> float:
+def rel_mse(image: Image, reference: Image, trim: float = 0.0) -> float:
     """Relative mean squared error: mean of (x - r)^2 / (r^2 + eps).
 
     Over pixels and channels; eps is `rel_mse_epsilon`. Source: F. Rousselle, C. Knaus, M. Zwicker, Adaptive
@@ -59,7 +142,7 @@ def rel_mse(image, reference, trim=0.0) -> float:
     return float(error[kept].mean())
 
 
-def spread(images, reference, trim=0.0) -> list[float]:
+def spread(images: Sequence[np.ndarray], reference: Image, trim: float = 0.0) -> list[float]:
     """Return `rel_mse` without bias for each of n independent ``images`` of one mean.
 
     The mean of (x - m)^2 n / (n - 1) / (r^2 + eps), m the mean of the n images and r the ``reference``, which
@@ -73,12 +156,12 @@ def spread(images, reference, trim=0.0) -> list[float]:
     return [scale * _kept_mean((((image - centre) * weights) ** 2).ravel(), trim) for image in images]
 
 
-def _kept_mean(errors, trim) -> float:
+def _kept_mean(errors: np.ndarray, trim: float) -> float:
     """Return the mean of ``errors`` without the share ``trim`` of the largest."""
     return float(errors[_smallest(errors, trim)].mean())
 
 
-def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
+def reference_rel_mse(difference: Image, image: Image, reference: Image, trim: float = 0.0) -> float:
     """Return what the reference's own error adds to `rel_mse`.
 
     ``difference``: an image of the reference's error, such as half the difference of its halves. Returns its
@@ -90,14 +173,14 @@ def reference_rel_mse(difference, image, reference, trim=0.0) -> float:
     return float(own[kept].mean())
 
 
-def _relative_errors(image, reference, trim):
+def _relative_errors(image: Image, reference: Image, trim: float) -> tuple[np.ndarray, np.ndarray]:
     """Return squared relative errors (n,), and the indices of those kept."""
     image, reference = pair_of(image, reference)
     error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
     return error, _smallest(error, trim)
 
 
-def _smallest(errors, trim):
+def _smallest(errors: np.ndarray, trim: float) -> np.ndarray:
     """Return the indices of ``errors`` without the share ``trim`` of the largest."""
     if trim != 0:
         trim = number_of("trim", trim, 0, 1)
@@ -107,7 +190,7 @@ def _smallest(errors, trim):
     return np.argpartition(errors, keep - 1)[:keep]
 
 
-def mape(image, reference) -> float:
+def mape(image: Image, reference: Image) -> float:
     """Mean absolute relative error: mean of |x - r| / (|r| + eps1); 1 is 100 %.
 
     Over pixels and channels. eps1 = 0.01 mean(r) bounds the weight of pixels below a hundredth of the mean,
@@ -120,36 +203,20 @@ def mape(image, reference) -> float:
     return float(np.mean(np.abs(image - reference) / (np.abs(reference) + epsilon)))
 
 
-# Relative to the mean: negative values up to this are rounding (`volpath` in grids).
-ROUNDED = 1e-5
-
-
-def energy_in_black(image, reference) -> float:
-    """Share of the image's energy in pixels that are black in the reference.
-
-    All three channels of the reference are exactly 0 there. 0 for an image without energy. Negative values
-    beyond rounding raise ``CommandError``.
-    """
-    image, reference = pair_of(image, reference)
-    if image.min() < -ROUNDED * image.mean():
-        raise CommandError(f"image holds negative values down to {image.min():g}; energies must not cancel.")
-    total = image.sum()
-    black = (reference == 0).all(axis=-1)
-    return float(image[black].sum() / total) if total > 0 else 0.0
-
-
-def tone_map(image, exposure=0.0) -> np.ndarray:
+def tone_map(image: Image, exposure: float = 0.0) -> np.ndarray:
     """Return sRGB-encoded values in [0, 1] for display, shape (height, width, 3).
 
     x = clip(image * 2^exposure, 0, 1) with ``exposure`` in stops, then the transfer function of IEC
     61966-2-1: 12.92 x up to 0.0031308, above it 1.055 x^(1/2.4) - 0.055.
     """
-    x = np.clip(image_of("image", image) * 2.0 ** number_of("exposure", exposure, -100, 100), 0, 1)
+    x: np.ndarray = np.clip(
+        image_of("image", image) * 2.0 ** number_of("exposure", exposure, -100, 100), 0, 1
+    )
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
 
 
 @functools.cache
-def _of_the_extra(module: str, needed_by: str):
+def _of_the_extra(module: str, needed_by: str) -> Any:
     """Import a module of the extra ``[measure]``; raise ``CommandError`` without it.
 
     Suppresses warnings at import about optional packages.
@@ -163,33 +230,23 @@ def _of_the_extra(module: str, needed_by: str):
             raise CommandError(f"{needed_by} needs the module {module}: {install}") from error
 
 
-def delta_e_2000(image, reference, exposure=0.0) -> float:
-    """Mean CIEDE2000 of both images as `tone_map` displays them; 1 is just visible.
-
-    sRGB to XYZ to L*a*b* under D65, k_L = k_C = k_H = 1. Source: CIE 142-2001; G. Sharma, W. Wu, E. Dalal,
-    The CIEDE2000 color-difference formula, 2005.
-    """
-    colour = _of_the_extra("colour", "delta_e_2000")
-    labs = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(tone_map(x, exposure))) for x in pair_of(image, reference)]
-    return float(np.mean(colour.delta_E(*labs, method="CIE 2000")))
-
-
-def delta_e_itp(image, reference, exposure=0.0, white=WHITE) -> float:
+def delta_e_itp(image: Image, reference: Image, exposure: float = 0.0, white: float = WHITE) -> float:
     """Mean Delta E ITP of both images as `tone_map` displays them; 1 is just visible.
 
     720 sqrt(dI^2 + (dC_T / 2)^2 + dC_P^2) in IC_TC_P of BT.2100 (PQ), linear BT.2020 in cd/m^2 with 1 at
-    ``white``. Source: Recommendation ITU-R BT.2124. More accurate than `delta_e_2000` in dark regions.
+    ``white``. Source: Recommendation ITU-R BT.2124.
     """
     colour = _of_the_extra("colour", "delta_e_itp")
     white = number_of("white", white, 0)
-    encoded = []
+    encoded: list[np.ndarray] = []
     for x in pair_of(image, reference):
         linear = colour.RGB_to_RGB(tone_map(x, exposure), "sRGB", "ITU-R BT.2020", apply_cctf_decoding=True)
         encoded.append(colour.RGB_to_ICtCp(white * np.maximum(linear, 0)))
-    return float(np.mean(colour.difference.delta_E_ITP(*encoded)))
+    difference: np.ndarray = colour.difference.delta_E_ITP(*encoded)
+    return float(difference.mean())
 
 
-def hdr_flip(image, reference):
+def hdr_flip(image: Image, reference: Image) -> tuple[float, np.ndarray]:
     """Mean HDR-FLIP error in [0, 1] and the error map (height, width), float32.
 
     The largest LDR-FLIP error over exposures that follow from the reference, ACES tone mapping, 67 pixels per

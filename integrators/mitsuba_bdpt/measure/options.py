@@ -6,9 +6,10 @@ A dataclass per measurement. Imports only the standard library, since the comman
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..errors import CommandError
 
@@ -70,7 +71,7 @@ WHOLE, SEED, STOPS = Number(int, 1), Number(int, 0, 2**32 - 1), Number(float, -1
 SECONDS, WIDTH = Number(float, 0), Number(int, 4, step=4)
 
 
-def option(default: Any, bounds: Number | Choice | type, text: str, **declared) -> Any:
+def option(default: Any, bounds: Number | Choice | type, text: str, **declared: Any) -> Any:
     """Return a field: default (None is valid beside the bounds), bounds and help.
 
     ``declared``: further arguments for argparse, and ``short``, another name there.
@@ -94,18 +95,17 @@ class Options:
     def __post_init__(self):
         """Raise ``CommandError`` for invalid values."""
         for found in options_of(type(self)):
-            value, bounds = getattr(self, found.name), found.metadata["bounds"]
+            value: Any = getattr(self, found.name)
+            bounds = found.metadata["bounds"]
             if isinstance(bounds, type) or (value is None and found.default is None):
                 continue
-            values = (
-                value if isinstance(found.default, tuple) and isinstance(value, list | tuple) else [value]
-            )
-            for single in values:
-                if not bounds.holds(single):
-                    raise CommandError(f"{found.name}={value!r} must be {bounds}")
+            several = isinstance(found.default, tuple) and isinstance(value, list | tuple)
+            values = cast(Sequence[object], value if several else [value])
+            if not all(map(bounds.holds, values)):
+                raise CommandError(f"{found.name}={value!r} must be {bounds}")
 
 
-def options_of(kind: type) -> list[Field]:
+def options_of(kind: type) -> list[Field[Any]]:
     return [found for found in fields(kind) if "bounds" in found.metadata]
 
 

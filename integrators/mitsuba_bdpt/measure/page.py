@@ -1,8 +1,8 @@
 """Writes a sweep as one HTML file that needs neither network nor server.
 
-For each scene: the first integrator's efficiency over `path` and its reasons, images of the first seed at the
-deciding budget (half precision, divider, exposure control), and error maps. Then a table of all renders, and
-plots. The template is page.html.
+For each scene: the first integrator's efficiency over `path`, images of the first seed at the deciding budget
+(half precision, divider, exposure control), and error maps. Then a table of all renders, and the report with
+its plots. The template is page.html.
 """
 
 from __future__ import annotations
@@ -11,20 +11,21 @@ import base64
 import html
 import json
 import math
+import re
 import tempfile
 from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+from markdown_it import MarkdownIt
 
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..files.whole import check_own
-from ..planning.explain import subpaths
-from . import figures, report
 from .analysis import NOTHING, RIVALS, Biased, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
+from .report import Report
 from .tables import ratio
 
 TITLE = "mitsuba-bdpt: sweep"
@@ -44,13 +45,6 @@ COLUMNS = {
     "MAPE": "mape",
     "HDR-FLIP": "flip",
     "ΔE ITP": "delta_e_itp",
-}
-
-PLOTS = {
-    "efficiency": "Ratio of efficiencies per scene, median and range over seeds",
-    "seconds": "relMSE over seconds, a panel per scene",
-    "samples": "relMSE over samples per pixel, a panel per scene",
-    "rays": "Rays per camera subpath by kind, a bar per scene",
 }
 
 
@@ -74,43 +68,12 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
     return found.median, f"{rival} is ahead: its efficiency is {ratio(1 / found.median)} ours {span}."
 
 
-def why(results: Results, scene: str) -> str:
-    """Describe what the first render at the deciding budget used and skipped."""
-    rows = results.of(scene, results.methods[0], results.deciding)
-    if not rows:
-        return ""
-    row = rows[0]
-    statistics = json.loads(row["statistics"] or "{}")
-    if not statistics:  # an integrator other than `bdpt`
-        return ""
-    decided = (statistics.get("decisions") or [None])[-1]
-    if decided is None:
-        said = "No pilot: the render was too short for one, or there was nothing to choose."
-    elif not decided["light_paths"]:
-        said = "Camera subpaths alone."
-    else:
-        joined = {
-            "none": "light tracing, no inner connections",
-            "one": "one inner connection drawn per camera vertex",
-            "all": "all inner connections",
-        }[decided["connections"]]
-        served = round(1 / decided["light_paths"])
-        said = f"A pilot chose one light subpath per {subpaths(served)}, {joined}."
-    left_out = [
-        f"Left out: {entry['class']} ({entry['why']})."
-        for entry in statistics.get("skipped", [])
-        if entry["level"] == "not worth its cost here"
-    ]
-    return " ".join([said, *left_out])
-
-
 def answers(results: Results) -> str:
     """Return the list of all scenes, by decreasing gain."""
     found = {scene: answer(results, scene) for scene in results.scenes}
     order = sorted(found, key=lambda scene: -1 if math.isnan(found[scene][0]) else found[scene][0])[::-1]
     items = [
-        f'<li><a href="#scene-{scene}"><b>{scene}</b></a>: {html.escape(found[scene][1])} '
-        f"{html.escape(why(results, scene))}</li>"
+        f'<li><a href="#scene-{scene}"><b>{scene}</b></a>: {html.escape(found[scene][1])}</li>'
         for scene in order
     ]
     return f"<ul>\n{chr(10).join(items)}\n</ul>"
@@ -146,7 +109,7 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
         "exposure": round(4 * math.log2(0.9 / max(bright, 1e-6))) / 4,
         "images": images | {"reference": encoded(target)},
         "figures": captions,
-        "words": f"{answer(results, scene)[1]} {why(results, scene)}",
+        "words": answer(results, scene)[1],
     }
 
 
@@ -167,42 +130,30 @@ def lines(results: Results) -> list[list]:
     return found
 
 
-def plots(results: Results) -> str:
+def reported(report: Report) -> str:
+    """Return the report as HTML, without its title, with its plots."""
+    text = report.text().partition("\n")[2]
     with tempfile.TemporaryDirectory() as folder:
-        files = {name: Path(folder) / f"{name}.png" for name in PLOTS}
-        if results.rivals:
-            figures.efficiencies(results, results.rivals, files["efficiency"])
-        figures.convergence(results, "seconds", files["seconds"])
-        figures.convergence(results, "spp", files["samples"])
-        figures.rays(results, files["rays"])
-        made = {name: file for name, file in files.items() if file.exists()}
-        shown = {name: base64.b64encode(file.read_bytes()).decode() for name, file in made.items()}
-    return "\n".join(
-        f'<p><img class="plot" alt="{PLOTS[name]}" src="data:image/png;base64,{data}"></p>'
-        for name, data in shown.items()
-    )
+        report.draw(Path(folder))
+
+        def embedded(found: re.Match) -> str:
+            data = base64.b64encode((Path(folder) / found[1]).read_bytes()).decode()
+            return f'class="plot" src="data:image/png;base64,{data}"'
+
+        return re.sub(r'src="(\w+\.png)"', embedded, MarkdownIt().enable("table").render(text))
 
 
-def page(folder: Path, results: Results, made: dict) -> str:
+def page(folder: Path, report: Report) -> str:
+    results = report.results
     data = {
         "columns": list(COLUMNS),
         "rows": lines(results),
-        "scenes": [scene_data(folder, results, made, scene) for scene in results.scenes],
+        "scenes": [scene_data(folder, results, report.made, scene) for scene in results.scenes],
     }
-    first, *others = (html.escape(name) for name in results.methods)
-    stronger = report.stronger(results).replace("`", "")
-    introduction = (
-        f"<p>{first} beside {', '.join(others)} in {len(results.scenes)} scenes, "
-        f"{len(results.rows)} renders. Efficiency is 1 / (seconds · relMSE); ratios are medians "
-        f"(smallest to largest) over renders with the same seed at {results.deciding} samples per pixel of "
-        f"{first}, trimmed of the worst 0.1 % of values, over {stronger}.</p>"
-    )
     parts = {
         "TITLE": f"{TITLE} {html.escape(folder.resolve().name)}",
-        "INTRODUCTION": introduction,
         "ANSWERS": answers(results),
-        "PLOTS": plots(results),
-        "MACHINE": html.escape(report.machine(results)),
+        "REPORT": reported(report),
         # Only "</" could end a script element.
         "DATA": json.dumps(data, allow_nan=False).replace("</", "<\\/"),
     }
@@ -219,7 +170,7 @@ def run(options: Namespace) -> int:
     output = options.output or folder / "page.html"
     check_output(output, ".html")
     check_own(output, f"<title>{TITLE}", "move it away, or name another output by -o")
-    text = page(folder, *report.load(project, folder))
+    text = page(folder, Report.of(project, folder))
     write_text(output, text)
     print(f"{output}: {len(text) / 2**20:.1f} MiB")
     return 0

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from .options import VARIANT
@@ -37,12 +38,9 @@ print(memory.peak() / 2**30)
 """
 
 
-def _printed(code, environment=None) -> float:
-    """Return the last number that a new process prints."""
-    return numbers(code, environment=environment)[-1]
-
-
-def numbers(code, *arguments, environment=None, folder: Path | None = None) -> list[float]:
+def numbers(
+    code: str, *arguments: str, environment: Mapping[str, str] | None = None, folder: Path | None = None
+) -> list[float]:
     """Return the numbers that a new process prints, run in a ``folder``."""
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder)
@@ -51,7 +49,14 @@ def numbers(code, *arguments, environment=None, folder: Path | None = None) -> l
     return [float(word) for word in done.stdout.split() if _is_number(word)]
 
 
-def _is_number(word) -> bool:
+def cold(code: str, *arguments: str, folder: Path | None = None) -> list[float]:
+    """Like `numbers`, with an empty kernel cache."""
+    with tempfile.TemporaryDirectory() as cache:
+        empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
+        return numbers(code, *arguments, environment=empty, folder=folder)
+
+
+def _is_number(word: str) -> bool:
     try:
         float(word)
     except ValueError:
@@ -59,26 +64,24 @@ def _is_number(word) -> bool:
     return True
 
 
-def coldstart(project: Project, rounds: int) -> dict:
+def coldstart(project: Project, rounds: int) -> dict[str, list[float]]:
     """Return seconds from an empty kernel cache to the first image, by integrator.
 
     Cornell box, 256x256, depth 6, 16 spp; without imports and loading. A value per round.
     """
-    seconds = {"path": [], "bdpt": []}
+    seconds: dict[str, list[float]] = {"path": [], "bdpt": []}
     for _ in range(rounds):
         for name, values in seconds.items():
-            with tempfile.TemporaryDirectory() as cache:
-                empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
-                values.append(_printed(COLD % name, empty))
+            values.append(cold(COLD % name)[-1])
     return seconds
 
 
-def memory(project: Project, rounds: int) -> dict:
+def memory(project: Project, rounds: int) -> dict[str, list[float]]:
     """Return the peak resident GiB of a render, by samples per pixel.
 
     Cornell box, 1920x1080, depth 8. A value per round.
     """
-    return {f"{spp} spp": [_printed(MEMORY % spp) for _ in range(rounds)] for spp in (2, 8)}
+    return {f"{spp} spp": [numbers(MEMORY % spp)[-1] for _ in range(rounds)] for spp in (2, 8)}
 
 
 PROBES = {"coldstart": coldstart, "memory": memory}

@@ -15,6 +15,7 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ..errors import CommandError, did_you_mean
 from ..files.texts import read_toml, table_of, whole_of
@@ -29,7 +30,7 @@ class Project:
     """The folder ``root``, see above."""
 
     root: Path
-    given: Mapping[str, DictionaryScene] = field(default_factory=dict, compare=False)
+    given: Mapping[str, DictionaryScene] = field(default_factory=dict[str, DictionaryScene], compare=False)
     """Scenes that are given as dictionaries, by their names."""
 
     @property
@@ -108,7 +109,7 @@ class Project:
         return named if named.exists() and not given.exists() else given
 
 
-def depth_in(file: Path, preset: dict, scene: MeasuredScene) -> int:
+def depth_in(file: Path, preset: dict[str, Any], scene: MeasuredScene) -> int:
     """Return the ``max_depth`` at which a preset from a TOML ``file`` renders a scene.
 
     The preset's for the scene, else the preset's, else that of the scene's file. Raises ``CommandError`` for

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Reference:
     image: np.ndarray
     difference: np.ndarray
     means: Means | None
-    provenance: dict
+    provenance: dict[str, Any]
 
     @property
     def error(self) -> float:
@@ -48,14 +49,14 @@ class Reference:
     def merged(self) -> bool:
         """Whether it contains light that only `merging` samples, slightly blurred."""
         made_by = self.provenance["integrator"]
-        return isinstance(made_by, dict) and made_by.get("merging", False)
+        return not isinstance(made_by, str) and bool(made_by.get("merging"))
 
     @property
     def given(self) -> bool:
         """Whether the user gave the image (`given`); its own error is then not stored."""
         return "given" in self.provenance
 
-    def share_of(self, image, trim: float) -> float:
+    def share_of(self, image: np.ndarray, trim: float) -> float:
         """Return the share of its own error in ``rel_mse(image, self.image, trim)``."""
         return reference_rel_mse(self.difference, image, self.image, trim)
 
@@ -134,7 +135,7 @@ def write(path: Path, reference: Reference):
     write_layers(path, layers, {"provenance": json.dumps(header)}, dtype)
 
 
-def means_of(kept) -> Means | None:
+def means_of(kept: Any) -> Means | None:
     """Return the `Means` in a provenance; freedom is infinite for exact images."""
     if kept is None:
         return None
@@ -151,7 +152,7 @@ def means_of(kept) -> Means | None:
     )
 
 
-def kept_of(means: Means | None):
+def kept_of(means: Means | None) -> dict[str, Any] | None:
     """Inverse of `means_of`, for JSON."""
     if means is None:
         return None

@@ -9,19 +9,21 @@ the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being 
 from __future__ import annotations
 
 import json
-import re
 from argparse import Namespace
 from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet
 
 from ..errors import CommandError
-from ..files.texts import list_of, read_json, read_toml, text_of, write_text
+from ..files.texts import list_of, read_toml, text_of, write_text
 from ..files.whole import check_own
 from . import figures
+from .agreement import BiasCheck
 from .analysis import (
     ALONE,
     IMPOSSIBLE,
@@ -44,52 +46,12 @@ from .analysis import (
 )
 from .metrics import rel_mse_epsilon
 from .project import Project
-from .reference import make_command, read_reference, reference_path, too_few
-from .scenes import digest
-from .tables import ranged, ratio, said, table
+from .record import Error, Row
+from .reference import Reference
+from .results import load
+from .tables import by_scene, ranged, ratio, replace_part, said, table
 
-
-def load(project: Project, folder: Path) -> tuple[Results, dict]:
-    """Return the results in a folder, and the references of its scenes by name.
-
-    Raises ``CommandError`` if there are none, or if errors are against other references than the
-    ``project``'s.
-    """
-    try:
-        rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
-    except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
-        raise CommandError(
-            f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
-        ) from error
-    made, digests = {}, {}
-    for row in rows:
-        scene = row["scene"]
-        if scene not in made:
-            path = reference_path(project, scene, row["resolution"], row["max_depth"])
-            if not path.is_file():
-                raise CommandError(
-                    f"{folder}: the reference of {scene} is not in {str(project.references)!r}; name the "
-                    "folder of the sweep's project by --project, or run the sweep again, which makes it"
-                )
-            made[scene], digests[scene] = read_reference(path), digest(path)
-        if row["reference_sha256"] != digests[scene]:
-            raise CommandError(
-                f"{folder}: the errors in {scene} were taken against another reference; run "
-                f"{project.sweep_command(folder)}, which takes them anew"
-            )
-    means = {scene: kept.means for scene, kept in made.items() if not kept.given}
-    if without := [scene for scene, kept in means.items() if kept is None]:
-        raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
-    file = folder / "probes.json"
-    measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
-    return Results(rows, means, measured), made
-
-
-def _reference_command(project: Project, rows: list[dict], scene: str) -> str:
-    """Return the command line that refines the reference of a scene."""
-    row = next(row for row in rows if row["scene"] == scene)
-    called = scene if scene in project.scene_names() else f"{scene}.xml"
-    return make_command(project, called, row["resolution"], row["max_depth"])
+# -- tables -----------------------------------------------------------------------------------
 
 
 def efficiency_table(results: Results) -> str:
@@ -97,34 +59,50 @@ def efficiency_table(results: Results) -> str:
 
     A table per set of rivals: scenes with media have others.
     """
-    groups = {}
+    groups: dict[tuple[str, ...], list[str]] = {}
     for scene in results.scenes:
         rivals = tuple(rival for rival in results.rivals if results.of(scene, rival))
         groups.setdefault(rivals, []).append(scene)
-    return "\n".join(_efficiencies(results, rivals, scenes) for rivals, scenes in groups.items())
+    return "\n".join(by_scene(scenes, _efficiencies(results, rivals)) for rivals, scenes in groups.items())
 
 
-def _efficiencies(results: Results, rivals, scenes) -> str:
-    head = ["scene", *(f"over {rival}, {kind}" for rival in rivals for kind in ("trimmed", "raw"))]
-    with_all = NONE in results.methods[1:]
-    head += [f"over {NONE}, trimmed"] * with_all
-    lines = []
-    for scene in scenes:
-        line = [f"`{scene}`"]
-        for rival in rivals:
-            try:
-                results.fair_efficiency(scene, rival)
-            except Biased as why:
-                line += [str(why), "–"]
-                continue
-            except Refused:
-                pass
-            line += [
-                said(lambda s=scene, r=rival, e=error: results.fair_efficiency(s, r, e))
-                for error in ("rel_mse_trimmed", "rel_mse")
-            ]
-        lines.append(line + [said(lambda s=scene: results.efficiency(s, NONE))] * with_all)
-    return table(head, lines)
+def _efficiencies(results: Results, rivals: Iterable[str]) -> dict[str, Callable[[str], object]]:
+    """Return the columns of the first integrator's efficiencies over the ``rivals`` and everything."""
+
+    def raw(rival: str, scene: str):
+        try:
+            return results.fair_efficiency(scene, rival, "rel_mse")
+        except Biased:
+            return "–"
+
+    columns: dict[str, Callable[[str], object]] = {}
+    for rival in rivals:
+        columns[f"over {rival}, trimmed"] = partial(results.fair_efficiency, rival=rival)
+        columns[f"over {rival}, raw"] = partial(raw, rival)
+    if NONE in results.methods[1:]:
+        columns[f"over {NONE}, trimmed"] = partial(results.efficiency, rival=NONE)
+    return columns
+
+
+KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
+
+
+def budgets_table(results: Results) -> str:
+    """Table of the efficiency over the strongest of `Results.standard`, by budget."""
+
+    def figure(scene: str, error: Error, budget: int) -> str:
+        try:
+            return ranged(results.against_path(scene, error, budget))
+        except Refused:
+            return "–"
+
+    columns = {
+        f"{budget} spp, {kind}": partial(figure, error=error, budget=budget)
+        for budget in sorted({row["budget"] for row in results.rows})
+        for error, kind in KINDS.items()
+    }
+    scenes = [scene for scene in results.scenes if any(f(scene) != "–" for f in columns.values())]
+    return by_scene(scenes, columns)
 
 
 def gaps_table(results: Results) -> str:
@@ -133,13 +111,12 @@ def gaps_table(results: Results) -> str:
     For the first integrator and the first of `Results.standard`, by decreasing ratio.
     """
     ours, rivals = results.methods[0], _first_rivals(results)
-    rows = []
-    for scene in results.by_gap(ours):
-        methods = [ours, *(results.standard_in(scene) or rivals)[:1]]
-        rows.append(
-            [f"`{scene}`", *(said(lambda s=scene, m=method: results.gap(s, m)) for method in methods)]
+    columns: dict[str, Callable[[str], object]] = {ours: partial(results.gap, method=ours)}
+    if rivals:
+        columns[" or ".join(rivals)] = lambda scene: results.gap(
+            scene, (results.standard_in(scene) or rivals)[0]
         )
-    return table(["scene", ours, *([" or ".join(rivals)] if rivals else [])], rows)
+    return by_scene(results.by_gap(ours), columns)
 
 
 def _first_rivals(results: Results) -> list[str]:
@@ -148,76 +125,76 @@ def _first_rivals(results: Results) -> list[str]:
     return list(dict.fromkeys(firsts)) or results.standard[:1]
 
 
-GALLERY = "../images/gallery"  # relative to docs/reports/figures.md
-GALLERY_COLUMNS = 3
-
-
-def gallery(results: Results) -> str:
-    """Images of all scenes, with the efficiency over the stronger `path`."""
-    cells = []
-    for scene in results.scenes:
-        try:
-            figure = ranged(results.against_path(scene))
-        except Biased as why:
-            rival, lacks = list(why.lacks.items())[-1]
-            figure = f"`{rival.split()[0]}`: {lacks}"
-        except NotJudged:
-            figure = "not judged"
-        except Refused as why:
-            figure = str(why)
-        cells.append(f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{figure}")
-    cells += [""] * (-len(cells) % GALLERY_COLUMNS)
-    rows = [cells[i : i + GALLERY_COLUMNS] for i in range(0, len(cells), GALLERY_COLUMNS)]
-    return table(rows[0], rows[1:])
-
-
-def estimate(x) -> str:
-    return f"{x.value:.2f} ({x.low:.2f} to {x.high:.2f})"
-
-
-def checks_table(results: Results, made: dict, notes: dict) -> str:
+def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, str]) -> str:
     """Cost per sample, slopes and bias checks per scene; marks unexpected ones."""
     ours = results.methods[0]
     rival = " or ".join(_first_rivals(results) or RIVALS[:1])
-    head = ["scene", f"cost of a sample over {rival}", f"{NONE} over {rival}", "slope"]
-    head += ["slope, independent points"]
-    head += ["bias check", LIGHT_TRACER]
-    lines = []
-    for scene in results.scenes:
-        path = [
-            row
-            for method in results.standard_in(scene)[:1]
-            for row in results.of(scene, method, results.deciding)
-        ]
-        lines.append(
-            [
-                f"`{scene}`",
-                *(
-                    said(lambda p=path, s=scene, m=method: cost(results.of(s, m, results.deciding), p))
-                    for method in (ours, NONE)
-                ),
-                _slope(results, scene, notes),
-                said(lambda s=scene: convergence(results.of(s, INDEPENDENT)), estimate),
-                said(lambda s=scene: results.bias(s, ours), partial(_verdict, merged=made[scene].merged))
-                + f", by {_maker(made[scene])}",
-                said(lambda s=scene: results.fair_efficiency(s, LIGHT_TRACER)),
-            ]
-        )
-    return table(head, lines)
+
+    def costs(method: str, scene: str) -> Summary:
+        first = results.standard_in(scene)[:1]
+        theirs = results.of(scene, first[0], results.deciding) if first else []
+        return cost(results.of(scene, method, results.deciding), theirs)
+
+    def bias(scene: str) -> str:
+        verdict = said(lambda: _verdict(results.bias(scene, ours), made[scene].merged))
+        return f"{verdict}, by {_maker(made[scene])}"
+
+    columns: dict[str, Callable[[str], object]] = {
+        f"cost of a sample over {rival}": partial(costs, ours),
+        f"{NONE} over {rival}": partial(costs, NONE),
+        "slope": partial(_slope, results, notes),
+        "slope, independent points": lambda scene: convergence(results.of(scene, INDEPENDENT)),
+        "bias check": bias,
+        LIGHT_TRACER: partial(results.fair_efficiency, rival=LIGHT_TRACER),
+    }
+    return by_scene(results.scenes, columns)
 
 
-def _slope(results, scene, notes) -> str:
-    try:
-        found = convergence(results.of(scene, results.methods[0]))
-    except Refused as why:
-        return str(why)
-    if len({_chosen(row) for row in results.of(scene, results.methods[0])}) > 1:
-        return estimate(found) + ", between decisions"
+def _slope(results: Results, notes: dict[str, str], scene: str) -> str:
+    rows = results.of(scene, results.methods[0])
+    found = convergence(rows)
+    if len(set(map(_chosen, rows))) > 1:
+        return said(lambda: found) + ", between decisions"
     expected = found.low <= -1 <= found.high or scene in notes
-    return estimate(found) + ("" if expected else ", **unexplained**")
+    return said(lambda: found) + ("" if expected else ", **unexplained**")
 
 
-def _chosen(row) -> str:
+def _verdict(check: BiasCheck, merged: bool) -> str:
+    """Format a bias check, with the surplus of energy and its interval in percent.
+
+    ``merged``: the reference contains light that only `merging` samples.
+    """
+    half = 50 * (check.missing.high - check.missing.low)
+    failed = "fails by what `merging` finds" if merged and check.missing.low > 0 else "**failed**"
+    verdict = "passed" if check.passed else failed
+    return f"{verdict}, p = {check.family_p:.2g}, energy {-100 * check.missing.value:+.2g} % ± {half:.2g}"
+
+
+def choices_table(results: Results) -> str:
+    """Table of the pilots' choices and costs, skipped strategies, and rays per sample."""
+
+    def rows(scene: str) -> list[Row]:
+        return results.of(scene, results.methods[0], results.deciding)
+
+    def chosen(scene: str) -> str:
+        counts = Counter(map(_chosen, rows(scene))).most_common()
+        return "; ".join(f"{text or 'no pilot'} ({n})" for text, n in counts) or "not rendered"
+
+    def left_out(scene: str) -> str:
+        skipped = [s for row in rows(scene)[:1] for s in json.loads(row["statistics"]).get("skipped", [])]
+        return ", ".join(s["class"] for s in skipped if s["level"] == "not worth its cost here") or "–"
+
+    columns: dict[str, Callable[[str], object]] = {
+        "chosen (number of renders)": chosen,
+        "left out in the first render": left_out,
+        "share of the pilot in the first render": lambda scene: _pilot_share(rows(scene)),
+        "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
+        f"the same, {NONE}": lambda scene: _rays_per_sample(results.of(scene, NONE, results.deciding)),
+    }
+    return by_scene(results.scenes, columns)
+
+
+def _chosen(row: Row) -> str:
     """Return the pilot's last choice as parameters; empty without a pilot."""
     decisions = json.loads(row["decisions"] or "null")
     last = decisions[-1] if decisions else None
@@ -228,15 +205,17 @@ def _chosen(row) -> str:
     return f"light_paths={light_paths}, connections={last['connections']}"
 
 
-def _pilot_share(row) -> float:
+def _pilot_share(rows: Sequence[Row]) -> str:
     """Return the pilots' share of a scene's first render; later ones reuse them."""
-    first = row.get("seconds_pilot")
-    if first is None:
-        raise Refused("rows of a version that remembered no pilots")
-    return first / (first + row["seconds"])
+    shares: list[float] = []
+    for row in rows:
+        if (first := row.get("seconds_pilot")) is None:
+            raise Refused("rows of a version that remembered no pilots")
+        shares.append(first / (first + row["seconds"]))
+    return f"{100 * np.median(shares):.1f} %" if shares else "–"
 
 
-def _rays_per_sample(rows) -> str:
+def _rays_per_sample(rows: Sequence[Mapping[str, Any]]) -> str:
     """Rays per sample: camera, light; shadow rays of s = 1, t = 1, inner."""
     if not rows or rows[0].get("rays_camera") is None:
         return "–"
@@ -247,42 +226,47 @@ def _rays_per_sample(rows) -> str:
     )
 
 
-def choices_table(results: Results) -> str:
-    """Table of the pilots' choices and costs, skipped strategies, and rays per sample."""
-    head = ["scene", "chosen (number of renders)", "left out in the first render"]
-    head += ["share of the pilot in the first render"]
-    head += ["closest hits and shadow rays per sample", f"the same, {NONE}"]
-    lines = []
-    for scene in results.scenes:
-        rows = results.of(scene, results.methods[0], results.deciding)
-        chosen = Counter(_chosen(row) for row in rows).most_common()
-        if not rows:
-            lines.append([f"`{scene}`", "not rendered", *["–"] * (len(head) - 2)])
-            continue
-        skipped = json.loads(rows[0]["statistics"]).get("skipped", [])
-        left_out = [s for s in skipped if s["level"] == "not worth its cost here"]
-        lines.append(
-            [
-                f"`{scene}`",
-                "; ".join(f"{text or 'no pilot'} ({count})" for text, count in chosen),
-                ", ".join(s["class"] for s in left_out) or "–",
-                said(lambda rows=rows: f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} %", str),
-                _rays_per_sample(rows),
-                _rays_per_sample(results.of(scene, NONE, results.deciding)),
-            ]
-        )
-    return table(head, lines)
+def references_table(made: dict[str, Reference]) -> str:
+    return by_scene(
+        made,
+        {
+            "max_depth": lambda scene: made[scene].provenance["max_depth"],
+            "by": lambda scene: _maker(made[scene]),
+            "samples per pixel": lambda scene: made[scene].provenance.get("spp", "–"),
+            "own relMSE": lambda scene: f"{made[scene].error:.1e}",
+            "epsilon of relMSE": lambda scene: f"{rel_mse_epsilon(made[scene].image):.3g}",
+        },
+    )
 
 
-def _verdict(check, merged: bool) -> str:
-    """Format a bias check, with the surplus of energy and its interval in percent.
+def _maker(kept: Reference) -> str:
+    """Name the integrator that made a reference."""
+    by = kept.provenance["integrator"]
+    return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
 
-    ``merged``: the reference contains light that only `merging` samples.
-    """
-    half = 50 * (check.missing.high - check.missing.low)
-    failed = "fails by what `merging` finds" if merged and check.missing.low > 0 else "**failed**"
-    verdict = "passed" if check.passed else failed
-    return f"{verdict}, p = {check.family_p:.2g}, energy {-100 * check.missing.value:+.2g} % ± {half:.2g}"
+
+GALLERY = "../images/gallery"  # relative to docs/reports/figures.md
+GALLERY_COLUMNS = 3
+
+
+def gallery(results: Results) -> str:
+    """Images of all scenes, with the efficiency over the stronger `path`."""
+
+    def figure(scene: str) -> str:
+        try:
+            return ranged(results.against_path(scene))
+        except Biased as why:
+            rival, lacks = list(why.lacks.items())[-1]
+            return f"`{rival.split()[0]}`: {lacks}"
+        except NotJudged:
+            return "not judged"
+
+    cells = [
+        f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
+    ]
+    cells += [""] * (-len(cells) % GALLERY_COLUMNS)
+    rows = [cells[i : i + GALLERY_COLUMNS] for i in range(0, len(cells), GALLERY_COLUMNS)]
+    return table(rows[0], rows[1:])
 
 
 def stronger(results: Results) -> str:
@@ -296,57 +280,18 @@ def stronger(results: Results) -> str:
     return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
 
 
-def budgets_table(results: Results) -> str:
-    """Table of the efficiency over the strongest of `Results.standard`, by budget."""
-    budgets = sorted({row["budget"] for row in results.rows})
-    head = ["scene", *(f"{b} spp, {kind}" for b in budgets for kind in ("trimmed", "raw"))]
-    lines = []
-    for scene in results.scenes:
-        line = [f"`{scene}`"]
-        for budget in budgets:
-            for error in ("rel_mse_trimmed", "rel_mse"):
-                try:
-                    line.append(ranged(results.against_path(scene, error, budget)))
-                except Refused:
-                    line.append("–")
-        if set(line[1:]) != {"–"}:
-            lines.append(line)
-    return table(head, lines)
-
-
-def _maker(kept) -> str:
-    """Name the integrator that made a reference."""
-    by = kept.provenance["integrator"]
-    return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
-
-
-def references_table(made: dict) -> str:
-    head = ["scene", "max_depth", "by", "samples per pixel", "own relMSE", "epsilon of relMSE"]
-    lines = []
-    for scene, kept in made.items():
-        lines.append(
-            [
-                f"`{scene}`",
-                str(kept.provenance["max_depth"]),
-                _maker(kept),
-                str(kept.provenance.get("spp", "–")),
-                f"{kept.error:.1e}",
-                f"{rel_mse_epsilon(kept.image):.3g}",
-            ]
-        )
-    return table(head, lines)
-
+Goal = dict[str, Any]
+"""What an entry of goals.toml says."""
 
 # -- goals ------------------------------------------------------------------------------------
 
 
-def _scene_goal(results: Results, scene: str, error="rel_mse_trimmed") -> str:
+def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> str:
     """Efficiency over the strongest unbiased path tracer; else their missing energy."""
     try:
         return ranged(results.against_path(scene, error))
     except Biased as why:
-        rivals = results.standard_in(scene)
-        found = [said(lambda r=rival: results.efficiency(scene, r, error)) for rival in rivals]
+        found = [said(results.efficiency, scene, rival, error) for rival in results.standard_in(scene)]
         return f"{why} (against their error all the same: {', '.join(found)})"
 
 
@@ -362,10 +307,12 @@ def _near(found: Summary) -> str:
 
 def _near_one(results: Results, scene: str) -> str:
     """Efficiency over each of `Results.standard`."""
-    return "; ".join(
-        f"{said(lambda r=rival: results.fair_efficiency(scene, r), _near)} over {rival}"
-        for rival in results.standard_in(scene) or RIVALS
-    )
+
+    def near(rival: str) -> str:
+        return _near(results.fair_efficiency(scene, rival))
+
+    rivals = results.standard_in(scene) or RIVALS
+    return "; ".join(f"{said(near, rival)} over {rival}" for rival in rivals)
 
 
 def _worst(results: Results) -> str:
@@ -373,7 +320,8 @@ def _worst(results: Results) -> str:
 
     Names the scenes that cannot be judged.
     """
-    found, others = {}, []
+    found: dict[str, Summary] = {}
+    others: list[str] = []
     for scene in results.scenes:
         try:
             found[scene] = results.against_path(scene)
@@ -396,9 +344,9 @@ def _against_none(results: Results) -> str:
 
 def _mean_over_none(results: Results, scenes: list[str]) -> str:
     """Mean over the judged scenes, by the errors and by the spread over seeds."""
-    found = []
+    found: list[str] = []
     for error in ("rel_mse_trimmed", "spread_trimmed"):
-        medians = []
+        medians: list[float] = []
         for scene in scenes:
             try:
                 medians.append(results.efficiency(scene, NONE, error).median)
@@ -413,83 +361,67 @@ def _mean_over_none(results: Results, scenes: list[str]) -> str:
 
 def _unaimed(results: Results, scene: str) -> str:
     error, noise = (
-        said(partial(results.efficiency, scene, UNAIMED, error))
-        for error in ("rel_mse_trimmed", "spread_trimmed")
+        said(results.efficiency, scene, UNAIMED, error) for error in ("rel_mse_trimmed", "spread_trimmed")
     )
     return f"{error}; by the spread over seeds {noise}"
 
 
 def _alone(results: Results, scene: str) -> str:
-    found = []
-    for budget in (results.deciding, 4 * results.deciding):
-        ours, theirs = (results.of(scene, method, budget) for method in (ALONE, RIVALS[1]))
-        figure = said(lambda a=ours, b=theirs: efficiency(a, b))
-        found.append(f"{figure} at {budget} spp")
-    return ", ".join(found)
+    return ", ".join(
+        f"{said(efficiency, *(results.of(scene, way, budget) for way in (ALONE, RIVALS[1])))} at {budget} spp"
+        for budget in (results.deciding, 4 * results.deciding)
+    )
 
 
 def _cost(results: Results, scene: str) -> str:
-    path = results.of(scene, RIVALS[0], results.deciding)
-    sides = [cost(results.of(scene, method, results.deciding), path) for method in (NONE, IMPOSSIBLE)]
-    return " / ".join(ranged(side) for side in sides)
+    path, *sides = (results.of(scene, way, results.deciding) for way in (RIVALS[0], NONE, IMPOSSIBLE))
+    return " / ".join(ranged(cost(side, path)) for side in sides)
 
 
 def _pilot(results: Results, scene: str) -> str:
-    found = []
+    shares: dict[int, str] = {}
     for budget in (results.deciding, 4 * results.deciding):
-        rows = results.of(scene, results.methods[0], budget)
-        if rows:
-            found.append(f"{100 * np.median([_pilot_share(row) for row in rows]):.1f} % at {budget} spp")
-    if not found:
+        if rows := results.of(scene, results.methods[0], budget):
+            shares[budget] = _pilot_share(rows)
+    if not shares:
         raise Refused(f"no render of {scene}")
-    return ", ".join(found)
+    return ", ".join(f"{share} at {budget} spp" for budget, share in shares.items())
 
 
 def _floor(results: Results) -> str:
-    return ", ".join(f"{ranged(summary(v))} `{name}`" for name, v in _values(results, "floor").items())
-
-
-def _values(results, name) -> dict:
-    """Return a probe's results for the software of the rows."""
-    probe = results.probes.get(name)
-    if probe is None:
-        raise Refused("not measured")
-    if probe["versions"] != json.loads(results.rows[0]["versions"]) | {"machine": results.rows[0]["machine"]}:
-        raise Refused("measured of another version or on another machine")
-    return probe["values"]
+    return ", ".join(f"{ranged(summary(v))} `{name}`" for name, v in results.probed("floor").items())
 
 
 def _coldstart(results: Results) -> str:
-    values = _values(results, "coldstart")
+    values = results.probed("coldstart")
     ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
     return f"{np.median(values['bdpt']):.2f} s, {ranged(ratios)} `path`'s"
 
 
 def _memory(results: Results) -> str:
-    values = _values(results, "memory")
-    return ", ".join(f"{np.median(v):.2f} GiB for {name}" for name, v in values.items())
+    return ", ".join(f"{np.median(v):.2f} GiB for {name}" for name, v in results.probed("memory").items())
 
 
-GOALS = {
+OF_A_SCENE: dict[str, Callable[[Results, str], object]] = {
     "efficiency": _scene_goal,
-    "efficiency raw": lambda results, scene: _scene_goal(results, scene, "rel_mse"),
+    "efficiency raw": partial(_scene_goal, error="rel_mse"),
     "near one": _near_one,
-    "worst": _worst,
-    "against none": _against_none,
     "alone": _alone,
     "not aimed": _unaimed,
     "cost": _cost,
     "pilot": _pilot,
+}
+OF_ALL: dict[str, Callable[[Results], object]] = {
+    "worst": _worst,
+    "against none": _against_none,
     "floor": _floor,
     "coldstart": _coldstart,
     "memory": _memory,
 }
-
-OF_A_SCENE = ("efficiency", "efficiency raw", "near one", "alone", "not aimed", "cost", "pilot")
-"""Those that take a scene."""
+"""What goals can measure: figures of a scene, and others."""
 
 
-def checked_goals(file: Path, data: dict) -> list[dict]:
+def checked_goals(file: Path, data: dict[str, Any]) -> list[Goal]:
     """Return the entries [[goal]] of goals.toml; raises ``CommandError`` if invalid."""
     if not data:
         return []
@@ -500,48 +432,38 @@ def checked_goals(file: Path, data: dict) -> list[dict]:
         if "aim" in goal:
             text_of(file, f"aim of {goal['what']!r}", goal["aim"])
         measure, scene = goal.get("measure"), goal.get("scene")
-        if measure is not None and measure not in tuple(GOALS):
-            raise CommandError(
-                f"{file}: measure={measure!r} of {goal['what']!r} must be one of {sorted(GOALS)}"
-            )
-        if measure is not None and (scene is not None) != (measure in OF_A_SCENE):
+        if measure is None:
+            continue
+        if measure not in (known := sorted([*OF_A_SCENE, *OF_ALL])):
+            raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} must be one of {known}")
+        if (scene is not None) != (measure in OF_A_SCENE):
             needs = "needs a scene" if scene is None else "is no figure of one scene: leave out scene"
             raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} {needs}")
     return goals
 
 
-def goals_table(results: Results, goals) -> str:
+def goals_table(results: Results, goals: list[Goal]) -> str:
     """Table of goals and measurements."""
-    lines = []
-    for goal in goals:
-        names = [goal["scene"]] if "scene" in goal else []
-        measure = goal.get("measure")
+
+    def figure(measure: str | None = None, scene: str | None = None, **_) -> str:
         if measure is None:
-            figure = "not measured yet"
-        else:
-            figure = said(lambda m=measure, n=names: GOALS[m](results, *n), str)
-        lines.append([goal["what"], goal["at_least"], goal.get("aim", "–"), figure])
+            return "not measured yet"
+        return said(OF_ALL[measure], results) if scene is None else said(OF_A_SCENE[measure], results, scene)
+
+    lines = [[goal["what"], goal["at_least"], goal.get("aim", "–"), figure(**goal)] for goal in goals]
     return table(["what", "at least", "aim", "measured"], lines)
 
 
 # -- files ------------------------------------------------------------------------------------
 
 
-def notes_text(notes: dict) -> str:
+def notes_text(notes: dict[str, str]) -> str:
     """Format the explanations, each with its scenes."""
-    lines = []
+    lines: list[str] = []
     for text in dict.fromkeys(notes.values()):
         scenes = ", ".join(f"`{scene}`" for scene in notes if notes[scene] == text)
         lines.append(f"* {scenes}: {text}\n")
     return "".join(lines)
-
-
-def replace_part(text: str, name: str, part: str) -> str:
-    """Replace the text between the markers of ``name``; ``ValueError`` without them."""
-    pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-    if len(pattern.findall(text)) != 1:
-        raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
-    return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)
 
 
 def machine(results: Results) -> str:
@@ -550,7 +472,9 @@ def machine(results: Results) -> str:
     Raises ``CommandError`` for rows of several machines or versions, or of one scene by several sources of
     the plugin.
     """
-    found, source_of, scenes = set(), {}, {}
+    found: set[tuple[str, str]] = set()
+    source_of: dict[str, str] = {}
+    scenes: dict[str, set[str]] = {}
     for row in results.rows:
         versions, scene = json.loads(row["versions"]), row["scene"]
         source = versions.pop("source")
@@ -588,15 +512,12 @@ holds the median in 90 % of cases, not 95 %).
 """
 
 
-def page(results: Results, made: dict, goals: list, notes: dict) -> str:
+def page(results: Results, made: dict[str, Reference], goals: list[Goal], notes: dict[str, str]) -> str:
     """Return the page of all tables, as Markdown."""
     if unknown := sorted(set(notes) - set(results.scenes)):
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
-    parts = [_introduction(results)]
-    if goals:
-        parts.append(f"## Goals\n\n{goals_table(results, goals)}")
-    parts.append(
-        f"""## Efficiency
+    return f"""{_introduction(results)}
+{f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
 {"![Efficiency per scene](efficiency.png)" if results.rivals else ""}
@@ -606,17 +527,13 @@ By budget, over {stronger(results)} that passes the bias check:
 {budgets_table(results)}
 How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel:
 
-{gaps_table(results)}"""
-    )
-    parts.append(
-        f"""## What was skipped
+{gaps_table(results)}
+## What was skipped
 
 Decided by a pilot in the first render of each scene, at {results.deciding} samples per pixel:
 
-{choices_table(results)}"""
-    )
-    parts.append(
-        f"""## Cost, convergence, bias
+{choices_table(results)}
+## Cost, convergence, bias
 
 Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval ("between
 decisions": budgets differ in what is skipped, since a short render has no pilot). Bias
@@ -631,10 +548,42 @@ have in common is left to the package's own tests.
 ![relMSE over seconds](seconds.png)
 
 ![Rays by kind](rays.png)
-"""
-    )
-    parts.append(f"## References\n\n{references_table(made)}")
-    return "\n".join(parts)
+
+## References
+
+{references_table(made)}"""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The results in a folder, with goals and notes."""
+
+    results: Results
+    made: dict[str, Reference]
+    goals: list[Goal]
+    notes: dict[str, str]
+
+    @staticmethod
+    def of(project: Project, folder: Path) -> Report:
+        """Read a folder; raises ``CommandError`` like `results.load`, or for invalid goals and notes."""
+        results, made = load(project, folder)
+        files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
+        kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
+        for scene, text in kept["notes"].items():
+            text_of(files["notes"], scene, text)
+        return Report(results, made, checked_goals(files["goals"], kept["goals"]), kept["notes"])
+
+    def text(self) -> str:
+        """Return the page of all tables, as Markdown."""
+        return page(self.results, self.made, self.goals, self.notes)
+
+    def draw(self, folder: Path) -> None:
+        """Write the plots that the page shows."""
+        if self.results.rivals:
+            figures.efficiencies(self.results, self.results.rivals, folder / "efficiency.png")
+        figures.convergence(self.results, "seconds", folder / "seconds.png")
+        figures.convergence(self.results, "spp", folder / "samples.png")
+        figures.rays(self.results, folder / "rays.png")
 
 
 def run(options: Namespace) -> int:
@@ -642,24 +591,15 @@ def run(options: Namespace) -> int:
     project = Project(options.project)
     folder = project.results(options.folder)
     check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
-    results, made = load(project, folder)
-    files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
-    kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
-    goals, notes = checked_goals(files["goals"], kept["goals"]), kept["notes"]
-    for scene, text in notes.items():
-        text_of(files["notes"], scene, text)
-    write_text(folder / "README.md", page(results, made, goals, notes))
-    if results.rivals:
-        figures.efficiencies(results, results.rivals, folder / "efficiency.png")
-    figures.convergence(results, "seconds", folder / "seconds.png")
-    figures.convergence(results, "spp", folder / "samples.png")
-    figures.rays(results, folder / "rays.png")
+    found = Report.of(project, folder)
+    write_text(folder / "README.md", found.text())
+    found.draw(folder)
     if options.readme:
         readme = options.readme.read_text()
         for name, part in (
-            ("goals", goals_table(results, goals)),
-            ("efficiency", efficiency_table(results)),
-            ("gallery", gallery(results)),
+            ("goals", goals_table(found.results, found.goals)),
+            ("efficiency", efficiency_table(found.results)),
+            ("gallery", gallery(found.results)),
         ):
             readme = replace_part(readme, name, part)
         write_text(options.readme, readme)

@@ -70,7 +70,7 @@ class MeasuredScene(ABC):
         # The stub says object.
         return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
 
-    def load(self, resolution: int | None = None, sampler: str | None = None, **definitions):
+    def load(self, resolution: int | None = None, sampler: str | None = None, **definitions: Any) -> mi.Scene:
         """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
 
         Keeps the film's aspect ratio; the sampler is that of the first sensor. None keeps the scene's own.
@@ -268,12 +268,12 @@ def depth_of(integrator) -> int:
     return depth if depth < 2**31 else -1  # Mitsuba's unlimited depth is unsigned
 
 
-def integrator_of(parameters: dict, depth: int):
+def integrator_of(parameters: Mapping[str, Any], depth: int) -> mi.Integrator:
     """Return the plugin with ``parameters`` (with ``type``) at ``max_depth``."""
-    return mi.load_dict({"max_depth": depth} | parameters)
+    return mi.load_dict({"max_depth": depth, **parameters})
 
 
-def check_plugins(name: str, parameters: dict, sampler: str | None, depth: int) -> None:
+def check_plugins(name: str, parameters: Mapping[str, Any], sampler: str | None, depth: int) -> None:
     """Raise ``CommandError`` if the plugin ``name`` or its ``sampler`` is invalid."""
     for what, make in (
         (f"integrator {name!r}", lambda: integrator_of(parameters, depth)),

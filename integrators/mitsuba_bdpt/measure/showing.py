@@ -5,7 +5,7 @@ Silent elsewhere than on a terminal. Print before or after a bar, not inside.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from itertools import count
 
@@ -22,7 +22,7 @@ def bar() -> Progress:
 
 
 @contextmanager
-def steps(total: int) -> Iterator[Callable[[str], None]]:
+def steps(total: int) -> Generator[Callable[[str], None]]:
     """A `bar` of ``total`` steps; call the result with a description at each step."""
     with bar() as shown:
         task, done = shown.add_task("", total=total), count()
@@ -30,7 +30,7 @@ def steps(total: int) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def amount(text: str, total: float) -> Iterator[Callable[[float], None]]:
+def amount(text: str, total: float) -> Generator[Callable[[float], None]]:
     """Like `steps`, for seconds or samples; call the result with the amount done."""
     with bar() as shown:
         task = shown.add_task(text, total=round(total))

@@ -1,19 +1,30 @@
-"""Formats Markdown tables and their figures."""
+"""Markdown tables, and their figures as texts."""
 
 from __future__ import annotations
 
-from .analysis import NotJudged, Refused, Summary
-from .efficiency import refused_share
+import re
+from collections.abc import Callable, Iterable, Mapping
+
+from ..errors import CommandError
+from .analysis import NotJudged, Refused, Summary, refused_share
+from .metrics import Estimate
 
 
-def table(head, rows) -> str:
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table; escapes bars and line ends."""
-    lines = [head, ["---"] * len(head), *rows]
+    first = list(head)
+    lines = [first, ["---"] * len(first), *rows]
     return "".join("| " + " | ".join(map(_cell, line)) + " |\n" for line in lines)
 
 
 def _cell(text: str) -> str:
     return " ".join(text.split("\n")).replace("|", "\\|")
+
+
+def by_scene(scenes: Iterable[str], columns: Mapping[str, Callable[[str], object]]) -> str:
+    """Return a table of a row per scene; ``columns``: figures of a scene by head, see `said`."""
+    rows = [[f"`{scene}`", *(said(column, scene) for column in columns.values())] for scene in scenes]
+    return table(["scene", *columns], rows)
 
 
 def ratio(x: float) -> str:
@@ -26,11 +37,24 @@ def ranged(found: Summary) -> str:
     return f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
 
 
-def said(figure, form=ranged) -> str:
-    """Format a figure, or the reason why there is none."""
+def said(figure: Callable[..., object], *given: object) -> str:
+    """Call ``figure`` and format what it returns, or the reason why there is none."""
     try:
-        return form(figure())
+        found = figure(*given)
     except NotJudged as why:
         return f"not judged: reference {refused_share(why.share, 2)}"
     except Refused as why:
         return str(why)
+    if isinstance(found, Summary):
+        return ranged(found)
+    if isinstance(found, Estimate):
+        return f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f})"
+    return str(found)
+
+
+def replace_part(text: str, name: str, part: str) -> str:
+    """Replace the text between the markers of ``name``; ``CommandError`` without them."""
+    pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+    if len(pattern.findall(text)) != 1:
+        raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
+    return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)

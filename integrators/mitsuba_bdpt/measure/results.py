@@ -1,4 +1,4 @@
-"""Rows of a sweep: errors of its images, files of cells, tables."""
+"""A sweep's files: cells, tables, spreads over seeds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ from ..files.whole import replacing
 from . import agreement, analysis, metrics
 from .preset import FIRST_SEED, Cell, Cells, Preset
 from .project import Project
-from .reference import Reference, load_reference, reference_path
+from .record import Errors, Row
+from .reference import (
+    Reference,
+    load_reference,
+    make_command,
+    read_reference,
+    reference_path,
+    too_few,
+)
 from .scenes import MeasuredScene, digest
 
 
@@ -53,31 +61,34 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
     ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not good enough. HDR-FLIP is
     slower than most renders: only with ``flip``, else None.
     """
-    raw, trimmed = (metrics.rel_mse(image, ref.image, trim) for trim in (0.0, metrics.TRIM))
-    own = [ref.share_of(image, trim) for trim in (0.0, metrics.TRIM)]
-    return {
+    found = relative_errors(image, ref)
+    return found | {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
         "height": image.shape[0],
         "mean": float(image.mean()),
         "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
         "mse": metrics.mse(image, ref.image),
-        "rel_mse": raw,
-        "rel_mse_trimmed": trimmed,
         "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
         "mape": metrics.mape(image, ref.image),
         "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
-        "delta_e_2000": metrics.delta_e_2000(image, ref.image),
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
-        "energy_in_black": metrics.energy_in_black(image, ref.image),
-        "reference_rel_mse": own[0],
-        "reference_rel_mse_trimmed": own[1],
-        "judged": analysis.judged(own[0], raw),
-        "judged_trimmed": analysis.judged(own[1], trimmed),
+        "judged": analysis.judged(found["reference_rel_mse"], found["rel_mse"]),
+        "judged_trimmed": analysis.judged(found["reference_rel_mse_trimmed"], found["rel_mse_trimmed"]),
     }
 
 
-def read_rows(output: Path, cells: Cells, wanted) -> list[dict]:
+def relative_errors(image: np.ndarray, ref: Reference) -> Errors:
+    """Return the relMSE of an image, raw and trimmed, and what the reference's own error adds to each."""
+    return Errors(
+        rel_mse=metrics.rel_mse(image, ref.image),
+        rel_mse_trimmed=metrics.rel_mse(image, ref.image, metrics.TRIM),
+        reference_rel_mse=ref.share_of(image, 0.0),
+        reference_rel_mse_trimmed=ref.share_of(image, metrics.TRIM),
+    )
+
+
+def read_rows(output: Path, cells: Cells, wanted) -> list[Row]:
     """Return the rows of the finished cells among ``wanted``.
 
     Computes errors again if the reference has changed.
@@ -107,7 +118,7 @@ def _image(output: Path, cell: Cell) -> np.ndarray:
     return image
 
 
-def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
+def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
     """Return the rows of all finished cells of a scene, in order.
 
     Cells are those that were rendered: a source edited meanwhile changes their names.
@@ -117,10 +128,12 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[dict]:
         wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
     found = read_rows(output, cells, wanted.values())
     spreads = _spreads(output, cells, list(wanted.values()), found) if found else {}
-    return [row | spreads[row["key"]] | {"first": preset.methods[0].name} for row in found]
+    for row in found:
+        row |= spreads[row["key"]] | {"first": preset.methods[0].name}
+    return found
 
 
-def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) -> dict[str, dict]:
+def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[Row]) -> dict[str, dict]:
     """Return `metrics.spread` by the rows' keys, for each integrator and budget.
 
     Raw and trimmed; None for fewer than two renders, differing numbers of samples, or missing images. Cached
@@ -143,7 +156,7 @@ def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[dict]) 
     return found | {key: value for group in now.values() for key, value in group.items()}
 
 
-def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, dict]) -> dict[str, dict]:
+def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]) -> dict[str, dict]:
     """Like `_spreads`, of the compared cells ``group``, whose rows are ``there``."""
     files = [image_file(output, cell) for cell in group]
     if (
@@ -162,7 +175,7 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, dict
     }
 
 
-def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:
+def beside(table: list[Row], order: list[str], output: Path) -> list[Row]:
     """Return ``table`` and stored rows of other scenes, in ``order``."""
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     try:
@@ -175,18 +188,61 @@ def beside(table: list[dict], order: list[str], output: Path) -> list[dict]:
     return sorted(found, key=lambda row: order.index(row["scene"]))
 
 
-def write_tables(table: list[dict], output: Path) -> None:
+def write_tables(table: list[Row], output: Path) -> None:
     """Write rows.csv and rows.parquet, with the same columns."""
     columns = list(dict.fromkeys(key for row in table for key in row))
-    table = [{key: row.get(key) for key in columns} for row in table]
+    whole = [{key: row.get(key) for key in columns} for row in table]
     with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
-        writer.writerows(table)
-    arrays = pa.Table.from_pylist(table)
+        writer.writerows(whole)
+    arrays = pa.Table.from_pylist(whole)
     place = columns.index("tile_means")
     means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits, as written
     with replacing(output / "rows.parquet") as temporary:
         pyarrow.parquet.write_table(
             arrays.set_column(place, "tile_means", means), temporary, compression="zstd"
         )
+
+
+def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
+    """Return the results in a folder, and the references of its scenes by name.
+
+    Raises ``CommandError`` if there are none, or if errors are against other references than the
+    ``project``'s.
+    """
+    try:
+        rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+    except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
+        raise CommandError(
+            f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
+        ) from error
+    made, digests = {}, {}
+    for row in rows:
+        scene = row["scene"]
+        if scene not in made:
+            path = reference_path(project, scene, row["resolution"], row["max_depth"])
+            if not path.is_file():
+                raise CommandError(
+                    f"{folder}: the reference of {scene} is not in {str(project.references)!r}; name the "
+                    "folder of the sweep's project by --project, or run the sweep again, which makes it"
+                )
+            made[scene], digests[scene] = read_reference(path), digest(path)
+        if row["reference_sha256"] != digests[scene]:
+            raise CommandError(
+                f"{folder}: the errors in {scene} were taken against another reference; run "
+                f"{project.sweep_command(folder)}, which takes them anew"
+            )
+    means = {scene: kept.means for scene, kept in made.items() if not kept.given}
+    if without := [scene for scene, kept in means.items() if kept is None]:
+        raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
+    file = folder / "probes.json"
+    measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
+    return analysis.Results(rows, means, measured), made
+
+
+def _reference_command(project: Project, rows: list[Row], scene: str) -> str:
+    """Return the command line that refines the reference of a scene."""
+    row = next(row for row in rows if row["scene"] == scene)
+    called = scene if scene in project.scene_names() else f"{scene}.xml"
+    return make_command(project, called, row["resolution"], row["max_depth"])

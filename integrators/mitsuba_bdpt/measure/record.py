@@ -1,0 +1,66 @@
+"""The record of a render: what sweeps keep, and all figures are made of."""
+
+from __future__ import annotations
+
+from typing import Literal, NotRequired, TypedDict
+
+Error = Literal["rel_mse", "rel_mse_trimmed", "spread", "spread_trimmed"]
+"""Columns that efficiencies are made of."""
+
+
+class Errors(TypedDict):
+    """The error of an image, raw and trimmed of the worst 0.1 % of values."""
+
+    rel_mse: float
+    rel_mse_trimmed: float
+    reference_rel_mse: float  # what the reference's own error adds to them
+    reference_rel_mse_trimmed: float
+
+
+class Measured(Errors):
+    """What a render took and how wrong it is, with one seed."""
+
+    seed: int
+    seconds: float
+    cpu_seconds: NotRequired[float]  # missing in older sweeps
+
+
+class Row(Measured):
+    """A render of a sweep: a row of rows.csv and rows.parquet.
+
+    Beside these columns ``rays_KIND``, the rays of `bdpt` by kind.
+    """
+
+    key: str  # names the cell's files
+    scene: str
+    method: str  # name of the integrator, with its parameters
+    spp: int  # samples per pixel that it took
+    scene_sha256: str
+    resolution: int
+    max_depth: int
+    sampler: str
+    match: str  # "spp" or "seconds": what is equal to the first integrator's
+    budget: int  # samples per pixel of the first integrator
+    first: str  # the integrator that the others are compared with
+    parameters: str  # of the plugin, as JSON
+    statistics: str  # of `bdpt`, as JSON
+    decisions: str  # of `bdpt`, as JSON
+    machine: str
+    versions: str  # as JSON
+    started: str
+    seconds_compile: float
+    seconds_pilot: float | None  # missing in older sweeps
+    reference_sha256: str
+    width: int
+    height: int
+    mean: float
+    tile_means: list[float]  # `agreement.tile_columns`
+    mse: float
+    rel_mse_epsilon: float
+    mape: float
+    flip: float | None  # of the first seed
+    delta_e_itp: float
+    judged: bool  # whether the reference is good enough for rel_mse
+    judged_trimmed: bool
+    spread: float | None  # relMSE to the mean over seeds, without bias: `metrics.spread`
+    spread_trimmed: float | None
