@@ -11,7 +11,7 @@ import argparse
 import contextlib
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import NoReturn
@@ -47,18 +47,20 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser without abbreviations, which suggests commands and options."""
+    """A parser without abbreviations, which suggests commands and options.
+
+    ``options`` of its own; ``commands``: parsers of its subcommands.
+    """
 
     def __init__(self, **settings):
-        self._options: list[str] = []
-        self._commands: dict[str, Parser] = {}
-        self._subparsers_action = None
+        self.options: list[str] = []
+        self.commands: Mapping[str, Parser] = {}
         # An abbreviation may become ambiguous in the next version.
-        super().__init__(allow_abbrev=False, **settings)
+        super().__init__(allow_abbrev=False, epilog=mistakes.STATUSES, **settings)
 
     def add_argument(self, *names, **settings):
         """Declare an argument, like argparse."""
-        self._options += [name for name in names if name.startswith("-")]
+        self.options += [name for name in names if name.startswith("-")]
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
@@ -74,49 +76,32 @@ class Parser(argparse.ArgumentParser):
 
     def _question(self, name: str, command: bool) -> str:
         """Suggest a ``command``, or an option, for an unknown ``name``."""
-        known = [*self._options, *self._commands]
-        known += [name for parser in self._commands.values() for name in parser._options]
-        if name in known:
-            return f"that is an option of {' and '.join(self._commands_with(name))}"
+        having = [command for command, parser in self.commands.items() if name in parser.options]
+        if having or name in self.options:
+            return f"that is an option of {' and '.join(having) or self.prog}"
         if command and name.lower().endswith(".xml"):
             return f"did you mean render {name}?"
-        return removed.remedy(name) or did_you_mean(name, known)
-
-    def add_command(self, name: str, help_text: str) -> Parser:
-        if self._subparsers_action is None:
-            self._subparsers_action = self.add_subparsers(dest="command", required=True, metavar="COMMAND")
-        made = self._subparsers_action.add_parser(
-            name, help=help_text, description=help_text, epilog=mistakes.STATUSES
-        )
-        self._commands[name] = made
-        return made
-
-    def _commands_with(self, option: str) -> list[str]:
-        return [name for name, parser in self._commands.items() if option in parser._options] or [self.prog]
+        of_commands = (option for parser in self.commands.values() for option in parser.options)
+        return removed.remedy(name) or did_you_mean(name, [*self.options, *self.commands, *of_commands])
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = Parser(
-        prog="mitsuba_bdpt",
-        description="Bidirectional path tracing for Mitsuba 3.",
-        epilog=mistakes.STATUSES,
-    )
+    parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
     parser.add_argument("--version", action="version", version=_versions())
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    parser.commands = commands.choices
 
-    help_text = "say what is installed and render a tiny image to prove that it works"
-    doctor = parser.add_command("doctor", help_text)
+    def add_command(name: str, text: str) -> Parser:
+        return commands.add_parser(name, help=text, description=text)
+
+    doctor = add_command("doctor", "say what is installed and render a tiny image to prove that it works")
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
-
-    help_text = "render a Mitsuba scene file to an EXR and a PNG image"
-    add_render_arguments(parser.add_command("render", help_text))
-
-    help_text = (
-        "say which strategies a render of a scene file uses, which it skips, and what light none finds"
-    )
-    explain = parser.add_command("explain", help_text)
+    add_render_arguments(add_command("render", "render a Mitsuba scene file to an EXR and a PNG image"))
+    text = "say which strategies a render of a scene file uses, which it skips, and what light none finds"
+    explain = add_command("explain", text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
-    measuring.add_commands(parser.add_command)
+    measuring.add_commands(add_command)
     return parser
 
 
