@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -141,7 +141,7 @@ class Emitters:
         def where(group: Group, mask: mi.Bool):
             return group.place(index, p, d, mask), group.factor(index, p, d, cos, side, mask)
 
-        return self._query(where, self._supporting("guidable"), index, active)
+        return self._querying("guidable", index, active)(where)
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -186,8 +186,10 @@ class Emitters:
             found = dr.select(mask, question(group, mask), found)
         return found
 
-    def _supporting(self, capability: str) -> list[Group]:
-        return [group for group in self.groups if getattr(group, capability)]
+    def _querying(self, capability: str, index: mi.UInt32, active: mi.Bool) -> Callable[..., Any]:
+        """Return `_query`, of the groups that have a ``capability``."""
+        answering = [group for group in self.groups if getattr(group, capability)]
+        return partial(self._query, answering=answering, index=index, active=active)
 
     def covers(self, p, d):
         """`Disks.covers`; true where no light subpath starts at infinity."""
@@ -203,11 +205,8 @@ class Emitters:
         """
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
-        e = self._query(
-            lambda group, mask: group.sample_emission(chosen, u_point, u_direction, shared, mask),
-            self._supporting("supports_emission"),
-            chosen.index,
-            active,
+        e = self._querying("supports_emission", chosen.index, active)(
+            lambda group, mask: group.sample_emission(chosen, u_point, u_direction, shared, mask)
         )
         e.pdf_first *= chosen.pmf
         e.weight = dr.select(chosen.pmf > 0, e.weight / chosen.pmf, 0)
@@ -226,31 +225,22 @@ class Emitters:
         infinity): on surfaces the solid-angle density at the hit times the geometric cosine at y_0.
         """
         chosen = self._chosen(emission.index, active)
-        return self._query(
-            lambda group, mask: group.connection_density(chosen, emission, si, mask),
-            self._supporting("supports_emission"),
-            emission.index,
-            active,
+        return self._querying("supports_emission", emission.index, active)(
+            lambda group, mask: group.connection_density(chosen, emission, si, mask)
         )
 
     def direction_density(self, emission: Emission, p, d, active):
         """Density of emission from y_0 along ``d`` to ``p``, in ``pdf_second``'s measure."""
         chosen = self._chosen(emission.index, active)
-        return self._query(
-            lambda group, mask: group.direction_density(chosen, emission, p, d, mask),
-            self._supporting("connectible_to_sensor"),
-            emission.index,
-            active,
+        return self._querying("connectible_to_sensor", emission.index, active)(
+            lambda group, mask: group.direction_density(chosen, emission, p, d, mask)
         )
 
     def radiance_towards(self, emission: Emission, d, active):
         """Radiance, intensity (point) or irradiance (delta direction) of y_0 along ``d``."""
         chosen = self._chosen(emission.index, active)
-        return self._query(
-            lambda group, mask: group.radiance_towards(chosen, emission, d, mask),
-            self._supporting("connectible_to_sensor"),
-            emission.index,
-            active,
+        return self._querying("connectible_to_sensor", emission.index, active)(
+            lambda group, mask: group.radiance_towards(chosen, emission, d, mask)
         )
 
     # -- next-event estimation --------------------------------------------------------------
@@ -261,11 +251,8 @@ class Emitters:
         u = mi.Point2f(u_x, u.y)
         sampled = active if self._drawn_by_mitsuba.all else self._drawn_by_mitsuba.at(chosen.index, active)
         ds, weight = chosen.emitter.sample_direction(si, u, sampled)
-        direct = self._query(
-            lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask),
-            self._supporting("supports_next_event"),
-            chosen.index,
-            active,
+        direct = self._querying("supports_next_event", chosen.index, active)(
+            lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask)
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
