@@ -358,14 +358,14 @@ MUTANTS = (
         "transport/batch.py",
         "row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))",
         "row = seat.row",
-        ("tests/transport/test_sharing.py::test_every_sample_is_served_once[2]",),
+        ("tests/transport/test_sharing.py::test_every_sample_has_one_lane[2]",),
     ),
     Mutant(
         "sharing: the inverse of another map",
         "transport/batch.py",
         "row = _turned_back(row, self._rows, sobol.mix(column ^ keys[0]))",
         "row = _turned_back(row, self._rows, sobol.mix(column ^ keys[1]))",
-        ("tests/transport/test_sharing.py::test_every_sample_is_served_once[2]",),
+        ("tests/transport/test_sharing.py::test_every_sample_has_one_lane[2]",),
     ),
     Mutant(
         "sensors: a lens looks past its plane in focus",

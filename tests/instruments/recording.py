@@ -136,10 +136,10 @@ def _slots(launch: Launch, rows) -> list[int]:
     pixel = y * launch.width + x - batch.first_pixel
     sharing = kernel.shared_by(launch.kernel, batch, launch.points)
     seat, slot = sharing.seat(mi.UInt32(lane)), mi.UInt32(lane)
-    for part in range(launch.kernel.plan.served):
-        served = sharing.slot(seat, mi.UInt32(part))
-        here = (served // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
-        slot = dr.select(here, served, slot)
+    for part in range(launch.kernel.plan.camera_paths):
+        taken = sharing.slot(seat, mi.UInt32(part))
+        here = (taken // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
+        slot = dr.select(here, taken, slot)
     return np.broadcast_to(np.array(slot), len(rows)).tolist()
 
 

@@ -10,16 +10,16 @@ from repository import load_scene
 PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RUNS * LONGEST_RUN + 13)
 
 
-def served_slots(pixels, samples, served, seed) -> tuple[Sharing, np.ndarray]:
+def slots_of(pixels, samples, camera_paths, seed) -> tuple[Sharing, np.ndarray]:
     """The map and the slots of all parts (part, lane); -1 where a lane has none."""
-    sharing = Sharing(pixels, samples, served, mi.UInt32(seed))
-    lane, part = dr.meshgrid(dr.arange(mi.UInt32, sharing.lanes), dr.arange(mi.UInt32, served))
-    slots = sharing.slot(sharing.seat(lane), part).numpy().astype(int).reshape(served, sharing.lanes)
+    sharing = Sharing(pixels, samples, camera_paths, mi.UInt32(seed))
+    lane, part = dr.meshgrid(dr.arange(mi.UInt32, sharing.lanes), dr.arange(mi.UInt32, camera_paths))
+    slots = sharing.slot(sharing.seat(lane), part).numpy().astype(int).reshape(camera_paths, sharing.lanes)
     return sharing, np.where(slots < sharing.total, slots, -1)
 
 
-@pytest.mark.parametrize("served", [1, 2, 3, 4, 8, 16])
-def test_every_sample_is_served_once(served):
+@pytest.mark.parametrize("camera_paths", [1, 2, 3, 4, 8, 16])
+def test_every_sample_has_one_lane(camera_paths):
     """Rationale: a sample that is traced twice, or not at all, biases the image of films whose size S does
     not divide; samples of a pixel that share a light subpath depend on each other; those that share with
     several pixels, or with others in every pass, have no net of light subpaths (8 % more error, see
@@ -29,8 +29,8 @@ def test_every_sample_is_served_once(served):
     the next whole number of pixels takes; the first part, thus all if S = 1, is as it was."""
     for number, pixels in enumerate(PIXELS):
         for samples in (1, 2, 3, 16) if pixels < 5000 else (1, 3):
-            sharing, slots = served_slots(pixels, samples, served, number)
-            assert sharing.lanes == -(-pixels // served) * samples
+            sharing, slots = slots_of(pixels, samples, camera_paths, number)
+            assert sharing.lanes == -(-pixels // camera_paths) * samples
             there = slots >= 0
             assert np.array_equal(np.sort(slots[there]), np.arange(pixels * samples))
             found = sharing.lane(mi.UInt32(slots[there])).numpy()
@@ -40,9 +40,9 @@ def test_every_sample_is_served_once(served):
                 partners = slots
             samples_of = partners[..., None] * samples + np.arange(samples)
             assert np.array_equal(
-                slots, np.where(partners[..., None] < 0, -1, samples_of).reshape(served, -1)
+                slots, np.where(partners[..., None] < 0, -1, samples_of).reshape(camera_paths, -1)
             )
-        partners = np.sort(np.where(partners < 0, -1 - np.arange(served)[:, None], partners), axis=0)
+        partners = np.sort(np.where(partners < 0, -1 - np.arange(camera_paths)[:, None], partners), axis=0)
         assert (np.diff(partners, axis=0) > 0).all()
 
 
@@ -56,8 +56,8 @@ def lags(width, height):
     ("width", "height"),
     [(64, 64), (61, 47), (128, 96), (160, 90), (97, 61), (640, 360), (1, 4999), (5000, 1)],
 )
-@pytest.mark.parametrize("served", [2, 3, 4, 8, 16])
-def test_sharers_lie_at_no_distance_in_particular(width, height, served):
+@pytest.mark.parametrize("camera_paths", [2, 3, 4, 8, 16])
+def test_sharers_lie_at_no_distance_in_particular(width, height, camera_paths):
     """Rationale: pixels that share light subpaths have noise in common, half of it at most in our scenes; at
     one distance from each other they make stripes. Expected, as far as at least a quarter of all pixels have
     a neighbour at a lag, and in each of several maps: of the pairs of pixels there fewer than 0.05 share,
@@ -67,18 +67,18 @@ def test_sharers_lie_at_no_distance_in_particular(width, height, served):
     pixels are too small for S = 16."""
     pairs = lags(width, height)
     for seed in (0, 1):
-        _, slots = served_slots(width * height, 1, served, seed)
+        _, slots = slots_of(width * height, 1, camera_paths, seed)
         shared = np.zeros((2 * height, 2 * width))
-        for one in range(served):
-            for other in range(one + 1, served):
+        for one in range(camera_paths):
+            for other in range(one + 1, camera_paths):
                 there = (slots[one] >= 0) & (slots[other] >= 0)
                 a, b = slots[one][there], slots[other][there]
                 down, across = b // width - a // width, b % width - a % width
                 for sign in (1, -1):
                     np.add.at(shared, (sign * down, sign * across), 1)
-        assert shared.sum() == (served - 1) * width * height or (width * height) % served
+        assert shared.sum() == (camera_paths - 1) * width * height or (width * height) % camera_paths
         column = shared[:, 0].sum() / (width * height)
-        assert column < (served - 1) * (height - 1) / (width * height - 1) + 0.05
+        assert column < (camera_paths - 1) * (height - 1) / (width * height - 1) + 0.05
         enough = pairs >= width * height / 4
         assert (shared[enough] / pairs[enough]).max() < 0.05
 
@@ -100,9 +100,9 @@ def correlations(renders) -> np.ndarray:
     return found
 
 
-def noise_of(scene, served, spp, renders) -> np.ndarray:
+def noise_of(scene, camera_paths, spp, renders) -> np.ndarray:
     """Renders (seeds, height, width) of a scene, brightness."""
-    parameters = {"light_paths": 1 / served, "connections": "one", "max_depth": 6}
+    parameters = {"light_paths": 1 / camera_paths, "connections": "one", "max_depth": 6}
     integrator = mi.load_dict({"type": "bdpt"} | parameters)
     images = [np.array(integrator.render(scene, seed=seed, spp=spp)) for seed in range(renders)]
     return np.array(images, dtype=float)[..., :3].mean(axis=-1)
@@ -124,23 +124,23 @@ SCENES = ("uplight_room", "ajar_door", "cornell_box", "many_lights", "smallvcm_c
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("served", [2, 4, 16])
+@pytest.mark.parametrize("camera_paths", [2, 4, 16])
 @pytest.mark.parametrize("name", SCENES)
-def test_noise_of_scenes_has_no_stripes(name, served):
+def test_noise_of_scenes_has_no_stripes(name, camera_paths):
     """Expected: as above, in six scenes, by the positive correlations: neighbours in a row are opposite, by
     up to 0.1 also with path tracing alone, since their samples are neighbours in the sequence. Tolerance:
     with 128 renders the largest of all lags is found as 0.012 where all are 0."""
-    renders = noise_of(load_scene(name, resolution=64), served, 16, 128)
+    renders = noise_of(load_scene(name, resolution=64), camera_paths, 16, 128)
     assert correlations(renders).max() < 0.03
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("served", [2, 8, 16])
+@pytest.mark.parametrize("camera_paths", [2, 8, 16])
 @pytest.mark.parametrize(
     ("size", "crop"),
     [((61, 47), None), ((53, 67), None), ((160, 90), (3, 40, 101, 37)), ((96, 96), (17, 5, 48, 64))],
 )
-def test_noise_of_odd_films_and_crops_has_no_stripes(size, crop, served):
+def test_noise_of_odd_films_and_crops_has_no_stripes(size, crop, camera_paths):
     """Expected: as above, in Mitsuba's Cornell box, on films whose size S does not divide and on crop
     windows."""
     room = mi.cornell_box()
@@ -149,6 +149,6 @@ def test_noise_of_odd_films_and_crops_has_no_stripes(size, crop, served):
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         film |= dict(zip(names, crop, strict=True))
     room["sensor"]["film"] = film
-    renders = noise_of(mi.load_dict(room), served, 16, 128)
+    renders = noise_of(mi.load_dict(room), camera_paths, 16, 128)
     assert renders.shape[1:] == ((crop[3], crop[2]) if crop else size[::-1])
     assert correlations(renders).max() < 0.03

@@ -134,12 +134,12 @@ class Sharing:
     """The map of a batch's camera samples to lanes.
 
     Slots number the ``total`` camera samples, pixel by pixel with ``samples`` of each of the ``pixels``. Each
-    of the ``lanes`` serves at most ``served`` slots, all in different pixels. The map depends on ``seed``
+    of the ``lanes`` has at most ``camera_paths`` slots, all in different pixels. The map depends on ``seed``
     (``UInt32``), so that over several renders no two pixels remain correlated.
     """
 
-    def __init__(self, pixels: int, samples: int, served: int, seed: mi.UInt32):
-        part = -(-pixels // served)
+    def __init__(self, pixels: int, samples: int, camera_paths: int, seed: mi.UInt32):
+        part = -(-pixels // camera_paths)
         self.total, self.lanes = pixels * samples, part * samples
         run = run_pixels(part)
         rows, columns = table_size(part // run)
@@ -157,7 +157,7 @@ class Sharing:
         return Seat(lane, row, run - row * self._columns, pixel & self._last, lane - pixel * self._samples)
 
     def slot(self, seat: Seat, part: mi.UInt32) -> mi.UInt32:
-        """The slot that a lane serves in a ``part``; none if not below ``total``."""
+        """The slot of a lane in a ``part``; none if not below ``total``."""
         keys = self._keys(part)
         row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))
         column = _turned(seat.column, self._columns, sobol.mix(row ^ keys[1]))
@@ -166,7 +166,7 @@ class Sharing:
         return part * self._lanes + self._place(seat, part, row, column, hashed)
 
     def lane(self, slot: mi.UInt32) -> mi.UInt32:
-        """The lane that serves a slot, the inverse of `slot`."""
+        """The lane of a slot, the inverse of `slot`."""
         part = slot // self._lanes
         seat, keys = self.seat(slot - part * self._lanes), self._keys(part)
         hashed = sobol.mix(seat.column ^ keys[2])

@@ -113,7 +113,7 @@ class Kernel:
         self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
-        self.served = u32(plan.served)
+        self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
         # `photons.merging.Merging` of a pass; None without merging.

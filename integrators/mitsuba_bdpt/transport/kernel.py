@@ -30,7 +30,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
         roulette of the subpath; the next edge <- a ray
 
     # Its camera subpaths
-    for M S pixels (fewer in the last lanes; one without light subpaths):   _serve_all, _camera_subpath
+    for M S pixels (fewer in the last lanes; one without light subpaths):   _camera_paths, _camera_subpath
         z_0, direction, throughput <- the sensor, at a point of the pixel   subpaths.camera_sample
         the first edge <- a ray                                             subpaths.camera_walk
         d_vcm <- 1 / density of the direction (of z_0, if all are parallel) subpaths._first_partial
@@ -131,14 +131,14 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UI
     index = dr.arange(mi.UInt32, sharing.lanes)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
-    def serve(slot) -> Counters:
+    def trace_sample(slot) -> Counters:
         active = slot < dr.opaque(mi.UInt32, batch.size)
         return _camera_subpath(kernel, sink, lane, slot, active)
 
     if kernel.plan.light:
-        of_camera = _serve_all(kernel, sharing, sharing.seat(index), serve)
+        of_camera = _camera_paths(kernel, sharing, sharing.seat(index), trace_sample)
     else:
-        of_camera = serve(index)
+        of_camera = trace_sample(index)
     return (of_light + of_camera).summed()
 
 
@@ -162,7 +162,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     """
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
-    return Sharing(batch.pixels, batch.samples, kernel.plan.served, points.seed)
+    return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths, points.seed)
 
 
 def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
@@ -255,18 +255,18 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
 
 @dr.syntax
-def _serve_all(kernel: Kernel, sharing: Sharing, seat, serve) -> Counters:
-    """Call ``serve`` for each camera sample of the lane; returns the counters."""
+def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Counters:
+    """Call ``trace_sample`` for each camera sample of the lane; returns the counters."""
     walked = Counters.zeros("camera", *counted_in_media(kernel.space))
     counters = walked + _camera_counters(kernel)
-    served = mi.UInt32(0)
+    number = mi.UInt32(0)
     while dr.hint(
-        served < kernel.served,
+        number < kernel.camera_paths,
         label="camera subpaths of one light subpath",
-        exclude=[kernel, sharing, seat, serve],
+        exclude=[kernel, sharing, seat, trace_sample],
     ):
-        counters = counters + serve(sharing.slot(seat, served))
-        served += 1
+        counters = counters + trace_sample(sharing.slot(seat, number))
+        number += 1
     return counters
 
 

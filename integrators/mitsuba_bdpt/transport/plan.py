@@ -60,7 +60,7 @@ class Plan:
     joined: int = 1
 
     @property
-    def served(self) -> int:
+    def camera_paths(self) -> int:
         """Camera subpaths of a lane."""
         return self.camera_paths_per_light_path * self.joined
 
