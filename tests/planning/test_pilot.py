@@ -26,7 +26,6 @@ from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
 from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
-from mitsuba_bdpt.transport.plan import GUIDED
 
 from stress_cases.warned import Warned
 
@@ -115,8 +114,8 @@ def moments_of(target, lanes, rounds=1, **parameters):
 def made_of(base, rays, light=0.0):
     """Moments of this ``base``, of which points take nothing off, and of splats, alike for all candidates."""
     none, gain = np.zeros_like(base), np.ones(base.shape[1])
-    isolated = np.zeros((len(base), 1 + len(GUIDED)))
-    return moments.Moments(base, none, none + light, none, isolated, gain, 1.0, rays, 4096)
+    sds = np.zeros((len(base), 2))
+    return moments.Moments(base, none, none + light, none, sds, gain, 1.0, rays, 4096)
 
 
 def decision(way: Configuration, mean=0.0):
@@ -572,13 +571,13 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     """
     random, needed, met = np.random.default_rng(1), re.compile(r"to gain (.*)x, and gains? (.*)x"), set()
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined"), 1.0)
-    rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "aimed": 0.01}
+    rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "guidable": 0.01}
     even = [1 / choice.cost(c, rays) for c in CANDIDATES]
     for number in range(200):
         base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(CANDIDATES)))
         found = made_of(np.tile(base, (moments.GROUPS, 1)), rays, light=np.exp(random.uniform(-8, 0)))
         if number % 4 == 0:
-            found.isolated[:, 0] = 100.0
+            found.sds[:, 0] = 100.0
         some = [c for c in CANDIDATES if c.light_paths or number % 2]
         table = choice.choose(found, Alternatives(some, True, guidable=True))
         for row in table:
@@ -1015,11 +1014,11 @@ def test_pilots_that_do_not_measure_guided_hits():
     ]
     without, measured = found
     np.testing.assert_allclose(without.base, measured.base, rtol=0.1)
-    assert without.isolated.size == 0 and measured.isolated.any()
+    assert without.sds.size == 0 and measured.sds.any()
     possible = candidates(render.prepared, render.plan, render.settings)
     for one, gain in ((without, False), (measured, True), (without.joined(measured), True)):
         alternatives = Alternatives(possible, True, guidable=True)
         table = choice.choose(one, alternatives)
         assert bool(choice.guided_gain(one, alternatives, table)) == gain
     both = measured.joined(without)
-    np.testing.assert_array_equal(both.isolated, measured.isolated)
+    np.testing.assert_array_equal(both.sds, measured.sds)

@@ -28,8 +28,7 @@ COSTS = {
     "shadow_inner": 0.65,  # a tested connection, if all are tested
     # With media: an evaluated pair of the lane of a packet with most pairs, for which the others wait.
     "packets": 0.18,
-    "guide": 3.0,  # a vertex with photon-guided BSDF sampling
-    "aimed": 7.0,  # a guided sample of such a vertex
+    "guided": 31.0,  # a vertex with photon-guided BSDF sampling, its samples included
     "diverging": 0.5,  # an evaluated pair of BSDFs, if the lanes of a packet have different BSDFs
 }
 
@@ -63,7 +62,7 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
         total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
     if candidate.guided:
         total += FIXED["guided"] / samples
-        total += (COSTS["guide"] + COSTS["aimed"] * candidate.guided) * rays["aimed"]
+        total += COSTS["guided"] * rays["guidable"]
     return total / camera
 
 
@@ -78,12 +77,9 @@ DIRECT_GAIN = 1.15
 # `certainty` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
-# Photon-guided BSDF sampling with one sample has to gain this factor in three quarters of the pilot's groups.
-# It removes outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
-GUIDE_GAIN = 2.5
-
-# A larger number of guided samples has to gain this factor over a smaller one.
-MORE_GUIDED_GAIN = 1.3
+# Photon-guided BSDF sampling has to gain this factor in three quarters of the pilot's groups. It removes
+# outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
+GUIDE_GAIN = 3.0
 
 # Bootstrap resamplings of a pilot's groups, see `certainty`.
 RESAMPLINGS = 100
@@ -151,50 +147,37 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     Preceded by the best one with photon-guided BSDF sampling, if that pays.
     """
     table = _unguided(moments, alternatives)
-    if guided := _guided(moments, alternatives, table):
-        gain, row = guided[0]
-        pays = gain >= GUIDE_GAIN
-        for more in guided[1:]:
-            if more[0] >= MORE_GUIDED_GAIN * gain:
-                gain, row = more
-        if pays:
-            table.insert(0, row)
-    return table
+    guided = _guided(moments, alternatives, table)
+    return [guided, *table] if guided and guided.gain >= GUIDE_GAIN else table
 
 
 def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> float:
-    """Factor by which guiding s = 0 shortens the time to equal error; 0 if impossible.
+    """Factor by which guiding s = 0 shortens the time to equal error, outliers included; 0 if impossible.
 
-    Outliers included. Lower quartile of the groups, for the fewest guided samples. ``table`` of `choose`.
+    Lower quartile of the groups. ``table`` of `choose`.
     """
-    found = _guided(moments, alternatives, [row for row in table if not row.candidate.guided])
-    return found[0][0] if found else 0.0
+    guided = _guided(moments, alternatives, [row for row in table if not row.candidate.guided])
+    return guided.gain if guided else 0.0
 
 
-def _guided(
-    moments: Moments, alternatives: Alternatives, table: list[Prediction]
-) -> list[tuple[float, Prediction]]:
-    """For each number of guided samples: gain and best prediction with light subpaths.
+def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> Prediction | None:
+    """The best prediction with light subpaths, with photon-guided BSDF sampling; None if impossible.
 
-    Gain: see `guided_gain`. Path tracing alone would guide more vertices than the pilot measures, those that
-    light tracing samples. The number of light subpaths and the coefficients do not depend on guiding: its
-    outliers would hide the differences of the candidates.
+    Path tracing alone would guide more vertices than the pilot measures, those that light tracing samples.
+    The number of light subpaths and the coefficients do not depend on guiding: its outliers would hide the
+    differences of the candidates.
     """
     lit = next((row for row in table if row.candidate.light_paths), None)
-    if not alternatives.guidable or lit is None or not moments.isolated.size:
-        return []
-    alone, *guided = moments.isolated.T
+    if not alternatives.guidable or lit is None or not moments.sds.size:
+        return None
+    candidate = replace(lit.candidate, guided=GUIDED)
+    each = cost(candidate, moments.rays, alternatives.samples)
     others = _by_group(moments, [table[0].candidate, lit.candidate], alternatives.stratified)
     best, variance = np.maximum(others, LEAST_VARIANCE).T  # estimates of small variances may be negative
-    before = table[0].cost * (best + alone)
-    found: list[tuple[float, Prediction]] = []
-    for samples, isolated in zip(GUIDED, guided, strict=True):
-        candidate = replace(lit.candidate, guided=samples)
-        each = cost(candidate, moments.rays, alternatives.samples)
-        # Not the ratio of means: a few vertices may hold all of the variance.
-        gain = float(np.quantile(before / (each * (variance + isolated)), 1 / 4))
-        found.append((gain, replace(lit, candidate=candidate, cost=each, gain=gain)))
-    return found
+    unguided, guided = moments.sds.T
+    # Not the ratio of means: a few vertices may hold all of the variance.
+    gains = table[0].cost * (best + unguided) / (each * (variance + guided))
+    return replace(lit, candidate=candidate, cost=each, gain=float(np.quantile(gains, 1 / 4)))
 
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:

@@ -13,7 +13,7 @@ from typing import Any, TypeGuard
 from .. import components
 from ..errors import UsageError
 from ..settings import CONNECTIONS, LIGHT_PATHS
-from ..transport.plan import GUIDED, JOINED, EmissionTables, Plan
+from ..transport.plan import JOINED, MOST_GUIDED, EmissionTables, Plan
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _read_decision(entry: Any) -> Decision:
         if not least <= value <= LARGEST:
             raise ValueError(f"{name}={value!r}")
     guided = entry.get("guided", 0)  # missing in records of older versions
-    if isinstance(guided, bool) or guided not in (0, *GUIDED):
+    if isinstance(guided, bool) or not isinstance(guided, int) or not 0 <= guided <= MOST_GUIDED:
         raise ValueError(f"guided={guided!r}")
     joined = entry.get("joined", 1)
     if isinstance(joined, bool) or joined not in JOINED or (joined > 1 and connections != "one"):

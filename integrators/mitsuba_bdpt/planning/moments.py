@@ -16,7 +16,6 @@ import numpy as np
 
 from ..transport import mis
 from ..transport.batch import NET, NETS
-from ..transport.plan import GUIDED
 from .configuration import CANDIDATES
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ OWN_GAIN = 0.3
 
 
 # Fields of `Moments` with a row per group.
-_OF_GROUPS = ("base", "rare", "light", "draw", "isolated")
+_OF_GROUPS = ("base", "rare", "light", "draw", "sds")
 _ARRAYS = (*_OF_GROUPS, "gain", "emission")
 
 
@@ -123,8 +122,8 @@ class Moments:
     * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, candidates). ``rare``: the part of ``base`` on
       paths too rare for stratification; ``light``: of splats; ``draw``: by drawing one inner connection.
     * ``gain`` by candidate: the factor that the points of a net leave of ``base`` - ``rare``.
-    * ``isolated``, shape (`GROUPS`, numbers): variance of the paths on which s = 0 can be guided, excluded
-      from all others: unguided, then with each of `plan.GUIDED` (no columns: not measured).
+    * ``sds``, shape (`GROUPS`, 2): variance of SDS paths on which s = 0 can be guided, excluded from all
+      others: unguided and guided (no columns: not measured).
     * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
     * ``rays``: rays and connections per camera sample by kind, with one light subpath each, the number of
@@ -136,7 +135,7 @@ class Moments:
     rare: np.ndarray
     light: np.ndarray
     draw: np.ndarray
-    isolated: np.ndarray
+    sds: np.ndarray
     gain: np.ndarray
     mean: float
     rays: dict[str, float]
@@ -173,10 +172,10 @@ class Moments:
             return share * a + (1 - share) * b
 
         rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean") if n != "isolated"}
-        means["isolated"] = self.isolated if self.isolated.size else other.isolated
-        if self.isolated.size and other.isolated.size:
-            means["isolated"] = mean(self.isolated, other.isolated)
+        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean") if n != "sds"}
+        means["sds"] = self.sds if self.sds.size else other.sds
+        if self.sds.size and other.sds.size:
+            means["sds"] = mean(self.sds, other.sds)
         return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 
@@ -229,15 +228,15 @@ def group(lane: Lanes) -> Lanes:
 
 
 @dataclass(frozen=True)
-class Isolated:
-    """Light that s = 0 finds where it can be guided (SDS paths).
+class SDSLight:
+    """Light on SDS paths that s = 0 finds where it can be guided.
 
-    ``sums`` of moments (`guiding_benefit.Found`) over ``lanes`` camera samples, shape (`GROUPS`, fine tiles,
-    moments); ``aimed``: guidable vertices per camera sample.
+    ``sums`` over ``lanes`` camera samples, shape (`GROUPS`, fine tiles, 3): of the light and its second
+    moments, see `guiding_benefit.Found`; ``vertices``: guidable vertices per camera sample.
     """
 
     sums: np.ndarray
-    aimed: float
+    vertices: float
     lanes: int
 
 
@@ -246,19 +245,19 @@ def moments(
     nets: Samples | None,
     splats: Splats,
     rays: dict[str, float],
-    isolated: Isolated | None = None,
+    sds: SDSLight | None = None,
     heard: np.ndarray | None = None,
 ) -> Moments:
     """The moments of a pilot of independent ``samples`` and ``nets``.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
-    ``isolated`` light is in no sample; ``heard``: see `guided_emission.EmissionStatistics`.
+    ``sds`` light is in no sample; ``heard``: see `guided_emission.EmissionStatistics`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
     sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
-    if isolated is not None:
-        sizes = sizes + isolated.sums[:, :, 0] / isolated.lanes
+    if sds is not None:
+        sizes = sizes + sds.sums[:, :, 0] / sds.lanes
     groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
@@ -273,9 +272,9 @@ def moments(
             total = of_samples + (total if total.shape[1] else 0)
         return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
 
-    guided = np.zeros((GROUPS, 1 + len(GUIDED)))
-    if isolated is not None:
-        guided = np.matmul(of_group, isolated.sums[:, :, 1:])[:, 0] * (GROUPS / isolated.lanes)
+    of_sds = np.zeros((GROUPS, 2))
+    if sds is not None:
+        of_sds = np.matmul(of_group, sds.sums[:, :, 1:])[:, 0] * (GROUPS / sds.lanes)
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
@@ -284,7 +283,7 @@ def moments(
         rare=summed(None, "rare"),
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
-        isolated=guided,
+        sds=of_sds,
         emission=_of_tiles(heard, samples, sizes.sum(axis=0)),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),

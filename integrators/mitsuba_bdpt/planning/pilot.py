@@ -43,7 +43,7 @@ from ..transport.contribution import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.plan import Plan
-from . import isolated, moments
+from . import moments, sds_light
 from .configuration import CANDIDATES
 from .moments import (
     FINE,
@@ -53,9 +53,9 @@ from .moments import (
     SAMPLE,
     SPLAT,
     SUMS,
-    Isolated,
     Layout,
     Moments,
+    SDSLight,
     tile_of,
 )
 
@@ -207,10 +207,10 @@ class Pilot:
         """Evaluate the recorded kernel together with ``counts``."""
         dr.eval(self._samples, self._splats, counts)
 
-    def moments(self, counts: dict[str, int], isolated: Isolated | None = None) -> Moments:
+    def moments(self, counts: dict[str, int], sds: SDSLight | None = None) -> Moments:
         """The pilot's moments.
 
-        ``counts`` of the lanes' counters; ``isolated`` light is in no sample.
+        ``counts`` of the lanes' counters; ``sds`` light is in no sample.
         """
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
         parts = slice(self._first_net), slice(self._first_net, None)
@@ -223,9 +223,9 @@ class Pilot:
         rays["joined"] = SAMPLE.of(rows, "joined").mean()
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
         rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
-        rays["aimed"] = isolated.aimed if isolated else 0.0
+        rays["guidable"] = sds.vertices if sds else 0.0
         heard = self._listener.evaluated() if self._listener is not None else None
-        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, isolated, heard)
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, sds, heard)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
@@ -310,7 +310,7 @@ def measure(
     found = None
     guiding = guiding and everything.guidable
     if guiding:
-        found = isolated.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
+        found = sds_light.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
     kernel.without_isolated = found is not None or (everything.guidable and not guiding)
     region, listener = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
@@ -332,7 +332,7 @@ def measure(
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
     found = pilot.moments(counted, found)
     if everything.guidable and not guiding:
-        found = replace(found, isolated=found.isolated[:, :0])
+        found = replace(found, sds=found.sds[:, :0])
     known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
     known["media"] = float(prepared.space is not None)
     return replace(found, rays=found.rays | known)

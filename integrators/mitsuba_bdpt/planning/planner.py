@@ -178,7 +178,7 @@ class Planner:
             unguided = table[0].candidate.emission is None
             left_out = (
                 *choice.left_out(table, gain, name),
-                *UNMEASURED * (self.full.guidable and not moments.isolated.size),
+                *UNMEASURED * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
         return _Answer(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)

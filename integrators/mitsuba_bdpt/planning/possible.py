@@ -82,7 +82,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
-        guided=GUIDED[0] if guidable and not merging and settings.guiding == "always" else 0,
+        guided=GUIDED if guidable and not merging and settings.guiding == "always" else 0,
         guidable=guidable,
         teachable=teachable,
     )

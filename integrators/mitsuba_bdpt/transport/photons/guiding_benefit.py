@@ -30,9 +30,6 @@ from . import photon_guide
 from .photon import same_surface
 from .photon_guide import WINDOW, Guide
 
-# Number of moments at a vertex, see `Found`.
-MOMENTS = 2 + len(GUIDED)
-
 
 @dataclass
 class Estimator:
@@ -49,18 +46,20 @@ class Estimator:
 
 @dataclass
 class Found:
-    """Moments of the colours' mean at a vertex; ``aimed``: 1 if s = 0 can be guided.
+    """SDS light at a vertex, mean over the colours; ``vertices``: 1 if s = 0 can be guided.
 
-    ``moments``: the first; the second of s = 0 without guiding; the second for each of `GUIDED`.
+    ``arriving``: its mean; ``unguided``, ``guided``: second moments of s = 0.
     """
 
-    moments: list[mi.Float64]
-    aimed: mi.UInt32
+    arriving: mi.Float64
+    unguided: mi.Float64
+    guided: mi.Float64
+    vertices: mi.UInt32
 
 
 def nothing() -> Found:
     """`Found` of a vertex where s = 0 cannot be guided."""
-    return Found([mi.Float64(0) for _ in range(MOMENTS)], mi.UInt32(0))
+    return Found(mi.Float64(0), mi.Float64(0), mi.Float64(0), mi.UInt32(0))
 
 
 def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, add):
@@ -77,10 +76,14 @@ def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, ad
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     side = replace(subpaths.camera_side(kernel, sample, shared, walk), join=None, isolated=True)
 
-    def visit(z, state, walk):
+    def visit(z, total, walk):
         found = estimate(kernel, estimator, z, walk, sample.stream)
-        moments = [a + b for a, b in zip(state.moments, found.moments, strict=True)]
-        return Found(moments, state.aimed + found.aimed)
+        return Found(
+            total.arriving + found.arriving,
+            total.unguided + found.unguided,
+            total.guided + found.guided,
+            total.vertices + found.vertices,
+        )
 
     found, walk = random_walk(kernel, side, walk, sample.stream, visit, nothing())
     add(index, sample.start.position, found)
@@ -107,11 +110,11 @@ def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream
         there = photon_guide.find(estimator.guide, z.si.p)
         pdf = photon_guide.density(estimator.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
-        alone = dr.select(active, arriving * by_hit, 0)
-        first = dr.select(active, arriving, 0)
-        return Found([first, *(alone / (1 + n * ratio) for n in (0, *GUIDED))], mi.UInt32(1))
+        unguided = dr.select(active, arriving * by_hit, 0)
+        arriving = dr.select(active, arriving, 0)
+        return Found(arriving, unguided, unguided / (1 + GUIDED * ratio), mi.UInt32(1))
 
-    return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="isolated light")
+    return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="SDS light")
 
 
 def _mean(colours: mi.Spectrum) -> mi.Float:

@@ -1,4 +1,4 @@
-"""The pilot's predicted gain of guiding, see `transport.photons.guiding_benefit`."""
+"""The pilot's statistics of light on SDS paths, see `transport.photons.guiding_benefit`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
-from ..transport.photons.guiding_benefit import MOMENTS, Estimator, Found, trace
+from ..transport.photons.guiding_benefit import Estimator, Found, trace
 from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
-from .moments import FINE, GROUPS, Isolated, tile_of
+from .moments import FINE, GROUPS, SDSLight, tile_of
 
 # Camera samples (most subpaths end at once); photon subpaths of the estimate, and the most of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
@@ -31,8 +31,8 @@ SHARE = 16
 
 def measure(
     prepared: PreparedScene, plan: Plan, settings: Settings, seed: mi.UInt32, samples: float
-) -> Isolated | None:
-    """Second moments of s = 0 where ``plan`` can guide it.
+) -> SDSLight | None:
+    """Light on SDS paths where ``plan`` can guide s = 0, and its second moments.
 
     ``samples``: camera samples of the render. None without photons.
     """
@@ -53,8 +53,8 @@ def measure(
     batch = Batch(0, chosen, 0, LANES // chosen, spread=pixels)
     sums = Sums(region)
     trace(kernel, estimator, batch, Points("sobol", seed), sums.add)
-    found, aimed = sums.evaluated()
-    return Isolated(found, aimed / batch.size, batch.size)
+    found, vertices = sums.evaluated()
+    return SDSLight(found, vertices / batch.size, batch.size)
 
 
 def group(lane: mi.UInt32) -> mi.UInt32:
@@ -65,8 +65,8 @@ def group(lane: mi.UInt32) -> mi.UInt32:
     return (lane + sobol.mix(lane // GROUPS)) % GROUPS
 
 
-# Width of a row, even: Dr.Jit then adds it as a packet.
-_WIDTH = MOMENTS + MOMENTS % 2
+# Numbers of a row, the last one 0: Dr.Jit adds an even number as a packet.
+_WIDTH = 4
 
 
 class Sums:
@@ -75,18 +75,17 @@ class Sums:
     def __init__(self, region: Region):
         self._region = region
         self._sums = dr.zeros(mi.Float64, GROUPS * FINE**2 * _WIDTH)
-        self._aimed = dr.zeros(mi.UInt32, 1)
-        dr.make_opaque(self._sums, self._aimed)
+        self._vertices = dr.zeros(mi.UInt32, 1)
+        dr.make_opaque(self._sums, self._vertices)
 
     def add(self, lane: mi.UInt32, position: mi.Point2f, found: Found):
         """Accumulate the `Found` of a ``lane`` at a film ``position``."""
         row = group(lane) * FINE**2 + tile_of(self._region, position)
-        values = mi.ArrayXd(found.moments + [mi.Float64(0)] * (_WIDTH - MOMENTS))
+        values = mi.ArrayXd([found.arriving, found.unguided, found.guided, mi.Float64(0)])
         dr.scatter_reduce(dr.ReduceOp.Add, self._sums, values, row)
-        dr.scatter_reduce(dr.ReduceOp.Add, self._aimed, found.aimed, mi.UInt32(0))
+        dr.scatter_reduce(dr.ReduceOp.Add, self._vertices, found.vertices, mi.UInt32(0))
 
     def evaluated(self) -> tuple[np.ndarray, int]:
-        """Sums, shape (`GROUPS`, fine tiles, moments), and number of guidable vertices."""
-        dr.eval(self._sums, self._aimed)
-        sums = np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH)[:, :, :MOMENTS]
-        return sums, int(self._aimed[0])
+        """Sums, shape (`GROUPS`, fine tiles, 3), and number of guidable vertices."""
+        dr.eval(self._sums, self._vertices)
+        return np.array(self._sums).reshape(GROUPS, FINE**2, _WIDTH)[:, :, :3], int(self._vertices[0])
