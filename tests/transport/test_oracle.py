@@ -480,9 +480,9 @@ class Sensor:
         )
 
     def connect_direction(self, d, u_lens, u_film):
-        join = self.join(None, u_lens, u_film)
-        join.dist2 = mi.Float(1)
-        return join
+        connection = self.connect(None, u_lens, u_film)
+        connection.dist2 = mi.Float(1)
+        return connection
 
     def hit(self, walk, vertex, distant):
         return sensor_records.SensorHit(
