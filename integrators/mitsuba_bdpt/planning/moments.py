@@ -104,10 +104,6 @@ PER_PIXEL = 2
 # Candidates of a larger relative variance are ruled out, see `pilot.LOST`.
 RULED_OUT = 1e15
 
-# Weight of a candidate's own log stratification gain, from some 128 pairs of nets, against the mean of all.
-OWN_GAIN = 0.3
-
-
 # Fields of `Moments` with a row per group.
 _OF_GROUPS = ("base", "rare", "light", "draw", "sds")
 _ARRAYS = (*_OF_GROUPS, "gain", "emission")
@@ -150,14 +146,14 @@ class Moments:
             base = self.rare + self._left_by_points() * (base - self.rare)
         return base + self.draw + self.light
 
-    def _left_by_points(self) -> np.ndarray:
-        """Stratification gain of the points of a pixel, by candidate.
+    def _left_by_points(self) -> float:
+        """Stratification gain of the points of a pixel.
 
-        Extrapolates that of nets of `NET` points (`OWN_GAIN`) to 64; see experiments, "Choice of strategies".
+        Extrapolates that of nets of `NET` points, mean over the candidates, to 64; see experiments, "Choice
+        of strategies".
         """
         possible = np.isfinite(self.base).all(axis=0)
-        common = self.gain[possible].mean() if possible.any() else 1.0
-        gain = self.gain**OWN_GAIN * common ** (1 - OWN_GAIN)
+        gain = float(self.gain[possible].mean()) if possible.any() else 1.0
         return gain ** (1.35 + gain)
 
     def of(self, groups: np.ndarray) -> Moments:
