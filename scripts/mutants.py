@@ -1358,8 +1358,8 @@ MUTANTS = (
     Mutant(
         "guided emission: splats teach as if each light subpath had a camera sample",
         "planning/pilot.py",
-        "self._hear(c, size * np.sqrt(self._weight), c.position, c.active)",
-        "self._hear(c, size, c.position, c.active)",
+        "self._add_emission(c, size * np.sqrt(self._weight), c.position, c.active)",
+        "self._add_emission(c, size, c.position, c.active)",
         ("tests/images/test_guided_emission.py::test_what_a_pilot_accumulates",),
     ),
     Mutant(

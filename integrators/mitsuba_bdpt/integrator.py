@@ -172,9 +172,9 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if self.settings.decisions:
             render.replay()
         planner = render.planner
-        certainty = planner.certainty(render.passes) if table else 0.0
+        confidence = planner.confidence(render.passes) if table else 0.0
         lost = planner.lost_by_pilots()
-        text = explain(render.prepared, render.plan, self.settings, table, certainty, lost)
+        text = explain(render.prepared, render.plan, self.settings, table, confidence, lost)
         if loss := render.predicted_loss():
             text += f"\nlost light: {loss.removeprefix(UsageError.prefix)}"
         if spp is None and is_open(render.plan, self.settings):

@@ -107,7 +107,7 @@ def moments_of(target, lanes, rounds=1, **parameters):
     for number in range(rounds):
         seed = dr.opaque(mi.UInt32, number)
         new = pilot.measure(render.prepared, render.plan, render.settings, seed, lanes)
-        found = new if found is None else found.joined(new)
+        found = new if found is None else found.combined(new)
     return found
 
 
@@ -204,7 +204,7 @@ def test_choice(make, light, monkeypatch):
         assert {r["class"] for r in reasons} >= (set() if light else {"t<=1", "inner"})
         assert statistics["seconds"]["pilot"] > 0
     text = integrator.explain(target, spp=32)
-    assert "certainty: with " in text
+    assert "confidence: in " in text
     assert "pilot: time to the same error" in text and ("no light subpaths" in text) != light
     assert "pilot: time" not in integrator.explain(target)
 
@@ -540,7 +540,7 @@ def test_what_costs_more_has_to_gain(connections):
     candidates hardly differ. Expected: a candidate whose sample costs c times as much is chosen if it gains
     more than c^`CAUTION`, and if it gains less that is said.
     """
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined", "evaluated", "far"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated", "far"), 1.0)
     rays["kinds"] = 1
     light = {"none": SPLATS, "one": CONNECTED}[connections]
     possible = [ALONE, light]
@@ -566,7 +566,7 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     has a reason. Each kind of reason is met.
     """
     random, needed, met = np.random.default_rng(1), re.compile(r"to gain (.*)x, and gains? (.*)x"), set()
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "joined"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected"), 1.0)
     rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "guidable": 0.01}
     even = [1 / choice.cost(c, rays) for c in CANDIDATES]
     for number in range(200):
@@ -853,7 +853,7 @@ def test_recording_counts_in_short_renders():
     million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
     possible = [ALONE, FEW]
     rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0, "far": 0.0}
-    rays |= {"joined": 0.0, "evaluated": 0.0, "kinds": 1}
+    rays |= {"connected": 0.0, "evaluated": 0.0, "kinds": 1}
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, FEW.number] = 0.6
     for samples, lit in ((1 << 20, True), (1 << 16, False)):
@@ -866,7 +866,7 @@ def test_recording_counts_in_short_renders():
     assert choice.cost(ALONE, rays, 1 << 16) == 1 == choice.cost(ALONE, rays)
 
 
-def test_certainty():
+def test_confidence():
     """Expected: where all parts of a pilot agree the choice is certain; where one of sixteen has seen what
     decides, in about the share 1 - (15/16)^16 = 0.64 of its resamplings (100 of them: 0.05 is its standard
     error, three allowed)."""
@@ -874,10 +874,10 @@ def test_certainty():
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, alone] = 10
-    assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == 1
+    assert choice.confidence(made_of(base, rays), Alternatives(possible, True)) == 1
     base[:, alone] = 0.5
     base[3, alone] = 1e3
-    assert choice.certainty(made_of(base, rays), Alternatives(possible, True)) == pytest.approx(
+    assert choice.confidence(made_of(base, rays), Alternatives(possible, True)) == pytest.approx(
         0.64, abs=0.15
     )
 
@@ -1012,9 +1012,9 @@ def test_pilots_that_do_not_measure_guided_hits():
     np.testing.assert_allclose(without.base, measured.base, rtol=0.1)
     assert without.sds.size == 0 and measured.sds.any()
     possible = candidates(render.prepared, render.plan, render.settings)
-    for one, gain in ((without, False), (measured, True), (without.joined(measured), True)):
+    for one, gain in ((without, False), (measured, True), (without.combined(measured), True)):
         alternatives = Alternatives(possible, True, guidable=True)
         table = choice.choose(one, alternatives)
         assert bool(choice.guided_gain(one, alternatives, table)) == gain
-    both = measured.joined(without)
+    both = measured.combined(without)
     np.testing.assert_array_equal(both.sds, measured.sds)

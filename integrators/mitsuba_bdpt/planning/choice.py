@@ -24,7 +24,7 @@ COSTS = {
     "light": 0.76,  # a ray of a light subpath
     "light_in_media": 1.2,  # a ray of a light subpath in a scene with media
     "inner": 0.55,  # looking for connections, per sample
-    "joined": 0.65,  # a drawn and tested connection
+    "connected": 0.65,  # a drawn and tested connection
     "shadow_inner": 0.65,  # a tested connection, if all are tested
     # With media: an evaluated pair of the lane of a packet with most pairs, for which the others wait.
     "packets": 0.18,
@@ -55,8 +55,8 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
         total += light * candidate.light_paths
     if candidate.connections != "none":
         total += FIXED["inner"] / samples
-        kind = "joined" if candidate.connections == "one" else "shadow_inner"
-        total += COSTS["inner"] + COSTS[kind] * rays[kind]
+        counted = "connected" if candidate.connections == "one" else "shadow_inner"
+        total += COSTS["inner"] + COSTS[counted] * rays[counted]
         total += COSTS["packets"] * rays.get("packets", 0)
         part = (rays["kinds"] - FEW_KINDS) / (MANY_KINDS - FEW_KINDS)
         total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
@@ -74,14 +74,14 @@ CAUTION = 0.15
 # gain this factor. Without it `veach_mis` takes 1.16 times the time.
 DIRECT_GAIN = 1.15
 
-# `certainty` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
+# `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
 # Photon-guided BSDF sampling has to gain this factor in three quarters of the pilot's groups. It removes
 # outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
 GUIDE_GAIN = 3.0
 
-# Bootstrap resamplings of a pilot's groups, see `certainty`.
+# Bootstrap resamplings of a pilot's groups, see `confidence`.
 RESAMPLINGS = 100
 
 # relMSE per sample below which noise is invisible, and differences of candidates are the pilot's noise.
@@ -202,7 +202,7 @@ def _by_group(moments: Moments, candidates: list[Configuration], stratified: boo
     return moments.variance(stratified)[:, [candidate.number for candidate in candidates]]
 
 
-def certainty(moments: Moments, alternatives: Alternatives) -> float:
+def confidence(moments: Moments, alternatives: Alternatives) -> float:
     """Confidence in the choice, from bootstrap resamplings of the pilot's groups.
 
     Share of `RESAMPLINGS` in which the candidate that `choose` puts first is within `NEAR` of the best.

@@ -44,12 +44,12 @@ def explain(
     p: Plan,
     settings: Settings,
     table: list[Prediction],
-    certainty: float = 0.0,
+    confidence: float = 0.0,
     lost_by_pilot: int = 0,
 ) -> str:
     """Describe the strategies in use and those skipped.
 
-    ``table``: a pilot's predictions (`choice.choose`), with `choice.certainty`; empty without a pilot.
+    ``table``: a pilot's predictions (`choice.choose`), with `choice.confidence`; empty without a pilot.
     ``lost_by_pilot``: number of non-finite values of the pilot.
     """
     used = [
@@ -65,7 +65,7 @@ def explain(
                 p.guided,
             ),
             (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
-            (_aimed(p), p.emission is not None),
+            (_guided_emission(p), p.emission is not None),
         )
         if on
     ]
@@ -95,10 +95,10 @@ def explain(
         )
     if lost_by_pilot:
         lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
-    return "\n".join(lines + _pilot(settings, table, certainty))
+    return "\n".join(lines + _pilot(settings, table, confidence))
 
 
-def _aimed(p: Plan) -> str:
+def _guided_emission(p: Plan) -> str:
     if p.emission is None:
         return ""
     return (
@@ -116,7 +116,7 @@ def _named(candidate: Configuration) -> str:
     return f"{light}{guided}, coefficient of t<=1 {candidate.kappa_light:g}"
 
 
-def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> list[str]:
+def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
     """Describe the predictions, and the confidence in the first."""
     if not table:
         return []
@@ -140,8 +140,8 @@ def _pilot(settings: Settings, table: list[Prediction], certainty: float) -> lis
     if (joined := table[0].candidate.joined) > 1:
         lines.append(f"  they are of one light subpath at a time, not of {joined}")
     lines.append(
-        f"  certainty: with {certainty:.0%} of the pilots that its parts could have made the chosen takes at "
-        f"most {NEAR:g} times as long as the best"
+        f"  confidence: in {confidence:.0%} of bootstrap resamples of the pilot the chosen configuration is "
+        f"within {NEAR:g}x of the best"
     )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")

@@ -64,7 +64,7 @@ SAMPLE = Layout(
         "moment": len(CANDIDATES),
         "light": _USERS["light"],
         "draw": _USERS["inner"],
-        "joined": 1,
+        "connected": 1,
         "tile": 1,
         "evaluated": 1,
     }
@@ -89,7 +89,7 @@ SPLAT = Layout(
 FINE, TILES = 32, 8
 
 # The same for emission statistics.
-HEARD_TILES = 4
+EMISSION_TILES = 4
 
 # Independent parts of the pilot, for resampling.
 GROUPS = 16
@@ -160,7 +160,7 @@ class Moments:
         """The moments of the groups with these indices."""
         return replace(self, **{n: getattr(self, n)[groups] for n in _OF_GROUPS})
 
-    def joined(self, other: Moments) -> Moments:
+    def combined(self, other: Moments) -> Moments:
         """This pilot and another combined, weighted by ``lanes``."""
         share = self.lanes / (self.lanes + other.lanes)
 
@@ -242,12 +242,12 @@ def moments(
     splats: Splats,
     rays: dict[str, float],
     sds: SDSLight | None = None,
-    heard: np.ndarray | None = None,
+    emission: np.ndarray | None = None,
 ) -> Moments:
     """The moments of a pilot of independent ``samples`` and ``nets``.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
-    ``sds`` light is in no sample; ``heard``: see `guided_emission.EmissionStatistics`.
+    ``sds`` light is in no sample; ``emission``: see `guided_emission.EmissionStatistics`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
@@ -280,7 +280,7 @@ def moments(
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
         sds=of_sds,
-        emission=_of_tiles(heard, samples, sizes.sum(axis=0)),
+        emission=_of_tiles(emission, samples, sizes.sum(axis=0)),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
@@ -288,24 +288,24 @@ def moments(
     )
 
 
-def _of_tiles(heard: np.ndarray | None, samples: Samples, splats: np.ndarray) -> np.ndarray:
-    """Emission statistics relative to the brightness of `HEARD_TILES`^2 tiles.
+def _of_tiles(emission: np.ndarray | None, samples: Samples, splats: np.ndarray) -> np.ndarray:
+    """Emission statistics relative to the brightness of `EMISSION_TILES`^2 tiles.
 
-    Shape (2, cells, columns), per sample; no cells if ``heard`` is None. ``splats``: shares of the fine tiles
-    in the image's brightness.
+    Shape (2, cells, columns), per sample; no cells if ``emission`` is None. ``splats``: shares of the fine
+    tiles in the image's brightness.
     """
-    if heard is None:
+    if emission is None:
         return np.zeros((2, 0, 0))
 
     def over_tiles(values: np.ndarray) -> np.ndarray:
-        return _sums_of_blocks(values, HEARD_TILES).ravel()
+        return _sums_of_blocks(values, EMISSION_TILES).ravel()
 
     last = samples.estimate[:, -1]
     counts = over_tiles(np.bincount(samples.tile, minlength=FINE**2).astype(float))
     brightness = over_tiles(np.bincount(samples.tile, last, FINE**2)) / np.maximum(counts, 1)
-    brightness += over_tiles(splats) * HEARD_TILES**2
+    brightness += over_tiles(splats) * EMISSION_TILES**2
     norms = brightness**2 + 0.01 * brightness.mean() ** 2
-    found = np.einsum("htck,t->hck", heard, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
+    found = np.einsum("htck,t->hck", emission, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
     # A non-finite value would spoil all pilots that are combined with this one.
     return found if np.isfinite(found).all() else np.zeros_like(found)
 

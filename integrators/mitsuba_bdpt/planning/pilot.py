@@ -46,9 +46,9 @@ from ..transport.plan import Plan
 from . import moments, sds_light
 from .configuration import CANDIDATES
 from .moments import (
+    EMISSION_TILES,
     FINE,
     GROUPS,
-    HEARD_TILES,
     PER_PIXEL,
     SAMPLE,
     SPLAT,
@@ -105,7 +105,7 @@ class Pilot:
     """Sink (see `image.sink`) of a pilot's contributions, with or without ``media``.
 
     In a ``batch`` each `PER_PIXEL` consecutive camera samples are of one pixel, in nets each `batch.NETS`
-    times `batch.NET`. A ``listener`` accumulates emission statistics.
+    times `batch.NET`. ``emission`` accumulates emission statistics.
     """
 
     alpha = False
@@ -116,9 +116,9 @@ class Pilot:
         batch: Batch,
         rarest: float,
         media: bool = False,
-        listener: EmissionStatistics | None = None,
+        emission: EmissionStatistics | None = None,
     ):
-        self._listener = listener
+        self._emission = emission
         # Weight of a splat relative to a camera sample.
         self._weight = batch.size / batch.lanes
         self._region, self._lanes, self._media = region, batch.lanes, media
@@ -130,13 +130,13 @@ class Pilot:
 
     def begin(self) -> Total:
         """Zero totals."""
-        counted = ("joined", "evaluated") if self._media else ("joined",)
+        counted = ("connected", "evaluated") if self._media else ("connected",)
         return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {name: mi.UInt32(0) for name in counted}
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Accumulate a contribution with t >= 2."""
         size = self._size(c)
-        self._hear(c, size, start.position, c.active)
+        self._add_emission(c, size, start.position, c.active)
         own, squares = self._parts(size, c)
         new = {"estimate": own, **squares}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
@@ -153,7 +153,7 @@ class Pilot:
             if kernel.space is not None:  # its weight depends on the medium
                 c, size = seen, self._size(seen)
                 own, squares = self._parts(size, seen)
-            self._hear(replace(c, emission=lane.emission), size, start.position, seen.active)
+            self._add_emission(replace(c, emission=lane.emission), size, start.position, seen.active)
             found = {"visible": own, **squares}
             new = {n: [dr.select(seen.active, x, 0) for x in v] for n, v in found.items()}
             new = {"unshadowed": unshadowed} | new
@@ -167,9 +167,9 @@ class Pilot:
         # of all sizes times that of the visible ones; that of all connections is the square of the latter.
         draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
         rays = counted.shadow_inner
-        joined = total["joined"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
+        connected = total["connected"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as the state of a loop requires.
-        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "joined": joined}
+        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "connected": connected}
         if self._media:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
@@ -181,27 +181,27 @@ class Pilot:
         _, found = self._parts(size, c)
         found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
         _add(self._splats, SPLAT, found, row, size > 0)
-        self._hear(c, size * np.sqrt(self._weight), c.position, c.active)
+        self._add_emission(c, size * np.sqrt(self._weight), c.position, c.active)
         return Counters()
 
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
         """Accumulate a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
-        others = {"joined": total["joined"], "tile": tile_of(self._region, sample.start.position)}
+        others = {"connected": total["connected"], "tile": tile_of(self._region, sample.start.position)}
         others["evaluated"] = total["evaluated"] if self._media else 0
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
         return Counters()
 
-    def _hear(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
-        if self._listener is not None:
+    def _add_emission(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
+        if self._emission is not None:
             lane = dr.arange(mi.UInt32, self._lanes)
             # Samples of a pixel are in one half.
             pair = (lane - self._first_net) // (NETS * NET)
             half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
-            tile = tile_of(self._region, position, HEARD_TILES)
+            tile = tile_of(self._region, position, EMISSION_TILES)
             square, active = dr.square(size), active & (size > 0)
-            self._listener.accumulate(c.shares, c.emission, tile, half, square, active)
+            self._emission.accumulate(c.shares, c.emission, tile, half, square, active)
 
     def evaluate(self, counts: mi.UInt64):
         """Evaluate the recorded kernel together with ``counts``."""
@@ -220,12 +220,12 @@ class Pilot:
         rays = {
             name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
         }
-        rays["joined"] = SAMPLE.of(rows, "joined").mean()
+        rays["connected"] = SAMPLE.of(rows, "connected").mean()
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
         rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
         rays["guidable"] = sds.vertices if sds else 0.0
-        heard = self._listener.evaluated() if self._listener is not None else None
-        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, sds, heard)
+        emission = self._emission.evaluated() if self._emission is not None else None
+        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, sds, emission)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
@@ -312,11 +312,11 @@ def measure(
     if guiding:
         found = sds_light.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
     kernel.without_isolated = found is not None or (everything.guidable and not guiding)
-    region, listener = prepared.camera.region, None
+    region, emission = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
         kernel.cells = components.guided_emission.Cells(prepared.emitters)
         kernel.emitters = kernel.cells.emitters
-        listener = components.guided_emission.EmissionStatistics(HEARD_TILES**2, kernel.cells.count)
+        emission = components.guided_emission.EmissionStatistics(EMISSION_TILES**2, kernel.cells.count)
     pixels = int(region.size.prod())
     stratified = settings.points == "sobol"
     nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
@@ -324,7 +324,7 @@ def measure(
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
     batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None, listener)
+    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None, emission)
     # Samples outside nets use independent numbers: products of samples give the squared mean.
     points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)

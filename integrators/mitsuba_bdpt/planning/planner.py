@@ -36,7 +36,7 @@ LATEST_REPEAT = 1 / 4
 
 # Where path tracing alone is best without tables, a second pilot runs with them if they are predicted to make
 # light subpaths better than it by this factor.
-AIMED_GAIN = 1.15
+EMISSION_GAIN = 1.15
 
 # Where the fewest light subpaths and one connection are chosen, camera subpaths connect with several light
 # subpaths, drawn by an approximation (`connections`), in renders of at least so many samples and pixels. Not
@@ -88,7 +88,7 @@ class Decided:
 
 
 @dataclass(frozen=True)
-class _Answer:
+class _Result:
     """Result of a pilot.
 
     ``table`` of predictions, the best first, and what the best leaves out; ``moments`` that they follow from,
@@ -144,35 +144,35 @@ class Planner:
         self.decided = replace(self.decided, pilots=pilots._replace(repeat=repeat))
         return done <= LATEST_REPEAT * self._spp
 
-    def ask(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
+    def run_pilot(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
         if self.decided.pilots.asked:
-            answer = self._answer(samples)
+            result = self._result(samples)
         else:  # the first pilot of all renders of the scene
             key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
-            answer, is_known = self._findings.find("answers", key, lambda: self._answer(samples))
+            result, is_known = self._findings.find("results", key, lambda: self._result(samples))
             if is_known:
-                pilots = self.decided.pilots._replace(asked=answer.asked, remembered=answer.asked)
-                self.decided = replace(self.decided, pilots=pilots, moments=answer.moments)
-                self._with_tables = answer.with_tables
-        if answer.table:
-            self.adopt(answer.table[0].decided(len(passes), answer.moments.mean), answer.left_out)
+                pilots = self.decided.pilots._replace(asked=result.asked, remembered=result.asked)
+                self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
+                self._with_tables = result.with_tables
+        if result.table:
+            self.adopt(result.table[0].decided(len(passes), result.moments.mean), result.left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
-        return list(answer.table)
+        return list(result.table)
 
-    def _answer(self, samples: int) -> _Answer:
+    def _result(self, samples: int) -> _Result:
         """Result of a pilot combined with the earlier ones of this render."""
         found, before = self._measured(samples), self.decided.moments
-        moments = found if before is None else before.joined(found)
+        moments = found if before is None else before.combined(found)
         self.decided = replace(self.decided, moments=moments)
         alternatives, left_out = self._alternatives(samples), ()
         table = choice.choose(moments, alternatives)
         if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
         if table:
-            table, learnt = self._aimed(table, moments, samples)
-            table[0] = self._joined(table[0], samples)
+            table, learnt = self._with_guided_emission(table, moments, samples)
+            table[0] = self._with_more_light_paths(table[0], samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
             unguided = table[0].candidate.emission is None
@@ -181,19 +181,19 @@ class Planner:
                 *UNMEASURED * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
-        return _Answer(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
+        return _Result(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
 
-    def _aimed(
+    def _with_guided_emission(
         self, table: list[choice.Prediction], moments: Moments, samples: int
     ) -> tuple[list[choice.Prediction], Learnt | None]:
         """Add guided emission to ``table`` where it pays; also returns what was learnt."""
         self._with_tables = None
         if not moments.emission.size:
             return table, None
-        learnt = self._learnt(moments, samples)
+        learnt = self._fitted_emission(moments, samples)
         lit = min((row.time for row in table if row.candidate.light_paths), default=math.inf)
         is_lit = table[0].candidate.light_paths > 0
-        if learnt.tables is None or (not is_lit and lit * learnt.whole * AIMED_GAIN > table[0].time):
+        if learnt.tables is None or (not is_lit and lit * learnt.whole * EMISSION_GAIN > table[0].time):
             return table, learnt
         tables, before = learnt.tables, self.plan.emission
         if before is not None:
@@ -202,13 +202,13 @@ class Planner:
             tables = tables if left_by(tables, moments.emission) < BETTER_TABLES * left else before
         if not is_lit:
             found = self._measured(samples, tables)
-            aimed = choice.choose(found, self._alternatives(samples))
-            if not found.mean > 0 or not aimed or not aimed[0].candidate.light_paths:
+            guided = choice.choose(found, self._alternatives(samples))
+            if not found.mean > 0 or not guided or not guided[0].candidate.light_paths:
                 return table, learnt
-            self._with_tables, table = found, aimed
+            self._with_tables, table = found, guided
         return [row.with_emission(tables, is_lit) for row in table], learnt
 
-    def _joined(self, row: choice.Prediction, samples: int) -> choice.Prediction:
+    def _with_more_light_paths(self, row: choice.Prediction, samples: int) -> choice.Prediction:
         """``row`` with several light subpaths per lane where that pays (`JOINED_SAMPLES`)."""
         candidate = row.candidate
         fewest = candidate.connections == "one" and candidate.light_paths == min(n for n in LIGHT_PATHS if n)
@@ -226,7 +226,7 @@ class Planner:
     def _why_not_joined(self) -> str:
         return why_not_joined(self._prepared, self.full.merging)
 
-    def _learnt(self, moments: Moments, samples: int) -> Learnt:
+    def _fitted_emission(self, moments: Moments, samples: int) -> Learnt:
         """Fit tables of emission; the first pilot's are cached (20 ms under a sky)."""
         counts, component = self._prepared.emitters.tables, components.guided_emission
 
@@ -297,10 +297,10 @@ class Planner:
             self.adopt(decision, decided.left_out)
         self.decided = decided
 
-    def certainty(self, passes: tuple[int, ...]) -> float:
-        """`choice.certainty` of the pilots' decision."""
+    def confidence(self, passes: tuple[int, ...]) -> float:
+        """`choice.confidence` of the pilots' decision."""
         moments = self._with_tables or self.decided.moments
-        return choice.certainty(moments, self._alternatives(self._expected(passes)))
+        return choice.confidence(moments, self._alternatives(self._expected(passes)))
 
     def lost_by_pilots(self) -> int:
         """Number of non-finite values of the pilots, counted as zero."""

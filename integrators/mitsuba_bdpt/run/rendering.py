@@ -171,7 +171,7 @@ class Render:
         table = []
         if self.planner.begin(self.passes):
             with self.meter.pilot():
-                table = self.planner.ask(self.passes)
+                table = self.planner.run_pilot(self.passes)
         self._use_plan()
         return table
 
