@@ -21,7 +21,7 @@ import rendered
 from mitsuba_bdpt import workers
 from mitsuba_bdpt.cli import checkpoints, render, values
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.cli.signals import TERMINATED
+from mitsuba_bdpt.cli.mistakes import TERMINATED
 from mitsuba_bdpt.run.snapshot import read
 from patience import PATIENCE
 

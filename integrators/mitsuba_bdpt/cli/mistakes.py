@@ -1,4 +1,4 @@
-"""Errors of a command: one line on standard error, and an exit status.
+"""Exit statuses of a command: errors, in one line on standard error, and signals that end it.
 
 Usage errors, `USAGE`, concern the user's input; the same command would fail again:
 
@@ -20,8 +20,12 @@ from __future__ import annotations
 import argparse
 import errno
 import re
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 from ..errors import FailureError, UnsupportedError, UsageError, behind, chain, message
 
@@ -128,3 +132,45 @@ def is_mistake(error: BaseException) -> bool:
         return False
     _, traceback, rest = str(error).partition("Traceback (most recent call last):")
     return not traceback or bool(IN_WORDS.match(rest.strip().splitlines()[-1]))
+
+
+SIGNALS = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
+
+
+@dataclass
+class Ending:
+    """State of a command that a signal ends.
+
+    ``status``: its exit status; ``patient``: whether the next signal is only recorded, while results are
+    written; ``signalled``: whether one has come.
+    """
+
+    status: int = INTERRUPTED
+    patient: bool = False
+    signalled: bool = False
+
+    def __call__(self, number: int, frame: object) -> None:
+        """Handle a signal: the first raises ``KeyboardInterrupt``; later ones are ignored."""
+        if self.signalled:
+            return
+        self.signalled, self.status = True, SIGNALS[signal.Signals(number)]
+        if not self.patient:
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def terminable() -> Iterator[Ending]:
+    """Within, `Ending` handles SIGINT and SIGTERM.
+
+    Leaves signals unchanged outside of the main thread.
+    """
+    ending = Ending()
+    if threading.current_thread() is not threading.main_thread():
+        yield ending
+        return
+    before = {number: signal.signal(number, ending) for number in SIGNALS}
+    try:
+        yield ending
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -27,8 +27,7 @@ from ..host.introspection import versions
 from ..progress import Report, display, readable
 from ..run.rendering import PassReport
 from . import checkpoints, cluster
-from .mistakes import INTERRUPTED, answered, in_words, is_mistake
-from .signals import Ending, terminable
+from .mistakes import INTERRUPTED, Ending, answered, in_words, is_mistake, terminable
 
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""

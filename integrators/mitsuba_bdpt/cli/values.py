@@ -34,23 +34,22 @@ def within(bounds: Number) -> Callable[[str], float]:
     return parse
 
 
-def size(text: str) -> tuple[int, int]:
+def size(text: str) -> tuple[int, ...]:
     """Parse ``WIDTHxHEIGHT``, integers of at least 1."""
-    width, x, height = text.lower().partition("x")
-    if not (x and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form WIDTHxHEIGHT, in pixels")
-    return int(width), int(height)
+    return _pixels(text, r"(\d+)[xX](\d+)", "WIDTHxHEIGHT")
 
 
-def crop(text: str) -> tuple[int, int, int, int]:
+def crop(text: str) -> tuple[int, ...]:
     """Parse ``X,Y,WIDTH,HEIGHT``, integers, the last two at least 1."""
-    parts = text.split(",")
-    if len(parts) != 4 or not all(p.strip().isdecimal() for p in parts) or not all(map(int, parts[2:])):
-        raise argparse.ArgumentTypeError(
-            f"got {text!r}, which must have the form X,Y,WIDTH,HEIGHT, in pixels"
-        )
-    x, y, width, height = map(int, parts)
-    return x, y, width, height
+    return _pixels(text, ",".join([r"\s*(\d+)\s*"] * 4), "X,Y,WIDTH,HEIGHT")
+
+
+def _pixels(text: str, pattern: str, form: str) -> tuple[int, ...]:
+    match = re.fullmatch(pattern, text)
+    numbers = tuple(map(int, match.groups())) if match else (0,)
+    if not all(numbers[-2:]):
+        raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form {form}, in pixels")
+    return numbers
 
 
 def frames(text: str) -> list[int]:
