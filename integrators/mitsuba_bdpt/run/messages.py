@@ -17,22 +17,18 @@ NAMED = 5
 
 def log(statistics: dict):
     """Log the statistics of a render, and warn if its error is unknown."""
-    seconds = statistics["seconds"]
-    mi.Log(
-        mi.LogLevel.Info,
-        f"bdpt: {sum(statistics['passes'])} spp in {seconds['total']:.2f} s "
-        f"(compile {seconds['compile']:.2f} s); {json.dumps(statistics['rays'])}",
-    )
+    seconds, no_pilot = statistics["seconds"], statistics["no_pilot"]
+    lines = [
+        f"{sum(statistics['passes'])} spp in {seconds['total']:.2f} s (compile {seconds['compile']:.2f} s); "
+        f"{json.dumps(statistics['rays'])}"
+    ]
     if not statistics["unbiased"]:
-        mi.Log(
-            mi.LogLevel.Info, f"bdpt: merging: consistent, not unbiased; {json.dumps(statistics['merging'])}"
-        )
-    if statistics["no_pilot"]:
-        mi.Log(mi.LogLevel.Info, f"bdpt: no pilot: {statistics['no_pilot']}")
-    for made in statistics["decisions"]:
-        mi.Log(mi.LogLevel.Info, f"bdpt: decided: {json.dumps(made)}")
-    for left_out in statistics["skipped"]:
-        mi.Log(mi.LogLevel.Info, f"bdpt: skipped: {json.dumps(left_out)}")
+        lines.append(f"merging: consistent, not unbiased; {json.dumps(statistics['merging'])}")
+    lines += [f"no pilot: {no_pilot}"] if no_pilot else []
+    lines += [f"decided: {json.dumps(made)}" for made in statistics["decisions"]]
+    lines += [f"skipped: {json.dumps(left_out)}" for left_out in statistics["skipped"]]
+    for line in lines:
+        mi.Log(mi.LogLevel.Info, f"bdpt: {line}")
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,
@@ -46,19 +42,17 @@ def warn_of_parameters(scene, sensor):
     bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
     narrow = narrow_spots(scene)
     if bright:
-        warn_once(
-            scene,
-            sensor,
-            f"bdpt: {_some(bright)}: more light returns than arrives, and where it cannot "
-            "leave the image has no limit as max_depth grows; keep such parameters at 1 or below",
+        text = (
+            "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
+            "grows; keep such parameters at 1 or below"
         )
+        warn_once(scene, sensor, f"bdpt: {_some(bright)}: {text}")
     if narrow:
-        warn_once(
-            scene,
-            sensor,
-            f"bdpt: {_some(narrow)}: Mitsuba rounds how the light falls off across so narrow a cone, with "
-            "every integrator, and strategies do not agree about it; make it 0.2 degrees or more",
+        text = (
+            "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
+            "strategies do not agree about it; make it 0.2 degrees or more"
         )
+        warn_once(scene, sensor, f"bdpt: {_some(narrow)}: {text}")
 
 
 def warn_of_media(prepared, sensor):
@@ -66,24 +60,19 @@ def warn_of_media(prepared, sensor):
     media = prepared.light_media
     if media is None:
         return
-    scene = prepared.scene
-    for look in prepared.space.media.looks:
-        if look.strange:
-            warn_once(scene, sensor, f"bdpt: {look.strange}")
+    texts = [look.strange for look in prepared.space.media.looks]
     if media.contradiction:
-        warn_once(
-            scene,
-            sensor,
-            f"bdpt: {media.contradiction}; light subpaths would see another scene than the camera, so there "
-            "are none: the image is that of `volpath`",
+        texts.append(
+            f"{media.contradiction}; light subpaths would see another scene than the camera, so there are "
+            "none: the image is that of `volpath`"
         )
     if media.hides_infinity and prepared.emitters.at_infinity:
-        warn_once(
-            scene,
-            sensor,
-            "bdpt: the medium that the sensor declares has no end, and no light from infinity (sky, sun) "
-            "arrives through it; put a shape with a null BSDF around it",
+        texts.append(
+            "the medium that the sensor declares has no end, and no light from infinity (sky, sun) arrives "
+            "through it; put a shape with a null BSDF around it"
         )
+    for text in filter(None, texts):
+        warn_once(prepared.scene, sensor, f"bdpt: {text}")
 
 
 def warn_of_lost_light(prepared, plan, text: str):
@@ -114,12 +103,8 @@ def warn_of_non_finite(statistics: dict, scene):
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return
-    some = (
-        "1 value was not finite and counts as zero"
-        if lost == 1
-        else f"{lost} values were not finite and count as zero"
-    )
-    parts = [some] if lost else []
+    some = "1 value was not finite and counts" if lost == 1 else f"{lost} values were not finite and count"
+    parts = [f"{some} as zero"] if lost else []
     if in_pilot:
         which = "so did" if lost else "values that were not finite count as zero:"
         parts.append(f"{which} {in_pilot} of the pilot, which decided from the rest")
