@@ -17,11 +17,9 @@ NAMED = 5
 
 def log(statistics: dict):
     """Log the statistics of a render, and warn if its error is unknown."""
-    seconds, no_pilot = statistics["seconds"], statistics["no_pilot"]
-    lines = [
-        f"{sum(statistics['passes'])} spp in {seconds['total']:.2f} s (compile {seconds['compile']:.2f} s); "
-        f"{json.dumps(statistics['rays'])}"
-    ]
+    seconds, rays, no_pilot = (statistics[name] for name in ("seconds", "rays", "no_pilot"))
+    times = f"{seconds['total']:.2f} s (compile {seconds['compile']:.2f} s)"
+    lines = [f"{sum(statistics['passes'])} spp in {times}; {json.dumps(rays)}"]
     if not statistics["unbiased"]:
         lines.append(f"merging: consistent, not unbiased; {json.dumps(statistics['merging'])}")
     lines += [f"no pilot: {no_pilot}"] if no_pilot else []
