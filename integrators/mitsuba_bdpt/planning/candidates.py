@@ -50,11 +50,6 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
     return [candidate for candidate in CANDIDATES if is_possible(candidate)]
 
 
-def usual_direct(prepared: PreparedScene) -> float:
-    """kappa of s = 1 with path tracing alone, unless a pilot finds a better one."""
-    return UNIFORM_DIRECT if prepared.emitters.contrast <= UNIFORM else 1.0
-
-
 def without_pilot(
     prepared: PreparedScene, full: Plan, settings: Settings, samples: int, least: int
 ) -> Decision | None:
@@ -70,5 +65,5 @@ def without_pilot(
         return None
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
         return None
-    alone = Configuration(0.0, "none", 1.0, usual_direct(prepared))
+    alone = Configuration(0.0, "none", 1.0, UNIFORM_DIRECT if contrast <= UNIFORM else 1.0)
     return Decision.of(alone, first_pass=0, cost=1.0, variance=0.0, mean=0.0)

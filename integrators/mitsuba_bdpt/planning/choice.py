@@ -70,10 +70,6 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
 # experiments, "Choice of strategies".
 CAUTION = 0.15
 
-# With path tracing alone a coefficient of s = 1 other than the usual one (`Alternatives.usual_direct`) has to
-# gain this factor. Without it `veach_mis` takes 1.16 times the time.
-DIRECT_GAIN = 1.15
-
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
@@ -93,15 +89,13 @@ class Alternatives:
     """The ``candidates`` for a render with ``samples`` samples still to come.
 
     ``stratified``: whether its points are stratified, see `moments.Moments.variance`; ``guidable``: whether
-    photon-guided BSDF sampling is possible; ``usual_direct``: kappa of s = 1 in the absence of a reason for
-    another, see `candidates.usual_direct`.
+    photon-guided BSDF sampling is possible.
     """
 
     candidates: list[Configuration]
     stratified: bool
     samples: float = math.inf
     guidable: bool = False
-    usual_direct: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -189,12 +183,7 @@ def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
         for c, v in zip(candidates, variances.tolist(), strict=True)
         if math.isfinite(v)
     ]
-
-    def score(row: Prediction) -> float:
-        is_usual = row.candidate.light_paths or row.candidate.kappa_direct == alternatives.usual_direct
-        return row.score * (1 if is_usual else DIRECT_GAIN)
-
-    return sorted(table, key=score)
+    return sorted(table, key=lambda row: row.score)
 
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
@@ -227,8 +216,6 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
         return ""
     if chosen.candidate.guided and not row.candidate.guided:
         return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
-    if not row.candidate.light_paths:
-        return f"its coefficient of s=1 has to gain {DIRECT_GAIN:g}x, and gains {gain:.2f}x"
     more = row.cost / chosen.cost
     needed = f"{more**CAUTION:.2f}x"
     return f"a sample of it costs {more:.2f} times as much: it has to gain {needed}, and gains {gain:.2f}x"

@@ -18,7 +18,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import LIGHT_PATHS, Settings
 from ..transport.plan import JOINED, EmissionTables, Plan
 from . import budget, choice, pilot
-from .candidates import LEFT_OUT, candidates, usual_direct, without_pilot
+from .candidates import LEFT_OUT, candidates, without_pilot
 from .configuration import Decision, replayed
 from .explain import words
 from .findings import Findings
@@ -338,13 +338,7 @@ class Planner:
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """The alternatives for ``samples`` samples still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
-        return choice.Alternatives(
-            possible,
-            self._settings.points == "sobol",
-            samples,
-            self.full.guidable,
-            usual_direct(self._prepared),
-        )
+        return choice.Alternatives(possible, self._settings.points == "sobol", samples, self.full.guidable)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Expected number of samples still to come."""
