@@ -70,6 +70,20 @@ MUTANTS = (
         ("tests/planning/test_lost_light.py::test_a_share_near_the_limit_waits_for_the_image",),
     ),
     Mutant(
+        "lost light: lamps that rays hit lack light",
+        "transport/photons/photon_pass.py",
+        "active=walk.active & e.delta)",
+        "active=walk.active)",
+        ("tests/planning/test_lost_light.py::test_only_lamps_that_no_ray_hits_lack_light",),
+    ),
+    Mutant(
+        "lost light: photons have no emitter",
+        "transport/photons/photon_pass.py",
+        "y.edges, lanes, e.index)",
+        "y.edges, lanes, mi.UInt32(0))",
+        ("tests/planning/test_lost_light.py::test_lamps_of_several_colours_are_lost_together",),
+    ),
+    Mutant(
         "lost light: said after the last pass",
         "run/rendering.py",
         "messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())",

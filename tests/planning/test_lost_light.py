@@ -99,12 +99,11 @@ def mean(scene, integrator, spp, seed=0):
 def estimate(scene, monkeypatch):
     """What is lost, by four times 2^17 subpaths from either end, where a render takes 2^13."""
     monkeypatch.setattr(lost_light, "SUBPATHS", 1 << 17)
-    monkeypatch.setattr(lost_light, "COMPARED", 1 << 13)
     render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
     total = 0
     for seed in range(4):
         monkeypatch.setattr(lost_light, "SEED", seed)
-        total += sum(lost_light.estimate(render.prepared, render.plan, 16).radiance.values())
+        total += sum(lost_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
     return total / 4
 
 
@@ -263,7 +262,7 @@ def test_red_light_on_a_blue_floor_is_no_loss():
         lamp = {"type": "point", "position": [0.5, 3, 0], "intensity": {"type": "rgb", "value": red}}
         scene = scene_of(lamp, block=BLOCK, floor=floor() | {"bsdf": blue})
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found = sum(lost_light.estimate(render.prepared, render.plan, 16).radiance.values())
+        found = sum(lost_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
         assert found > lost_light.WORTH_A_WORD if lost else found == 0
 
 
@@ -309,9 +308,8 @@ def test_what_is_not_finite_is_said(lamp, called):
 def test_what_is_not_finite_out_of_view_is_not_said():
     """Rationale: nothing is lost of light that nobody sees. Expected: no warning of a lamp beyond single
     precision whose light meets nothing that is seen through glass."""
-    scene = scene_of(
-        LAMPS["point"] | {"intensity": 1e38}, block=BLOCK | {"to_world": T().translate([30, 1, 0])}
-    )
+    beneath = BLOCK | {"to_world": T().translate([0, -3, 0])}  # the floor
+    scene = scene_of(LAMPS["point"] | {"intensity": 1e38}, block=beneath)
     with Warned() as warnings:
         bdpt(light_paths=0).render(scene, spp=4)
     assert not [text for text in warnings if "cannot be told" in text]
@@ -413,25 +411,63 @@ def test_other_committed_scenes_are_not_looked_at():
     }
 
 
-@pytest.mark.parametrize("alpha", [0.05, 0.2])
-def test_rough_metal_reflects_no_more_than_arrives(alpha):
-    """Rationale: Mitsuba's answer of BSDFs that do not know their diffuse reflectance is pi times their value
-    towards the normal, which has no bound: 94 % of an image of rough metal beneath a pane were said to be
-    missing. Expected: of the irradiance that passes the pane, E, at most E / pi is lost of a white metal, the
-    radiance of a white floor, and half of it at least (two samples of the albedo, 0.9 to 1, and noise of a
-    tenth)."""
+def test_what_merging_adds_on_rough_metal_is_what_is_lost(monkeypatch):
+    """Rationale: the albedo of a glossy surface says little about what a camera sees of it. Expected: what
+    merging adds to the image of rough metal beneath glass, within 15 % (light that leaves the floor twice
+    within the glass is not estimated: 9 % of it; noise of 2 %)."""
+    metal = {"type": "roughconductor", "alpha": 0.2}
+    scene = scene_of(LAMPS["point"], block=BLOCK, floor=floor() | {"bsdf": metal})
+    added = mean(scene, bdpt(merging=True), 64) - mean(scene, bdpt(), 64)
+    assert estimate(scene, monkeypatch) == pytest.approx(added, rel=0.15)
+
+
+def test_only_lamps_that_no_ray_hits_lack_light():
+    """Rationale: camera subpaths hit a lamp with area through glass. Expected: of that and a point light the
+    share of the point light alone, as without the other (the same photons but for the choice of the emitter:
+    within 15 %)."""
+    lamp = lamp_with_area([-2, 3, 0], 0.3)
     found = []
-    for bsdf_of in ({"type": "diffuse", "reflectance": 1.0}, {"type": "roughconductor", "alpha": alpha}):
-        scene = scene_of(LAMPS["point"], block=BLOCK, floor=floor() | {"bsdf": bsdf_of})
+    for others in ({}, {"second": lamp}):
+        scene = scene_of(LAMPS["point"], block=BLOCK, **others)
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found.append(sum(lost_light.estimate(render.prepared, render.plan, 16).radiance.values()))
-    white, metal = found
-    assert 0.5 * white < metal < 1.1 * white
+        found.append(lost_light.estimate(render.prepared, render.plan, render.settings).radiance)
+    alone, beside = found
+    assert len(alone) == len(beside) == 1
+    assert sum(beside.values()) == pytest.approx(sum(alone.values()), rel=0.15)
+
+
+def fog(albedo):
+    """Fills the space between the floor and the sheet."""
+    medium = {"type": "homogeneous", "sigma_t": 0.4, "albedo": albedo}
+    to_world = T().translate([0, 0.4, 0]).scale([5.5, 0.5, 5.5])
+    return {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}
+
+
+def test_in_fog_the_direct_light_is_lost(monkeypatch):
+    """Rationale: media were left out. Expected: beneath a sheet of glass that neither reflects nor refracts
+    all direct light of the floor is lost, dimmed by the fog on its way down and up, as `volpath` sees it
+    without the sheet in a fog that only absorbs (within 5 %: noise of 1 %). A word is said, the share is
+    that of the image (with the noise of 2^13 subpaths: within 15 %), and the remedy is not merging, which
+    fog rules out.
+    """
+    sheet_of_glass = sheet({"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.0})
+    path = mi.load_dict({"type": "volpath", "max_depth": 2})
+    expected = mean(scene_of(LAMPS["spot"], fog=fog(0.0)), path, 64)
+    clear = mean(scene_of(LAMPS["spot"]), path, 64)
+    scene, integrator = scene_of(LAMPS["spot"], fog=fog(0.8), sheet=sheet_of_glass), bdpt()
+    assert estimate(scene, monkeypatch) == pytest.approx(expected, rel=0.05) and expected < 0.6 * clear
+    with Warned() as warnings:
+        found = mean(scene, integrator, 4)
+    assert len(warnings) == 1 and "spot 'lamp' shines through glass" in warnings[0], warnings
+    assert "merging" not in warnings[0] and "small area" in warnings[0]
+    share = sum(integrator.statistics["lost_light"].values())
+    assert share == pytest.approx(expected / (expected + found), rel=0.15)
 
 
 def test_lamps_of_several_colours_are_lost_together():
     """Rationale: the brightest colours of a red, a green and a blue lamp are those of three white ones.
-    Expected: together they lack what a white lamp does, in equal parts, to the noise of a tenth."""
+    Expected: together they lack what a white lamp does, each in proportion to what the floor reflects of its
+    colour, to the noise of a tenth."""
 
     def lamp(colour):
         return {"type": "point", "position": [0.5, 3, 0], "intensity": {"type": "rgb", "value": colour}}
@@ -441,11 +477,12 @@ def test_lamps_of_several_colours_are_lost_together():
     shares = []
     for scene in (one, three):
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        shares.append(lost_light.estimate(render.prepared, render.plan, 16).radiance)
+        shares.append(lost_light.estimate(render.prepared, render.plan, render.settings).radiance)
     white, coloured = shares
     assert len(coloured) == 3
     assert sum(coloured.values()) == pytest.approx(sum(white.values()), rel=0.2)
-    assert max(coloured.values()) < 2 * min(coloured.values())
+    parts_of = np.array([*coloured.values()]) / sum(coloured.values())
+    np.testing.assert_allclose(parts_of, np.array([1, 0.8, 0.5]) / 2.3, rtol=0.2)
 
 
 def test_edits_of_what_is_around_a_lamp_are_seen():

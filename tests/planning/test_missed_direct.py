@@ -100,6 +100,22 @@ def test_missing_light_through_glass_is_said(lamp):
     assert of_plan(meter(), lamp, WITHOUT, pane=GLASS, blind=BLIND) == []
 
 
+def test_missing_light_through_glass_in_fog_is_said():
+    """Rationale: media were left out. Expected: as without the fog, which lies between glass and meter; in an
+    opaque one nothing arrives.
+    """
+    pane = GLASS | {"bsdf": {"type": "dielectric"}}  # edges pass a thin one where there are media
+
+    def fog(sigma_t):
+        to_world = T().translate([0, 0, 0.15]).scale([1, 1, 0.1])
+        medium = {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.5}
+        return {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}
+
+    (warning,) = of_plan(meter(), LAMPS["point"], WITHOUT, pane=pane, fog=fog(0.5))
+    assert "'bulb' shines through glass or mirrors on" in warning
+    assert of_plan(meter(), LAMPS["point"], WITHOUT, pane=pane, fog=fog(1e4)) == []
+
+
 def test_a_lamp_that_starts_no_light_subpath_is_not_looked_for():
     """Rationale: a user's own lamp without area has none to follow. Expected: no warning, no error."""
     parts.register_plugins()

@@ -86,8 +86,8 @@ def explain(
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
     missing = unreachable_paths(prepared, p, settings)
     lines += [f"lost: {words(lost)}" for lost in missing]
-    if missing and prepared.space is not None:
-        lines.append("lost light: its share of the image is not estimated in scenes with media")
+    if any(lost.volumes for lost in missing):
+        lines.append("lost light: the estimate of its share leaves out vertices in media")
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "

@@ -8,25 +8,31 @@ shadow rays or light subpaths find the emitters whose light arrives.
 from __future__ import annotations
 
 from functools import partial
-from itertools import islice
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..geometry import rays
+from ..host.jit import evaluated_mode, gc_paused
+from ..sampling.points import Purpose
 from ..scene.prepared import PreparedScene
 from ..sensors import checks, kinds
 from ..sensors.records import CameraConnection, Sensor
 from ..settings import Settings
+from ..transport import subpaths, techniques
+from ..transport.inputs import Kernel, Observer
+from ..transport.photons import unsampled
 from ..transport.plan import Plan
-from . import lost_light
 from .findings import Findings
-from .lost_light import NAMED, called, shared_sample
+from .lost_light import NAMED, called, delta_kernel, points
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 # Points on the sensor to which each emitter is connected.
 POINTS = 1 << 10
+
+# Light subpaths tested for hits of a sensor: about two hit 10 cm^2 at a distance of 3 m from a lamp.
+HITTING = 1 << 18
 
 
 def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
@@ -38,7 +44,7 @@ def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: 
 def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str:
     """Warning about light of ``paths`` that end at the sensor; empty if none arrives."""
     direct = Start.DIRECT_DELTA_EMITTER in paths.starts
-    look = partial(_arriving, prepared, direct, settings.max_depth)
+    look = partial(_arriving, prepared, plan, settings, direct)
     found, _ = findings.find("missed direct light", (direct, settings.max_depth), look)
     if not found:
         return ""
@@ -66,25 +72,22 @@ def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: st
     return "decisions leave out light subpaths", "leave decisions to the integrator"
 
 
-def _arriving(prepared: PreparedScene, direct: bool, max_depth: int) -> tuple[int, ...]:
+def _arriving(prepared: PreparedScene, plan: Plan, settings: Settings, direct: bool) -> tuple[int, ...]:
     """Indices of at most `NAMED` + 1 delta emitters whose light arrives at the sensor.
 
     Directly if ``direct``, else by delta events.
     """
-    views = _with_area(prepared)
-    if not direct:
-        # `lost_light` supports neither media nor emitters without light subpaths.
-        if prepared.space is not None or not prepared.emitters.traced:
-            return ()
-        found = {i for view in views for i in lost_light.arriving(prepared, view, max_depth)}
-        return tuple(sorted(found)[: NAMED + 1])
-    emitters = prepared.scene.emitters()
-    arriving = (
-        i
-        for i in prepared.emitters.unhittable_connectible
-        if any(_arrives(prepared, view, emitters[i]) for view in views)
-    )
-    return tuple(islice(arriving, NAMED + 1))
+    kernel, emitters = delta_kernel(prepared, plan, settings), prepared.scene.emitters()
+    found: set[int] = set()
+    for view in _with_area(prepared):
+        kernel.camera = view
+        if direct:
+            found |= {i for i in prepared.emitters.unhittable_connectible if _arrives(kernel, emitters[i])}
+        elif prepared.emitters.traced:
+            with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
+                arriving = unsampled.arriving(kernel, points("sobol"), HITTING)
+            found |= set(np.flatnonzero(np.array(arriving)).tolist())
+    return tuple(sorted(found)[: NAMED + 1])
 
 
 def _with_area(prepared: PreparedScene) -> list[Sensor]:
@@ -95,11 +98,12 @@ def _with_area(prepared: PreparedScene) -> list[Sensor]:
     return [view for view in found or [camera] if view.connectible and not view.delta]
 
 
-def _arrives(prepared: PreparedScene, sensor: Sensor, emitter: mi.Emitter) -> bool:
-    """Whether light of a delta ``emitter`` arrives at the ``sensor`` unoccluded."""
-    generator = mi.PCG32(POINTS)
-    u_lens, u_film = (mi.Point2f(generator.next_float32(), generator.next_float32()) for _ in range(2))
-    shared = shared_sample(prepared, generator)
+def _arrives(kernel: Kernel, emitter: mi.Emitter) -> bool:
+    """Whether light of a delta ``emitter`` arrives at the kernel's sensor unoccluded."""
+    index, drawn = mi.UInt64(dr.arange(mi.UInt32, POINTS)), points("sobol")
+    stream, sensor = drawn.stream("light", index), kernel.camera
+    u_lens, u_film = (drawn.draw_2d("light", stream, use) for use in (Purpose.LENS, Purpose.FILM))
+    shared = subpaths.shared_by_lane(kernel.bound(drawn, 1.0, Observer()), stream, index)
     infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.DeltaDirection)
     seen_from = dr.zeros(mi.SurfaceInteraction3f, POINTS)
     ds, _ = emitter.sample_direction(seen_from, mi.Point2f(0.5))
@@ -110,18 +114,14 @@ def _arrives(prepared: PreparedScene, sensor: Sensor, emitter: mi.Emitter) -> bo
     seen_from.p, seen_from.time, seen_from.wavelengths = join.p, shared.time, shared.wavelengths
     ds, weight = emitter.sample_direction(seen_from, mi.Point2f(0.5))
     lit = join.valid & dr.any(mi.unpolarized_spectrum(weight) != 0)
-    return bool(np.any(np.array(lit & ~_occluded(prepared, join, ds, infinite, shared))))
+    return bool(np.any(np.array(lit & ~_occluded(kernel, join, ds, infinite, shared))))
 
 
-def _occluded(
-    prepared: PreparedScene, join: CameraConnection, ds: mi.DirectionSample3f, infinite: bool, shared
-):
-    """Mask: a surface blocks the edge; with media False, as boundaries are surfaces."""
-    if prepared.space is not None:
-        return mi.Bool(False)
+def _occluded(kernel: Kernel, join: CameraConnection, ds: mi.DirectionSample3f, infinite: bool, shared):
+    """Mask: a surface blocks the edge."""
     if infinite:
         ray = rays.spawn(join.anchor, -join.d, shared)
         ray.maxt = join.reach
     else:
         ray = rays.segment_to(join.anchor, ds.p, shared)
-    return rays.occluded(prepared.scene, ray, join.valid)
+    return techniques.hidden(kernel, ray, join.valid)

@@ -367,7 +367,7 @@ class Render:
         prepared, plan, max_depth = self.prepared, self.plan, self.settings.max_depth
         if not lost_light.is_possible(prepared, plan, self.settings):
             return None
-        look = partial(lost_light.estimate, prepared, plan, max_depth)
+        look = partial(lost_light.estimate, prepared, plan, self.settings)
         lost, _ = self.findings.find("lost light", (plan.splat, plan.direct, max_depth), look)
         return lost if lost.colours else None
 

@@ -59,7 +59,7 @@ class Traits:
     See `needs_full_pdf`, `needs_round_trip`, `Asked`. ``glossy``: one has a glossy lobe; ``transmits``: one
     has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map; ``parts``: one is
     sampled by its parts, see `draws`; ``reverse``: a strategy in use starts from the other side, so that
-    weights need reverse densities.
+    weights need reverse densities; ``only_delta``: only delta lobes are sampled.
     """
 
     full_pdf: bool
@@ -70,10 +70,15 @@ class Traits:
     mapped: bool = False
     parts: bool = False
     reverse: bool = True
+    only_delta: bool = False
 
     def from_one_side(self) -> Traits:
         """The traits without reverse densities."""
         return replace(self, round_trip=False, reverse=False)
+
+    def of_delta_lobes(self) -> Traits:
+        """The traits for sampling delta lobes only, without reverse densities."""
+        return replace(self.from_one_side(), full_pdf=False, parts=False, only_delta=True)
 
     def null_transmission(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Null transmission of the surface at ``si``, for all polarizations."""
@@ -285,11 +290,14 @@ def _answers(questions, asked: Asked, target, bsdf, *args):
 def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
     """Weight of a light subpath's sample without the ratio of geometric cosines."""
     bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-    f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
+    weight = mi.Spectrum(0)
+    if not traits.only_delta:
+        f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
+        weight = f.value / drawn.density
     # Removes the factor eta^-2 of radiance on camera subpaths.
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
-    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), f.value / drawn.density)
+    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), weight)
     # Mitsuba may return a density for a rejected direction. NaN is kept, to be counted.
     return dr.select((drawn.pdf_fwd_w == 0) | drawn.rejected, 0, weight)
 
@@ -323,7 +331,8 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
     """Sample a direction with densities both ways, in one virtual call."""
 
     def ask(self, si, u1, u2, active):
-        ctx, found = mi.BSDFContext(), draws.draw(self, si, u1, u2, active)
+        ctx = mi.BSDFContext()
+        found = (draws.draw_delta if traits.only_delta else draws.draw)(self, si, u1, u2, active)
         bs = found.bs
         weight = polarization.in_world(si, found.weight, -bs.wo, si.wi)
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

@@ -53,6 +53,14 @@ def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active
     return _BY_PARTS[bsdf.class_name()](bsdf, si, u1, u2, active)
 
 
+def draw_delta(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
+    """Sample the delta lobes of a BSDF in radiance mode; rejected without one."""
+    context = mi.BSDFContext(mi.TransportMode.Radiance, +mi.BSDFFlags.Delta)
+    bs, weight = bsdf.sample(context, si, u1, u2, active)
+    rejected = is_zero(weight) | ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    return Draw(bs, dr.select(rejected, 0, weight), bs.pdf, rejected)
+
+
 def by_parts(bsdf) -> bool:
     """Whether `draw` samples the parts of a BSDF: it contains a blend.
 

@@ -262,7 +262,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
-        active &= ~(asked & _hidden(kernel, z.surroundings, asked))
+        active &= ~(asked & hidden(kernel, z.surroundings, asked))
     ends = walk.edges + 1, mi.UInt32(0)
     return Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
 
@@ -298,7 +298,7 @@ def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active)
     return (length > 0) & before_end, depth
 
 
-def _hidden(kernel: Kernel, ray: mi.Ray3f, active):
+def hidden(kernel: Kernel, ray: mi.Ray3f, active):
     """Mask: a surface blocks ``ray``."""
     if kernel.space is None:
         return rays.occluded(kernel.scene, ray, active)

@@ -448,11 +448,13 @@ def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
 def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
     """Mask: the diffuse ``vertex`` of an SDS path, if the other subpath matches.
 
-    No edge up to it is connected by a strategy in use, its event is not delta, and the path may have a
-    further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
+    No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
+    path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
     """
     joined = mis.is_joined(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
     possible = vertex.hit & vertex.connectible() & ~joined & (vertex.edges < kernel.max_depth)
+    if vertex.volume is not None:
+        possible &= ~vertex.volume
     return possible if walk.isolated is None else possible & walk.isolated
 
 

@@ -123,12 +123,26 @@ def bucket_of(cell: mi.UInt64) -> mi.UInt32:
     return word >> (32 - BUCKET_BITS)
 
 
-def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-    """Merge the camera vertex ``z`` with one photon near it, drawn by flux.
+@dataclass
+class Sample:
+    """A photon drawn for a camera vertex.
+
+    ``f``: the BSDF (an `Evaluation`) towards it; ``value``: estimate of all merges of the vertex, without
+    weight.
+    """
+
+    photon: Photon
+    f: Any
+    value: mi.Spectrum
+    active: mi.Bool
+
+
+def sample(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
+    """Draw a photon near the camera vertex ``z`` by flux.
 
     Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
     """
-    h, merging = kernel.heuristic, kernel.merging
+    merging = kernel.merging
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
     chosen, total = _draw(kernel, z, word, wavelength_set)
     active = z.hit & (total > 0)
@@ -138,14 +152,21 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
     # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * dr.abs(dr.dot(z.si.n, photon.d))))
     value = z.throughput * f.value * estimate
-    active &= ~spectra.is_zero(value)
+    return Sample(photon, f, value, active & ~spectra.is_zero(value))
+
+
+def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
+    """Merge the camera vertex ``z`` with one photon near it, see `sample`."""
+    h, merging = kernel.heuristic, kernel.merging
+    drawn = sample(kernel, z, stream, wavelength_set)
+    photon, f = drawn.photon, drawn.f
     light_side = h.scale(photon.older, f.pdf_fwd_w)
     # t = 0, the oldest alternative of the camera's side, does not sample longer paths.
     older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)
     older = h.scale(older, photon.aim)  # t = 0 starts with the emitter's density, not the photons'
     camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
-    return Contribution(value, weight, photon.edges + 1, z.edges, active, shares, "merge")
+    return Contribution(drawn.value, weight, photon.edges + 1, z.edges, drawn.active, shares, "merge")
 
 
 @dr.syntax

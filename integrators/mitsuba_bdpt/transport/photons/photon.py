@@ -19,7 +19,8 @@ class Photon:
     ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
     throughput, not divided by the number of subpaths; ``older``: partial sum of all alternatives with fewer
     light vertices (area measure); ``aim``: the emitter's own density of the first direction over that of
-    `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath.
+    `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath;
+    ``emitter``: index in the scene.
     """
 
     p: mi.Point3f
@@ -31,6 +32,7 @@ class Photon:
     distance: mi.Float
     edges: mi.UInt32
     lane: mi.UInt32
+    emitter: mi.UInt32
 
     @staticmethod
     def types() -> tuple[Any, ...]:
@@ -40,7 +42,7 @@ class Photon:
         """
         return (
             *(mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum),
-            *(mi.Float, mi.Float, mi.Float, mi.UInt32, mi.UInt32),
+            *(mi.Float, mi.Float, mi.Float, mi.UInt32, mi.UInt32, mi.UInt32),
         )
 
     @staticmethod

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import drjit as dr
 import mitsuba as mi
@@ -45,8 +46,18 @@ def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
-    photons, found, counters = _all(_kernel(kernel, points, merging), merging.aim, count)
-    return replace(merging, photons=_sorted(merging, photons, found)), counters
+    traced = _all(_kernel(kernel, points, merging), merging.aim, count, Kept.MERGED)
+    return replace(merging, photons=_sorted(merging, traced.photons, traced.count)), traced.counters
+
+
+def trace_unsampled(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.Bool]:
+    """Trace ``count`` photon subpaths; returns ``merging`` with those that no strategy samples.
+
+    Also a mask by emitter: a photon subpath ended by a non-finite value.
+    """
+    kernel = _kernel(kernel, points, merging)
+    traced = _all(kernel, merging.aim, count, Kept.UNSAMPLED)
+    return replace(merging, photons=_sorted(merging, traced.photons, traced.count)), traced.broken
 
 
 def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
@@ -54,8 +65,8 @@ def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[G
 
     The guide is None without photons. ``aim`` samples first directions.
     """
-    photons, found, counters = _all(_kernel(kernel, points, None), aim, count)
-    return Guide.of(photons, found) if found else None, counters
+    traced = _all(_kernel(kernel, points, None), aim, count, Kept.GUIDED)
+    return Guide.of(traced.photons, traced.count) if traced.count else None, traced.counters
 
 
 def _kernel(kernel: Kernel, points: Points, merging: Merging | None) -> Kernel:
@@ -65,24 +76,38 @@ def _kernel(kernel: Kernel, points: Points, merging: Merging | None) -> Kernel:
     return kernel
 
 
-def _all(kernel: Kernel, aim: Aim, count: int) -> tuple[Photon, int, mi.UInt64]:
+class Kept(Enum):
+    """Vertices of photon subpaths that are stored."""
+
+    MERGED = "all diffuse vertices of SDS paths"
+    GUIDED = "the first non-delta vertex, if s = 0 can sample the path through it"
+    UNSAMPLED = "the first non-delta vertex, if no strategy can sample the path through it"
+
+
+@dataclass
+class _Traced:
+    """``count`` ``photons`` in the order of threads; ``broken``: see `trace_unsampled`."""
+
+    photons: Photon
+    count: int
+    counters: mi.UInt64
+    broken: mi.Bool
+
+
+def _all(kernel: Kernel, aim: Aim, count: int, kept: Kept) -> _Traced:
     """Like `_traced`, again with more memory if the photons exceed it."""
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        photons, found, counters = _traced(kernel, aim, count, Photon.zeros(capacity))
-        if found <= capacity:
-            return photons, found, counters
-        capacity = found
+        traced = _traced(kernel, aim, count, kept, Photon.zeros(capacity))
+        if traced.count <= capacity:
+            return traced
+        capacity = traced.count
 
 
-def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, int, mi.UInt64]:
-    """Store photons in ``out``; returns it, their number (may exceed it), counters.
-
-    With merging all diffuse vertices of SDS paths; for a guide the first non-delta vertex of a subpath, if s
-    = 0 can sample the path through it.
-    """
+def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> _Traced:
+    """Store photons in ``out``; `_Traced.count` may exceed it."""
     capacity = dr.width(out)
-    kept, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
+    number, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
@@ -92,8 +117,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
         kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
         shared,
     )
-    walk = subpaths.light_walk(kernel, e, stream, shared, True)
-    merges = kernel.merging is not None
+    merges, finite = kept is Kept.MERGED, mi.Bool(True)
+    if kept is Kept.UNSAMPLED:  # traced, to see where their light arrives
+        finite = spectra.is_finite(e.weight)
+        e = replace(e, weight=dr.select(finite, e.weight, 1))
+    walk = subpaths.light_walk(kernel, e, stream, shared, merges)
+    if kept is Kept.UNSAMPLED:  # s = 0 samples the others
+        walk = replace(walk, active=walk.active & e.delta)
     side = subpaths.light_side(kernel, e, stream, shared, walk)
     side = replace(side, join=None, isolated=merges, only_delta=not merges)
 
@@ -102,11 +132,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
         keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
-        if not merges:
+        if kept is Kept.GUIDED:
             keep &= older > 0
+        if kept is Kept.UNSAMPLED:
+            older = dr.select(finite, mi.Float(0), dr.nan)
         distance = dr.norm(y.si.p - y.previous)
-        found = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes)
-        place = dr.scatter_inc(kept, mi.UInt32(0), keep)
+        found = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index)
+        place = dr.scatter_inc(number, mi.UInt32(0), keep)
         dr.scatter(out, found, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
 
@@ -114,8 +146,12 @@ def _traced(kernel: Kernel, aim: Aim, count: int, out: Photon) -> tuple[Photon, 
     counters, walk = random_walk(kernel, side, walk, stream, visit, Counters.zeros("photons"))
     counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
     counts = counters.summed()
-    dr.eval(kept, out, counts)
-    return out, int(kept[0]), counts
+    broken = dr.zeros(mi.Bool, len(kernel.scene.emitters()))
+    if kept is Kept.UNSAMPLED:
+        astray = walk.broken | (e.delta & ~dr.isfinite(dr.sum(e.d)))
+        dr.scatter(broken, mi.Bool(True), e.index, astray)
+    dr.eval(number, out, counts, broken)
+    return _Traced(out, int(number[0]), counts, broken)
 
 
 def _sorted(merging: Merging, photons: Photon, count: int) -> Photons:
