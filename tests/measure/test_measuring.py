@@ -459,7 +459,7 @@ def test_samples_of_a_render_that_stops_are_its_own(here):
     """Expected: the row of a render that has reached its target error has the samples that it took; of one
     that has not, it is said at the end, which is no failure."""
     stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
-    own = '[[integrator]]\ntype = "bdpt"\nvariance = true\ntarget_error = 100.0\n'
+    own = '[[integrator]]\ntype = "bdpt"\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
     (row,) = pyarrow.parquet.read_table(here / "out" / "rows.parquet").to_pylist()
