@@ -14,9 +14,10 @@ import mitsuba as mi
 from .emitters.kinds import third_party_elsewhere
 from .errors import UnsupportedError, UsageError, UsageTypeError
 from .host import tracebacks
+from .image.layers import film_layers
 from .planning.budget import is_open
 from .planning.explain import explain
-from .properties import check_variant, film_layers, integer, read_settings
+from .properties import check_variant, integer, read_settings
 from .run import messages
 from .run.arguments import check_made_for, check_resumable, resolve_sensor, samples_per_pixel
 from .run.rendering import PassReport, Render

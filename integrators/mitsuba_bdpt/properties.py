@@ -16,7 +16,7 @@ from .host.introspection import named
 from .image import denoising, features, film_limits
 from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
-from .image.layers import layer_names
+from .image.layers import film_layers
 from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
@@ -140,13 +140,6 @@ _READERS = {
     "layers": _layers,
 }
 _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}
-
-
-def film_layers(settings: Settings) -> list[str]:
-    """Return the names of the film's layers beside colours and alpha."""
-    depth, names = settings.strategy_depth, features.feature_names(settings.aovs)
-    merges, denoise, stokes = settings.merge_images, settings.denoise, settings.stokes
-    return layer_names(depth, settings.variance, names, merges=merges, denoise=denoise, stokes=stokes)
 
 
 def _not_a_parameter(name: str, value) -> str:

@@ -17,9 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
+from ..settings import Settings
 from . import denoising
 from .colour import POLARIZED
-from .layers import image_count, layer_names, strategies, strategy_count, strategy_index
+from .layers import film_layers, image_count, strategies, strategy_count, strategy_index
 from .replicates import Replicates, Spread
 
 
@@ -126,25 +127,20 @@ class Accumulator:
     """Accumulates the samples of one render.
 
     ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
-    pixels that camera samples reach beyond the crop window; ``depth``: largest path length of strategy
-    images, 0 for none; ``merges``: whether merges have one too; ``variance``: whether replicates are kept,
-    see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``.
+    pixels that camera samples reach beyond the crop window; ``settings``: the layers, of which the variance
+    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``.
     """
 
-    def __init__(self, film, colour, border: int, depth: int, merges: bool, variance: bool, features):
+    def __init__(self, film, colour, border: int, settings: Settings, features):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
-        self.depth = depth
+        self.depth = settings.strategy_depth
         self.size = [int(x) for x in film.crop_size()]
         self.offset = [int(x) for x in film.crop_offset()]
         self.rfilter = film.rfilter()
-        self.variance, self.replicates = variance, Replicates()
-        names = features.names if features else []
-        guides = features is not None and features.guides
+        self.variance, self.replicates = settings.variance, Replicates()
         self.stokes = colour.stokes
-        colour.prepare(
-            layer_names(depth, variance, names, colour.names, merges, guides, self.stokes is not None)
-        )
+        colour.prepare(film_layers(settings, colour.names))
         self._channels = Channels.of(
             film, len(colour.names), features.count if features else 0, POLARIZED if self.stokes else 0
         )
@@ -153,8 +149,8 @@ class Accumulator:
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
         # One strip of rows per strategy, separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
-        rows = image_count(depth, merges) * self._stride
-        self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if depth else None
+        rows = image_count(self.depth, settings.merge_images) * self._stride
+        self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
         self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
         self._share = [self._covered(n) for n in self.size]
 

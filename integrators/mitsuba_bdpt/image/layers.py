@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from ..settings import Settings
 from .colour import STOKES_NAMES
+from .features import feature_names
 
 # Layers of the denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
@@ -32,23 +36,13 @@ def strategy_index(s, t):
     return (k - 1) * (k + 4) // 2 + s
 
 
-def layer_names(
-    depth: int,
-    variance: bool,
-    features=(),
-    colours=("R", "G", "B"),
-    merges: bool = False,
-    denoise: bool = False,
-    stokes: bool = False,
-) -> list[str]:
-    """Return the names of the film's layers, in the order of `Accumulator`.
-
-    Layers of ``stokes``, ``features``, ``denoise``, the variance of ``colours``, and strategy images of paths
-    of up to ``depth`` edges, with one of all ``merges`` if true.
-    """
-    names = [*(STOKES_NAMES if stokes else ()), *features, *(DENOISED if denoise else ())]
-    names += [f"variance.{colour}" for colour in colours if variance]
-    of_strategies = [f"s{s}t{t}" for _, s, t in strategies(depth)] + ["merged"] * merges
+def film_layers(settings: Settings, colours: Iterable[str] = "RGB") -> list[str]:
+    """Return the names of the film's layers beside its ``colours`` and alpha, in order."""
+    names = [*(STOKES_NAMES if settings.stokes else ()), *feature_names(settings.aovs)]
+    names += DENOISED if settings.denoise else ()
+    names += [f"variance.{colour}" for colour in colours if settings.variance]
+    of_strategies = [f"s{s}t{t}" for _, s, t in strategies(settings.strategy_depth)]
+    of_strategies += ["merged"] * settings.merge_images
     return names + [
         f"{kind}.{strategy}.{channel}"
         for strategy in of_strategies

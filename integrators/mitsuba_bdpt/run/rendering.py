@@ -87,10 +87,7 @@ class Render:
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
         border = self.prepared.camera.region.border
-        strategies = settings.strategy_depth, settings.merge_images
-        self.accumulator = Accumulator(
-            sensor.film(), colour, border, *strategies, settings.variance, features
-        )
+        self.accumulator = Accumulator(sensor.film(), colour, border, settings, features)
         self.kernel = self._kernel()
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
