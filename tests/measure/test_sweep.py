@@ -530,12 +530,12 @@ def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
         assert swept(*words) == 0
     assert calls == [1, 2]
     assert json.loads((output / "probes.json").read_text())["memory"]["values"] == {"2 spp": [1.0]}
-    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: {"2 spp": [probes._printed("1 / 0")]})
+    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: {"2 spp": [probes.numbers("1 / 0")[-1]]})
     preset_file(folder, f"{PRESET}[probes]\nmemory = 3\n")
     assert swept(*words) == 1
     assert "failed: memory: a probe ended with status 1" in capsys.readouterr().out
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        probes._printed("1 / 0")
+        probes.numbers("1 / 0")
 
 
 def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
