@@ -275,7 +275,7 @@ def test_what_is_joined(change, joined):
         _pixels=given["pixels"],
         _why_not_joined=lambda: given["why"],
     )
-    row = planner.Planner._joined(asked, choice.Prediction(way, 1.0, 1.0), given["samples"])
+    row = planner.Planner._with_more_light_paths(asked, choice.Prediction(way, 1.0, 1.0), given["samples"])
     assert row.candidate.joined == joined
 
 

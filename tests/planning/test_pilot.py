@@ -403,19 +403,6 @@ def test_direct_light_is_never_rare():
     assert (found.light[:, lit].mean(axis=0) > 0).all() and (found.rare == 0).all()
 
 
-def test_light_subpaths_from_infinity_cost_more():
-    """Expected: the share of the light subpaths that start at infinity is that of the emitters' sampling
-    weights, and they take `COSTS`["far"] more."""
-    sphere = {"type": "sphere", "emitter": {"type": "area", "sampling_weight": 3.0}}
-    sun = {"type": "directional", "sampling_weight": 1.0}
-    for emitters, share in (({"a": sphere}, 0), ({"a": sphere, "b": sun}, 0.25), ({"b": sun}, 1)):
-        target = mi.load_dict({"type": "scene", "sensor": camera(16), **emitters})
-        assert of(target).prepared.emitters.far_share == share
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
-    more = choice.cost(SPLATS, rays) - choice.cost(SPLATS, rays | {"far": 0.0})
-    assert more == pytest.approx(choice.COSTS["far"] / 2 / 2)
-
-
 @pytest.mark.parametrize("make, least, most", [(sky, 0.05, 0.5), (cornell, 0.4, 0.9)])
 def test_measured_gain_of_points(make, least, most):
     """Expected: what a pilot says points leave of the variance of path tracing is what renders of a net per
@@ -540,7 +527,7 @@ def test_what_costs_more_has_to_gain(connections):
     candidates hardly differ. Expected: a candidate whose sample costs c times as much is chosen if it gains
     more than c^`CAUTION`, and if it gains less that is said.
     """
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated", "far"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated"), 1.0)
     rays["kinds"] = 1
     light = {"none": SPLATS, "one": CONNECTED}[connections]
     possible = [ALONE, light]
@@ -567,7 +554,7 @@ def test_what_looks_better_says_why_it_is_not_chosen():
     """
     random, needed, met = np.random.default_rng(1), re.compile(r"to gain (.*)x, and gains? (.*)x"), set()
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected"), 1.0)
-    rays |= {"far": 0.0, "kinds": 1, "evaluated": 0.0, "guidable": 0.01}
+    rays |= {"kinds": 1, "evaluated": 0.0, "guidable": 0.01}
     even = [1 / choice.cost(c, rays) for c in CANDIDATES]
     for number in range(200):
         base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(CANDIDATES)))
@@ -852,7 +839,7 @@ def test_recording_counts_in_short_renders():
     subpaths. Expected: with 0.6 of the variance for a third more per sample light subpaths are taken for a
     million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
     possible = [ALONE, FEW]
-    rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0, "far": 0.0}
+    rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0}
     rays |= {"connected": 0.0, "evaluated": 0.0, "kinds": 1}
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, FEW.number] = 0.6
@@ -861,7 +848,7 @@ def test_recording_counts_in_short_renders():
         assert bool(table[0].candidate.light_paths) == lit
     fixed = choice.FIXED
     extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16 + choice.COSTS["inner"]
-    more = extra + (fixed["light"] + fixed["inner"]) / 2**16
+    more = extra + fixed["light"] / 2**16
     assert choice.cost(FEW, rays, 1 << 16) == pytest.approx(1 + more / (4 + fixed["start"] / 2**16))
     assert choice.cost(ALONE, rays, 1 << 16) == 1 == choice.cost(ALONE, rays)
 
@@ -871,7 +858,7 @@ def test_confidence():
     decides, in about the share 1 - (15/16)^16 = 0.64 of its resamplings (100 of them: 0.05 is its standard
     error, three allowed)."""
     possible, alone = [ALONE, SPLATS], ALONE.number
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "far"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, alone] = 10
     assert choice.confidence(made_of(base, rays), Alternatives(possible, True)) == 1

@@ -38,8 +38,8 @@ class Emitters:
     * ``connectible_to_sensor``: y_0 of one can be connected to a sensor; ``connectible_nearby``: of one that
       is not at infinity; ``unhittable_connectible``: indices of those that cannot be hit;
       ``finite_hittable``: one can be hit and connected, and is not at infinity.
-    * ``on_shapes``: one is on a shape; ``at_infinity``, ``far_share``: light subpaths can start at infinity,
-      and the share that does; ``beams``: only its own light subpaths reach one.
+    * ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: only
+      its own light subpaths reach one.
     * ``evaluated``: an emitter in the process, even of another scene, requires evaluated loops and calls.
     * ``left_out``: strategies that single emitters lack, with reasons.
     * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
@@ -54,7 +54,7 @@ class Emitters:
         types = [group_of(emitter) for emitter in emitters]
         weights = [number(emitter.sampling_weight()) for emitter in emitters]
         registered = registered_emitters()
-        self._summarize(emitters, types, weights)
+        self._summarize(emitters, types)
         # It evaluates a mask, which cannot be recorded.
         self.evaluated = "TimedSunskyEmitter" in registered
         self.groups, self.disks, self.has_places = (), None, False
@@ -80,7 +80,7 @@ class Emitters:
         self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
         dr.make_opaque(self._group, self._pmf, self._inverse)
 
-    def _summarize(self, emitters, types, weights):
+    def _summarize(self, emitters, types):
         """Set the properties that depend on all emitters; ``types``: their groups."""
         hittable = [t.is_hittable(e) for e, t in zip(emitters, types, strict=True)]
         self._hittable_types = {t for t, h in zip(types, hittable, strict=True) if h}
@@ -100,9 +100,6 @@ class Emitters:
         self.on_shapes = any(emitter.get_shape() is not None for emitter in emitters)
         self.beams = any(t.supports_emission and not t.connectible_to_sensor for t in types)
         self.at_infinity = any(t.at_infinity for t in types)
-        of_groups = list(zip(weights, types, strict=True))
-        far = sum(w for w, t in of_groups if t.at_infinity)
-        self.far_share = far / sum(w for w, t in of_groups if t.supports_emission) if far > 0 else 0.0
         self.tables = [t.tables(e) for e, t in zip(emitters, types, strict=True)]
         self.left_out: list[tuple[str, str]] = [
             text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)

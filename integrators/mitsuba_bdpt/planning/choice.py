@@ -20,12 +20,10 @@ from .moments import GROUPS, Moments
 # experiments, "Choice of strategies".
 COSTS = {
     "light_path": 1.7,  # starting a light subpath
-    "far": 2.0,  # additional cost of starting one at infinity
     "light": 0.76,  # a ray of a light subpath
     "light_in_media": 1.2,  # a ray of a light subpath in a scene with media
     "inner": 0.55,  # looking for connections, per sample
     "connected": 0.65,  # a drawn and tested connection
-    "shadow_inner": 0.65,  # a tested connection, if all are tested
     # With media: an evaluated pair of the lane of a packet with most pairs, for which the others wait.
     "packets": 0.18,
     "guided": 31.0,  # a vertex with photon-guided BSDF sampling, its samples included
@@ -33,8 +31,8 @@ COSTS = {
 }
 
 # Cost of a render besides its samples, mainly recording of its kernel, in the same unit: path tracing alone,
-# plus light subpaths, plus connections, plus guiding. See experiments, "Choice of strategies".
-FIXED = {"start": 180e3, "light": 250e3, "inner": 20e3, "guided": 600e3}
+# plus light subpaths, plus guiding. See experiments, "Choice of strategies".
+FIXED = {"start": 180e3, "light": 250e3, "guided": 600e3}
 
 # Numbers of kinds of BSDFs between which the lanes of a packet increasingly take turns in evaluating their
 # BSDFs. BSDFs of one kind share their functions.
@@ -49,14 +47,11 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
     if candidate.light_paths:
         total += FIXED["light"] / samples
-        light = COSTS["light_path"] + COSTS["far"] * rays["far"]
         each = COSTS["light_in_media" if rays.get("media") else "light"]
-        light += each * (rays["light"] + rays["shadow_t1"])
+        light = COSTS["light_path"] + each * (rays["light"] + rays["shadow_t1"])
         total += light * candidate.light_paths
     if candidate.connections != "none":
-        total += FIXED["inner"] / samples
-        counted = "connected" if candidate.connections == "one" else "shadow_inner"
-        total += COSTS["inner"] + COSTS[counted] * rays[counted]
+        total += COSTS["inner"] + COSTS["connected"] * rays["connected"]
         total += COSTS["packets"] * rays.get("packets", 0)
         part = (rays["kinds"] - FEW_KINDS) / (MANY_KINDS - FEW_KINDS)
         total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]

@@ -122,8 +122,8 @@ class Moments:
       others: unguided and guided (no columns: not measured).
     * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
-    * ``rays``: rays and connections per camera sample by kind, with one light subpath each, the number of
-      ``kinds`` of BSDFs, and ``far``, the share of light subpaths that start at infinity.
+    * ``rays``: rays and connections per camera sample by kind, with one light subpath each, and the
+      number of ``kinds`` of BSDFs.
     * ``lanes``: number of camera samples.
     """
 

@@ -333,7 +333,7 @@ def measure(
     found = pilot.moments(counted, found)
     if everything.guidable and not guiding:
         found = replace(found, sds=found.sds[:, :0])
-    known = {"kinds": prepared.traits.asked.kinds, "far": prepared.emitters.far_share}
+    known = {"kinds": float(prepared.traits.asked.kinds)}
     known["media"] = float(prepared.space is not None)
     return replace(found, rays=found.rays | known)
 
