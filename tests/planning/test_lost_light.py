@@ -123,6 +123,18 @@ def test_behind_a_sheet_of_nothing_the_direct_light_is_lost(lamp, eye, bsdf, pas
     assert estimate(plain, monkeypatch) == 0
 
 
+def test_a_sensor_of_one_ray_finds_photons():
+    """Rationale: its pixel has no size, which was the radius of the disc of photons. Expected: beneath a
+    sheet of nothing the direct light of the floor at that point is lost, within half (about twenty photons).
+    """
+    eye = {"type": "radiancemeter", "film": film(1), "to_world": T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0])}
+    scene = scene_of(LAMPS["spot"], eye, sheet=sheet({"type": "null"}))
+    render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
+    found = lost_light.estimate(render.prepared, render.plan, render.settings).radiance
+    expected = mean(scene_of(LAMPS["spot"], eye), mi.load_dict({"type": "path", "max_depth": 2}), 64)
+    assert sum(found.values()) == pytest.approx(expected, rel=0.5)
+
+
 @pytest.mark.parametrize("camera_height, sheet_height", [(2.4, 2.7), (4, 3.5)])
 def test_what_lies_behind_glass_on_one_side_only_is_found(camera_height, sheet_height, monkeypatch):
     """Rationale: next-event estimation joins the floor with a lamp on its side of the glass, t = 1 with a

@@ -40,6 +40,9 @@ SUBPATHS = 1 << 13
 # the image.
 RADIUS = 1.5
 
+# Merging radius in pixels of `Footprints` where these cannot be measured: 1/64 of the scene's diagonal.
+UNMEASURED = 8.0
+
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
 
@@ -134,8 +137,9 @@ def points(kind: str) -> Points:
 
 def _merging(prepared: PreparedScene) -> Merging:
     """Merging of the estimate, without photons."""
-    pixels = RADIUS * math.sqrt(prepared.camera.region.size.prod() / SUBPATHS)
-    radius = Footprints.of(prepared.scene, prepared.camera.sensor).radius(pixels)
+    footprints = Footprints.of(prepared.scene, prepared.camera.sensor)
+    of_samples = RADIUS * math.sqrt(prepared.camera.region.size.prod() / SUBPATHS)
+    radius = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     sets, wavelengths = 1, None
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)

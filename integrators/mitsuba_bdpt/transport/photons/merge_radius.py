@@ -61,12 +61,16 @@ class Radius:
 
 @dataclass(frozen=True)
 class Footprints:
-    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``."""
+    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``.
+
+    ``measured``: False where no pixels can be measured.
+    """
 
     centre: tuple[float, float, float]
     base: float
     angle: float
     median: float
+    measured: bool = True
 
     def radius(self, factor: float) -> Radius:
         """The radius of ``factor`` pixels."""
@@ -101,4 +105,4 @@ class Footprints:
         box = scene_box(scene)
         diagonal = math.dist([*box.min], [*box.max])
         size = diagonal * _OF_DIAGONAL if 0 < diagonal < math.inf else 1.0
-        return Footprints((0.0, 0.0, 0.0), size, 0.0, size)
+        return Footprints((0.0, 0.0, 0.0), size, 0.0, size, measured=False)
