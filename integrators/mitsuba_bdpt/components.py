@@ -18,6 +18,7 @@ from .errors import UnsupportedError
 COMPONENTS = {
     "guided_emission": "mitsuba_bdpt.guided_emission",
     "media": "mitsuba_bdpt.media",
+    "merging": "mitsuba_bdpt.merging",
 }
 
 
@@ -41,6 +42,6 @@ def _find(name: str) -> Any:
 
 
 if TYPE_CHECKING:
-    from . import guided_emission, media
+    from . import guided_emission, media, merging
 else:
-    guided_emission, media = map(_find, ("guided_emission", "media"))
+    guided_emission, media, merging = map(_find, ("guided_emission", "media", "merging"))

@@ -221,24 +221,6 @@ def check_not_frozen():
         )
 
 
-def check_merging(sensor, settings: Settings, media: bool):
-    """Raise ``UnsupportedError`` where vertex merging is not possible.
-
-    ``media``: whether the scene has participating media.
-    """
-    if not settings.merging:
-        return
-    if sensor.shutter_open_time() > 0:
-        raise UnsupportedError(
-            f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
-            "subpaths have different times; set shutter_close to shutter_open, or leave out merging"
-        )
-    if media:
-        raise UnsupportedError(
-            "merging in scenes with participating media is not supported; leave out merging"
-        )
-
-
 def check_film(sensor, settings: Settings):
     """Check the film against the requested layers; returns its colours.
 

@@ -15,8 +15,8 @@ from mitsuba_bdpt.guided_emission import Cells, EmissionTables, learning, side_o
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.planning import pilot
 from mitsuba_bdpt.run import rendering
+from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
-from test_merging import images as rendered_images
 
 from stress_cases.capture import Capture
 from stress_cases.weights import Tally, weigh

@@ -24,8 +24,7 @@ from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
 from mitsuba_bdpt.transport.photons.photon_guide import Guide
 from mitsuba_bdpt.transport.plan import GUIDED
-from snapshots import ROUNDING
-from test_merging import (
+from sds_scenes import (
     CASES,
     CHANGES,
     ball,
@@ -38,6 +37,7 @@ from test_merging import (
     transform,
     under_glass,
 )
+from snapshots import ROUNDING
 
 import drjit as dr  # isort: skip
 

@@ -13,8 +13,8 @@ import welch as st
 from mitsuba_bdpt.planning import choice, planner
 from mitsuba_bdpt.planning.configuration import Configuration
 from mitsuba_bdpt.transport import connections, sketches
+from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
-from test_merging import images as rendered_images
 
 from instruments import recording
 

@@ -14,74 +14,46 @@ import pytest
 import variants
 import views
 import welch as st
+from mitsuba_bdpt.merging import merging, passes, wavelength_sets
+from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport.inputs import Kernel
-from mitsuba_bdpt.transport.photons import aim, merging, photon_pass, wavelength_sets
-from mitsuba_bdpt.transport.photons.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons import aim, photon_pass
 from mitsuba_bdpt.transport.photons.photon import Photon
+from sds_scenes import (
+    ALBEDO,
+    CAMERA,
+    CASES,
+    CHANGES,
+    FOV,
+    INTENSITY,
+    IOR,
+    LAMP,
+    SIZE,
+    THICKNESS,
+    ball,
+    bumpy,
+    glass,
+    images,
+    matte,
+    mirror,
+    point,
+    strategy_images,
+    transform,
+    under_glass,
+)
 from snapshots import ROUNDING, stopped
 
 import drjit as dr  # isort: skip
 
-LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
-IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
 
 # What is left of the blur at a quarter of a pixel, relative; it is 3e-3 at two pixels and falls as r^2.
 BLUR = 1e-3
 
 
-def transform():
-    return mi.ScalarTransform4f()
-
-
-def matte(value=ALBEDO):
-    return {"type": "diffuse", "reflectance": value}
-
-
-def point():
-    return {"type": "point", "position": list(LAMP), "intensity": INTENSITY}
-
-
 def sun():
     return {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0}
-
-
-def ball(radius=0.5):
-    return {
-        "type": "sphere",
-        "center": list(LAMP),
-        "radius": radius,
-        "bsdf": matte(0.0),
-        "emitter": {"type": "area", "radiance": 10.0},
-    }
-
-
-def glass():
-    return {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
-
-
-def under_glass(light, floor=None, plate=None, kind="perspective", **more):
-    """The scene; ``more`` of its entries."""
-    lens = {"aperture_radius": 0.3, "focus_distance": 3.0} if kind == "thinlens" else {}
-    eye = views.camera(kind, origin=CAMERA, target=(0, 0, 0), fov=FOV, size=SIZE, **lens)
-    to_world = transform().translate([0, 0, 0.5]).scale([4, 4, THICKNESS / 2])
-    return {
-        "type": "scene",
-        "sensor": eye,
-        "floor": {"type": "rectangle", "to_world": transform().scale(4), "bsdf": floor or matte()},
-        "plate": {"type": "cube", "to_world": to_world, "bsdf": plate or glass()},
-        "light": light,
-        **more,
-    }
-
-
-def images(scene, spp, seeds, first=0, **parameters):
-    """(seeds, height, width) of the first colour."""
-    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
-    method = internals.bdpt(**{"max_depth": 6, "rr_depth": 100, **parameters})
-    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
-    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
 
 
 # -- known answers -------------------------------------------------------------------------------------
@@ -155,7 +127,7 @@ def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
     (9/4 - 1/4) : (9 - 1/4), that is 1 : 4.4, with a standard error of 0.5; between 3 and 7 (of the radius
     itself it would be 2.5, of its cube 8.3).
     """
-    monkeypatch.setattr(photon_pass, "_PER_DISC", 1 << 18)
+    monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
     scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
         images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
@@ -184,9 +156,9 @@ def test_far_from_the_origin(monkeypatch):
     Expected: the mean brightness of the same scene at the origin, within 3 %. There rays leave surfaces by
     0.02, which shortens the way from the lamp: 1.7 % brighter, with discs of any size. Standard error 0.4 %.
     """
-    monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
+    monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
     monkeypatch.setattr(photon_pass, "FEWEST_PHOTONS", 1 << 17)
-    monkeypatch.setattr(photon_pass, "_PER_DISC", 1 << 17)
+    monkeypatch.setattr(passes, "_PER_DISC", 1 << 17)
     near, far = (
         images(under_a_spot(away), 16, 1, merging=True, merging_radius=radius).mean()
         for away, radius in (([0, 0, 0], 1.0), ([1e4, -1e4, 7e3], 0.1))
@@ -195,32 +167,6 @@ def test_far_from_the_origin(monkeypatch):
 
 
 # -- against s = 0 -------------------------------------------------------------------------------------
-
-
-def bumpy(bsdf):
-    rng = np.random.default_rng(2)
-    heights = mi.Bitmap(rng.random((16, 16, 1), dtype=np.float32) * 0.02)
-    texture = {"type": "bitmap", "bitmap": heights, "raw": True}
-    return {"type": "bumpmap", "arbitrary": texture, "bsdf": bsdf}
-
-
-def mirror():
-    """Beside the floor, so that the camera sees it there too."""
-    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
-
-
-CASES = {
-    "diffuse": {},
-    "plastic": {"floor": {"type": "plastic"}},
-    "rough metal": {"floor": {"type": "roughconductor", "alpha": 0.3}},
-    "rough glass above": {"plate": {"type": "thindielectric"}},
-    "bumpy glass": {"plate": bumpy},
-    "bumpy floor": {"floor": bumpy},
-    "masked floor": {"floor": {"type": "mask", "opacity": 0.6, "bsdf": {"type": "diffuse"}}},
-    "mirror": {"mirror": mirror},
-    "lens": {"kind": "thinlens"},
-}
 
 
 def lit_by_a_ball(case):
@@ -259,8 +205,8 @@ def test_spectral():
     floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
     scene = mi.load_dict(under_glass(lamp, floor))
     expected = coloured(scene, 256, 8, 100)
-    for first, spp, passes in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
-        found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **passes)
+    for first, spp, more in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
+        found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **more)
         family = [st.compare_images(st.tiles(found[..., i]), st.tiles(expected[..., i])) for i in range(3)]
         st.assert_agree(st.Comparisons.join(family), at_least=40)
 
@@ -382,9 +328,9 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
     half of its radius, and at its radius a quarter to 0.6. Tolerance: three standard errors of 0.013, beside
     0.02 for the perspective, in which edges look smaller than the middle; standard errors of the ball: 0.03.
     """
-    monkeypatch.setattr(rendering, "coefficient", lambda *_: 1.0)
+    monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
     monkeypatch.setattr(photon_pass, "FEWEST_PHOTONS", 1 << 18)
-    monkeypatch.setattr(photon_pass, "_PER_DISC", 1 << 18)
+    monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
     scene, expected = small(shape)
     pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
     found = images(scene, 16, 8, merging=True, merging_radius=radius / pixel).mean()
@@ -426,15 +372,6 @@ def test_nothing_leaks_through_a_thin_wall():
     scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
     scene["floor"]["bsdf"] = {"type": "twosided", "bsdf": matte()}
     assert not images(scene, 64, 2, merging=True, merging_radius=2.0).any()
-
-
-CHANGES = {
-    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
-    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
-    "hidden lamp": {"bdpt": {"hide_emitters": True}},
-    "features": {"bdpt": {"aovs": "dd:depth"}},
-    "instance": {},
-}
 
 
 @cache
@@ -494,7 +431,7 @@ def traced(count=1 << 14):
     kernel: Kernel = render.kernel
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
     of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1), render.aim)
-    of_pass, counts = photon_pass.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
+    of_pass, counts = passes.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
     found = of_pass.photons.found
     arrays = [np.array(column) for column in vars(found).values()]
     return arrays, np.array(of_pass.photons.starts), counts.numpy()
@@ -524,7 +461,7 @@ def test_cells_may_share_a_bucket(monkeypatch):
     """
     scene = mi.load_dict(under_glass(point()))
     expected = images(scene, 16, 1, merging=True)
-    for module in (photon_pass, merging):
+    for module in (passes, merging):
         monkeypatch.setattr(module, "BUCKET_BITS", 2)
     np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
 
@@ -547,9 +484,9 @@ def test_discs_hold_few_photons():
     """Rationale: merges of very many photons are slow. Expected: one photon's subpath for eight of a pass's
     samples, and no more than 64 for each disc that its film has room for.
     """
-    assert photon_pass.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
-    assert photon_pass.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
-    assert photon_pass.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
+    assert passes.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
+    assert passes.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
+    assert passes.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
 
 
 def test_no_photon_is_dropped(monkeypatch):
@@ -645,17 +582,6 @@ def test_merges_do_not_outweigh_what_is_better(monkeypatch):
     scene = mi.load_dict(under_glass({"type": "constant", "radiance": 1.0}))
     a, b = (images(scene, 256, 10, merging=merges).var(0, ddof=1).mean() for merges in (True, False))
     assert 0 < a < 1.3 * b
-
-
-def strategy_images(scene, spp, seeds, **more):
-    """Images and layers of the first colour by name, each (seeds, height, width)."""
-    parameters = {"max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
-    method = internals.bdpt(**parameters | {"layers": "strategies"} | more)
-    found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
-    found = np.array(found, dtype=np.float64)
-    names = method.aov_names()
-    assert found.shape[-1] == 3 + len(names)
-    return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
 
 
 def test_strategy_image_of_merges():

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 import views
 import welch as st
+from mitsuba_bdpt.merging import merging, passes
+from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.sampling import sobol
-from mitsuba_bdpt.transport.photons import merging, photon_guide, photon_pass
-from mitsuba_bdpt.transport.photons.merge_radius import Footprints
+from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
+from sds_scenes import ball, images, matte, point, strategy_images, transform, under_glass
 from snapshots import ROUNDING
-from test_merging import ball, images, matte, point, strategy_images, transform, under_glass
 
 import drjit as dr  # isort: skip
 
@@ -87,7 +88,7 @@ def test_all_photons_of_a_disc_are_found():
     radius = Footprints((0.0, 0.0, 0.3), 0.0, 0.1, 0.2).radius(4.0)
     found = random_photons(n)
     of_pass = merging.Merging(radius, mi.Float(n), mi.Float(1), None)
-    of_pass.photons = photon_pass._sorted(of_pass, found, n)
+    of_pass.photons = passes.sort(of_pass, found, n)
     rng = np.random.default_rng(2)
     p, edges = rng.uniform(-3, 3, (2, n)), rng.integers(1, 4, n)
     z = SimpleNamespace(
@@ -95,8 +96,8 @@ def test_all_photons_of_a_disc_are_found():
         edges=mi.UInt32(edges.astype(np.uint32)),
         anchor=SimpleNamespace(offset=mi.Float(0)),
     )
-    kernel = SimpleNamespace(merging=of_pass, max_depth=dr.opaque(mi.UInt32, most))
-    _, total = merging._draw(kernel, z, sobol.mix(dr.arange(mi.UInt32, n)), None)
+    word = sobol.mix(dr.arange(mi.UInt32, n))
+    _, total = merging._draw(of_pass, z, dr.opaque(mi.UInt32, most) - z.edges, word, None)
 
     off = np.array(found.p)[:2, None, :] - p[:, :, None]
     r = np.array(radius.at(z.si.p))

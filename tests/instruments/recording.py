@@ -164,7 +164,7 @@ def render(scene, integrator, least, spp: int, seed: int):
     outliers = []
 
     def trace(traced, image, batch, points, of):
-        if traced.guide is not None:
+        if traced.sds is not None:
             raise CommandError("paths that are guided are not looked at; set guiding=never")
         if traced.plan.emission is not None:  # whose densities nobody but the kernel knows
             raise CommandError("paths whose emission is guided are not looked at; set guiding=photons")

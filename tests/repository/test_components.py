@@ -61,6 +61,10 @@ KNOWN = {
         asked={"decisions": json.dumps([_DECISION])},
         tests=("guided_emission", "images/test_guided_emission.py"),
     ),
+    "merging": Component(
+        asked={"merging": True},
+        tests=("images/test_merging.py", "images/test_sds_paths.py"),
+    ),
     "media": Component(
         things={"fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}},
         tests=(

@@ -46,8 +46,7 @@ from mitsuba_bdpt.transport import (
 )
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer, Shared
-from mitsuba_bdpt.transport.photons import merging, photon_pass
-from mitsuba_bdpt.transport.photons.merge_radius import Radius
+from mitsuba_bdpt.transport.photons import photon_pass
 
 from instruments import oracle
 from instruments.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
@@ -606,16 +605,14 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         shape_errors=Flat(),
         space=None,
         light_media=None,
-        merging=None,
-        guide=None,
-        without_isolated=False,
+        sds=None,
         cells=None,
         sensor_medium=None,
         scatters=True,
     )
     shared = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     if merges is not None:
-        k_.merging = traced_photons(world, k_, merges, shared, monkeypatch)
+        k_.sds = traced_photons(world, k_, merges, shared, monkeypatch)
         record_merges(world, monkeypatch)
     result = [f(0)] * (k + 2)
     stored = []
@@ -643,7 +640,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         return total, Counters()
 
     for function, edges_of in (
-        (techniques.hit_emitter, lambda z: (0, edges(z))),
+        (techniques.hit_emitter, lambda z, *_: (0, edges(z))),
         (techniques.next_event, lambda z, *_: (1, edges(z) + 1)),
         (techniques.join_endpoints, lambda *_: (1, 1)),
         (techniques.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
@@ -688,28 +685,32 @@ class Unaimed:
         return pdf_second
 
 
-def traced_photons(world: World, k_, merges: merging.Merging, shared, monkeypatch) -> merging.Merging:
+def traced_photons(world: World, k_, merges, shared, monkeypatch):
     """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
+    from mitsuba_bdpt.merging import passes  # a component, see test_components
+
     k_.bound = lambda *_: SimpleNamespace(**vars(k_))
     with monkeypatch.context() as patch:
         patch.setattr(photon_pass, "_CAPACITY", float(world.k))  # else they are traced again
         patch.setattr(subpaths, "shared_by_lane", lambda *_: shared)
         patch.setattr(dr, "while_loop", python_loop(world.k - 1))
         world.scene.begin(from_light=True)
-        return photon_pass.trace(k_, merges, k_.points, world.n)[0]
+        return passes.trace(k_, merges, k_.points, world.n)[0]
 
 
 def record_merges(world: World, monkeypatch):
     """Keep in ``world.merged`` what is merged at each x_m, a `Contribution`; inactive where nothing is."""
-    is_sds_vertex, merge, draw, loop = kernel.is_sds_vertex, merging.merge, merging._draw, dr.while_loop
+    from mitsuba_bdpt.merging import merging
+
+    is_sds_vertex, merge, draw, loop = merging.is_sds_vertex, merging.merge, merging._draw, dr.while_loop
     world.merged, mask = {}, {}
 
     def recorded_mask(kernel_, first, walk, z):
         mask[0] = is_sds_vertex(kernel_, first, walk, z)
         return mask[0]
 
-    def recorded_merge(kernel_, z, *more):
-        out, m = merge(kernel_, z, *more), world.k - int(z.edges[0])
+    def recorded_merge(kernel_, merging_, z, *more):
+        out, m = merge(kernel_, merging_, z, *more), world.k - int(z.edges[0])
         out.active = out.active & mask[0]
         world.merged[m] = out
         world.demands.append(~out.active | ((out.s == m + 1) & (out.t == world.k - m)))
@@ -720,8 +721,7 @@ def record_merges(world: World, monkeypatch):
             patch.setattr(dr, "while_loop", loop)
             return draw(*arguments)
 
-    monkeypatch.setattr(kernel, "is_sds_vertex", recorded_mask)
-    for name, function in (("merge", recorded_merge), ("_draw", drawn)):
+    for name, function in (("is_sds_vertex", recorded_mask), ("merge", recorded_merge), ("_draw", drawn)):
         monkeypatch.setattr(merging, name, function)
 
 
@@ -789,7 +789,7 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
     ],
 )
 def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """Rationale: as above, also of ``photon_pass.trace``, ``walk.is_sds_vertex`` and ``merging.merge``:
+    """Rationale: as above, also of ``passes.trace``, ``walk.is_sds_vertex`` and ``merging.merge``:
     photons are traced along the paths, sorted into the grid and found again from the camera's side, in discs
     so small that each holds the vertex of its own path alone. Radii depend on the place, so that eta is
     spread over three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
@@ -799,13 +799,16 @@ def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, 
     merge's estimate is the photon's flux over eta and the cosine towards the light's side, to 1e-3; the flux
     is 1 / density of the events before it, times their adjoint factors.
     """
+    from mitsuba_bdpt.merging.merging import Merging
+    from mitsuba_bdpt.merging.radius import Radius
+
     kappa, rng, share, total = COEFFICIENTS[classes], np.random.default_rng(9), 0.3, 0
     for k in (4, 5):
         world = World(rng, 1000, k, lens, delta=0.5)
         centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
         radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
         with monkeypatch.context() as patch:
-            merges = merging.Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
+            merges = Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
             weights = kernel_weights(world, kappa, name, patch, merges)
         distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
         eta = count * np.pi * np.clip(angle * distance, low, high) ** 2

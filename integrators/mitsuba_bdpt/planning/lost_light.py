@@ -3,12 +3,11 @@
 Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
 reaches the sensor; no two neighbouring vertices can be connected. `possible.unreachable_paths` decides
 whether such paths are possible. The estimate merges a few thousand camera subpaths with as many photons, see
-`transport.photons.unsampled` for what it leaves out, and lamps seen in a mirror.
+`merging.unsampled` for what it leaves out, and lamps seen in a mirror.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import components
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
@@ -24,24 +24,12 @@ from ..settings import Settings
 from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
-from ..transport.photons import photon_pass, unsampled
-from ..transport.photons.aim import Aim
-from ..transport.photons.merge_radius import Footprints
-from ..transport.photons.merging import Merging
-from ..transport.photons.wavelength_sets import SETS, WavelengthSets
 from ..transport.plan import Plan
 from .possible import Start, unreachable_paths
 
 # Subpaths from either end. The noise of the estimate suffices for `WORTH_A_WORD`, not for a figure to rely
 # on; see experiments, "Vertex merging".
 SUBPATHS = 1 << 13
-
-# Merging radius in distances between camera samples on the film: discs overlap, and remain small relative to
-# the image.
-RADIUS = 1.5
-
-# Merging radius in pixels of `Footprints` where these cannot be measured: 1/64 of the scene's diagonal.
-UNMEASURED = 8.0
 
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
@@ -90,6 +78,8 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if plan.merging:  # which samples these paths
         return False
+    if components.why_absent("merging"):  # which estimates their light
+        return False
     lost = unreachable_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
@@ -105,15 +95,13 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings) -> LostLig
     batch = Batch(0, chosen, 0, SUBPATHS // chosen, spread=pixels)
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         kernel = delta_kernel(prepared, plan, settings)
-        photons, broken = photon_pass.trace_unsampled(kernel, _merging(prepared), points("sobol"), SUBPATHS)
-        kernel.merging = photons
-        found = unsampled.trace(kernel, batch, points("independent"))
+        found = components.merging.estimate(kernel, batch, SUBPATHS, points("sobol"), points("independent"))
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
     total = np.array(found.by_emitter).reshape(len(prepared.scene.emitters()), -1) / batch.size
     if mi.is_spectral:
         total = np.repeat(total.mean(axis=1, keepdims=True), total.shape[1], axis=1)
     if np.array(found.seen).any():
-        total[np.array(broken)] = np.nan
+        total[np.array(found.broken)] = np.nan
     finite = np.isfinite(total).all(axis=1)
     if not finite.all():
         _warn_of_not_finite(prepared, np.flatnonzero(~finite))
@@ -133,18 +121,6 @@ def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Ker
 def points(kind: str) -> Points:
     """Random numbers of an estimate, the same for all renders."""
     return Points(kind, dr.opaque(mi.UInt32, SEED))
-
-
-def _merging(prepared: PreparedScene) -> Merging:
-    """Merging of the estimate, without photons."""
-    footprints = Footprints.of(prepared.scene, prepared.camera.sensor)
-    of_samples = RADIUS * math.sqrt(prepared.camera.region.size.prod() / SUBPATHS)
-    radius = footprints.radius(of_samples if footprints.measured else UNMEASURED)
-    sets, wavelengths = 1, None
-    if mi.is_spectral:
-        sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
-    aim = Aim.of(prepared.scene, prepared.emitters)
-    return Merging(radius, dr.opaque(mi.Float, SUBPATHS / sets), mi.Float(1), aim, wavelengths=wavelengths)
 
 
 def _ids(shapes: np.ndarray, found: np.ndarray) -> tuple[str, ...]:

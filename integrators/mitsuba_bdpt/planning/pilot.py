@@ -42,6 +42,7 @@ from ..transport.batch import NET, NETS, Batch
 from ..transport.contribution import COUNTERS, Counters, one
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
+from ..transport.photons.guided_hits import Unguided
 from ..transport.plan import Plan
 from . import moments, sds_light
 from .configuration import CANDIDATES
@@ -311,7 +312,8 @@ def measure(
     guiding = guiding and everything.guidable
     if guiding:
         found = sds_light.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
-    kernel.without_isolated = found is not None or (everything.guidable and not guiding)
+    if found is not None or (everything.guidable and not guiding):
+        kernel.sds = Unguided()
     region, emission = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
         kernel.cells = components.guided_emission.Cells(prepared.emitters)

@@ -16,6 +16,7 @@ from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
+from ..transport.photons.guided_hits import Unguided
 from ..transport.photons.guiding_benefit import Estimator, Found, trace
 from ..transport.photons.photon_pass import photons_of, trace_guide
 from ..transport.plan import Plan
@@ -44,7 +45,7 @@ def measure(
     ]
     if made[0] is None or made[1] is None:
         return None
-    kernel.without_isolated = True
+    kernel.sds = Unguided()
     counts = dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, samples / SHARE)
     estimator = Estimator(made[0], made[1], *counts)
     region = prepared.camera.region

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import components
 from ..errors import UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
@@ -26,7 +28,7 @@ from ..planning.findings import Findings
 from ..planning.lost_light import LostLight
 from ..planning.planner import Planner
 from ..progress import Report
-from ..properties import check_film, check_merging, check_not_frozen, check_variant, integer
+from ..properties import check_film, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
@@ -34,15 +36,17 @@ from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
-from ..transport.photons.merge_radius import SHRINKING, Footprints
-from ..transport.photons.merging import Merging, coefficient
+from ..transport.photons.guided_hits import Guiding
 from ..transport.photons.photon_guide import Guide
-from ..transport.photons.wavelength_sets import SETS
 from ..transport.plan import Plan
+from ..transport.sds import SdsStrategy
 from . import messages
 from .schedule import REPLICATES, PassPoints, Step, batches, passes_since, schedule
 from .snapshot import Progress, Snapshot, identity
 from .statistics import Meter, rays
+
+if TYPE_CHECKING:
+    from ..merging import Passes
 
 
 @dataclass(frozen=True)
@@ -72,7 +76,8 @@ class Render:
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
-        check_merging(sensor, settings, self.prepared.space is not None)
+        if settings.merging:
+            components.merging.check(sensor, self.prepared.space is not None)
         self.findings = Findings(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
@@ -80,9 +85,12 @@ class Render:
         seed = mi.UInt32(seed)
         dr.make_opaque(seed)
         self.points = PassPoints(settings, seed)
-        self.footprints = Footprints.of(scene, sensor) if self.plan.merging else None
         aims = self.plan.merging or self.plan.guidable
         self.aim = Aim.of(scene, self.prepared.emitters) if aims else None
+        self.merging = None
+        if self.plan.merging:
+            pixels = int(self.prepared.camera.region.size.prod())
+            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels)
         features = None
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
@@ -226,9 +234,10 @@ class Render:
         """Trace one pass, with a launch for each batch."""
         first = not self.passes and self.planner.threshold is None
         if self.plan.guided:
-            self.kernel.guide = self._guide()
-        if self.plan.merging and self.footprints is not None:
-            self.kernel.merging = self._photons(step, self.footprints)
+            guide = self._guide()
+            self.kernel.sds = None if guide is None else Guiding(guide)
+        if self.plan.merging and self.merging is not None:
+            self.kernel.sds = self._photons(step, self.merging)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
@@ -242,28 +251,15 @@ class Render:
         if first and self.plan.roulette:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
 
-    def _photons(self, step: Step, footprints: Footprints) -> Merging:
-        """Trace the photons of a pass.
-
-        Their merging radius follows from the number of passes done of the same image or replicate.
-        """
-        done = passes_since(self.passes, step.done)
-        factor = self.settings.internals.merging_radius * (done + 1) ** ((SHRINKING - 1) / 2)  # in pixels
-        pixels = int(self.prepared.camera.region.size.prod())
-        count = photon_pass.photons_of_pass(step.size * pixels, pixels, factor)
-        changes = self.planner.changes
-        sets, wavelengths = 1, None
-        if mi.is_spectral:
-            sets, wavelengths = SETS, self.points.wavelengths(step, done, changes)
-            count = max(count // sets, 1) * sets
-        kappa = coefficient(step.size / sets, factor)
-        kappa, met = dr.opaque(mi.Float, kappa), dr.opaque(mi.Float, count / sets)
-        merging = Merging(footprints.radius(factor), met, kappa, self.aim, wavelengths=wavelengths)
+    def _photons(self, step: Step, merging: Passes) -> SdsStrategy:
+        """Trace the photons of a pass; returns their merging."""
+        done, changes = passes_since(self.passes, step.done), self.planner.changes
+        start = self.points.wavelengths(step, changes) if mi.is_spectral else None
         points = self.points.of_photons(step, done, changes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-            merging, counts = photon_pass.trace(self.kernel, merging, points, count)
+            photons, counts = merging.trace(self.kernel, points, step.size, done, start)
         self.meter.launched(counts)
-        return merging
+        return photons
 
     def _guide(self) -> Guide | None:
         """Return the photon guide, traced before the first pass; None without photons."""

@@ -12,7 +12,6 @@ from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, WAVELENGTHS, sequence_
 from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport.batch import Batch
-from ..transport.photons.wavelength_sets import WavelengthSets
 
 # Samples per kernel launch (four times as many in a launch of one row, see `batches`). Bounds the duration of
 # a launch (seconds on a few cores), and thus the delay of Ctrl-C, timeout and progress; it needs no memory.
@@ -128,10 +127,9 @@ class PassPoints:
         """
         return Points(self._kind, self._seed_of(step, changes, self.seed))
 
-    def wavelengths(self, step: Step, done: int, changes: int) -> WavelengthSets:
-        """Return the wavelengths of a merging pass, after ``done`` passes of its image."""
-        start, _ = sequential(self._seed_of(step, changes, sequence_seed(self.seed, WAVELENGTHS)))
-        return WavelengthSets.of(start, done)
+    def wavelengths(self, step: Step, changes: int) -> mi.Float:
+        """Return the number in [0, 1) from which the wavelengths of an image's merging passes follow."""
+        return sequential(self._seed_of(step, changes, sequence_seed(self.seed, WAVELENGTHS)))[0]
 
     def _seed_of(self, step: Step, changes: int, seed: mi.UInt32) -> mi.UInt32:
         """Return a seed from ``seed`` that is distinct by replicate and change of plan."""

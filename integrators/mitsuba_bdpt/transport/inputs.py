@@ -14,6 +14,7 @@ from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
 from .plan import Plan
+from .sds import SdsStrategy
 
 if TYPE_CHECKING:
     from ..guided_emission import Cells
@@ -116,12 +117,8 @@ class Kernel:
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
-        # `photons.merging.Merging` of a pass; None without merging.
-        self.merging = None
-        # `photons.photon_guide.Guide`; None without guiding.
-        self.guide = None
-        # Whether s = 0 skips paths on which it could be guided, see `photons.guiding_benefit`.
-        self.without_isolated = False
+        # The further strategy for SDS paths: that of a pass, or None.
+        self.sds: SdsStrategy | None = None
         # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 

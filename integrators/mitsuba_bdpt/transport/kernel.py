@@ -41,7 +41,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
             if z is a hit: d_vcm, d_vc <- in the area measure               walk._vertex
             a point of an emitter; direction of the next edge and BSDF      walk._interact
                 towards that point <- one virtual call
-            where vertices are merged: total += z merged with a photon      photons.merging
+            where vertices are merged: total += z merged with a photon      merging.merging
             s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
                         (eqs. 42, 43)
             s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event
@@ -86,7 +86,6 @@ A pilot has several light subpaths per camera sample, most without one; its esti
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -102,9 +101,8 @@ from . import (
 from .batch import Batch, Places, Sharing
 from .contribution import Counters, counted_by_camera, counted_by_light, counted_in_media, one
 from .inputs import Kernel, Observer, Shared
-from .photons import guided_hits, merging
 from .subpaths import CameraSample
-from .walk import is_sds_vertex, random_walk
+from .walk import random_walk
 
 
 @dataclass
@@ -241,9 +239,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
-    walk = subpaths.light_walk(kernel, e, stream, shared, plan.arrival)  # t = 0 samples SDS paths
-    guide = None if walk.only_delta is None else partial(guided_hits.look_back, kernel)
-    active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, guide)
+    sds = kernel.sds if plan.arrival else None  # t = 0 samples SDS paths
+    walk = subpaths.light_walk(kernel, e, stream, shared, sds)
+    active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)
     state = path, counted_by_light(plan, kernel.space)
     (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
     counters += counted + walk.counted(active)
@@ -272,9 +270,7 @@ def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Count
 
 def _camera_counters(kernel: Kernel) -> Counters:
     counters = counted_by_camera(kernel.plan, kernel.space)
-    if kernel.guide is not None:
-        counters += Counters.zeros("guided", "aimed")
-    return counters if kernel.merging is None else counters + Counters.zeros("merges")
+    return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
 
 
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
@@ -282,20 +278,13 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     sample = subpaths.camera_sample(kernel, lane.place, lane.shared, slot, active)
     active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
     walk = subpaths.camera_walk(kernel, sample, active)
-    side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha, _camera_guide(kernel))
+    side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha)
     visit = _camera_visit(kernel, sink, lane, sample)
     state = sink.begin(), _camera_counters(kernel)
     (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
     counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
     counters += walk.counted(active)
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
-
-
-def _camera_guide(kernel: Kernel):
-    """`Side.guide` of camera subpaths; None without guiding."""
-    if kernel.without_isolated:
-        return partial(guided_hits.mark, kernel)
-    return None if kernel.guide is None else partial(guided_hits.advise, kernel)
 
 
 def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
@@ -306,37 +295,16 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         c = contribution.drop_non_finite(c)
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
-    def merge(z, total, lost, merges):
-        c = merging.merge(kernel, z, sample.stream, shared.wavelength_set)
-        return *add(c, total, lost), merges + one(c.active)
-
-    def merged(z, walk, total, counted):
-        # A separate branch: few lanes are on an SDS path.
-        return dr.if_stmt(
-            (z, total, *counted),
-            is_sds_vertex(kernel, kernel.kappa.splat, walk, z),
-            merge,
-            lambda z, total, lost, merges: (total, lost, merges),
-            label="merges",
-        )
-
     def visit(z, state, walk):
         total, counters = state
-        if kernel.merging is not None:
-            counted = counters.non_finite, counters.merges
-            total, lost, merges = merged(z, walk, total, counted)
-            counters = replace(counters, non_finite=lost, merges=merges)
-        if kernel.guide is not None:
-            state = total, counters.non_finite, counters.aimed, counters.guided
-            state = guided_hits.follow(kernel, z, sample.stream, shared, add, state)
-            total, lost, aimed, traced = state
-            counters = replace(counters, non_finite=lost, aimed=aimed, guided=traced)
+        if kernel.sds is not None:
+            total, counters = kernel.sds.visit(kernel, z, walk, sample.stream, shared, add, state)
         if plan.hit:
             # A separate branch: few lanes hit an emitter.
             total, lost = dr.if_stmt(
                 (z, total, counters.non_finite),
                 techniques.sees_emitter(kernel, z),
-                lambda z, total, lost: add(techniques.hit_emitter(kernel, z), total, lost),
+                lambda z, total, lost: add(techniques.hit_emitter(kernel, z, kernel.sds), total, lost),
                 lambda z, total, lost: (total, lost),
                 label="s = 0",
             )

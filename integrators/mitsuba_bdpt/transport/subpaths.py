@@ -16,6 +16,7 @@ from ..sensors.records import CameraStart
 from . import mis, spectra, techniques
 from .batch import Places
 from .inputs import Kernel, Shared
+from .sds import SdsStrategy
 from .walk import Side, Walk, not_finite
 
 
@@ -39,11 +40,11 @@ def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
     if not mi.is_spectral:
         return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     number = None
-    if kernel.merging is None:
+    if kernel.sds is None or kernel.sds.wavelengths is None:
         u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
     else:
-        number = kernel.merging.wavelengths.number(index)
-        u = kernel.merging.wavelengths.u(number)
+        number = kernel.sds.wavelengths.number(index)
+        u = kernel.sds.wavelengths.u(number)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
     return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
 
@@ -66,8 +67,8 @@ def emission(kernel: Kernel, stream, shared):
     return e
 
 
-def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
-    """A light subpath on its first edge; ``merges``: its weights include merges."""
+def light_walk(kernel: Kernel, e, stream, shared, sds: SdsStrategy | None) -> Walk:
+    """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in its weights on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -77,16 +78,16 @@ def light_walk(kernel: Kernel, e, stream, shared, merges: bool) -> Walk:
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     # s = 0, which samples y_0 by a hit, is an older alternative.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
-    partial = mis.Partial(h.start(inverse_pdf), h.present(hit), _no_merges(kernel, merges))
+    partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
     edge = None
     if kernel.space is not None:
         edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
-    only_delta = mi.Bool(True) if merges and kernel.guide is not None else None
-    return replace(walk, broken=broken, only_delta=only_delta)
+    walk = replace(walk, broken=broken)
+    return walk if sds is None else sds.begin_light(kernel, walk)
 
 
-def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
+def light_side(kernel: Kernel, e, stream, shared, walk, sds: SdsStrategy | None) -> Side:
     """The `Side` of a light subpath."""
     return Side(
         "light",
@@ -97,7 +98,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk, guide=None) -> Side:
         kernel.kappa.direct,
         complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
         join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
-        guide=guide,
+        sds=sds,
     )
 
 
@@ -128,12 +129,10 @@ def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)
     walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
-    if kernel.guide is None and not kernel.without_isolated:
-        return walk
-    return replace(walk, isolated=mi.Bool(True), guided=mi.Float(0))
+    return walk if kernel.sds is None else kernel.sds.begin_camera(kernel, walk)
 
 
-def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False, guide=None) -> Side:
+def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False) -> Side:
     """The `Side` of a camera subpath."""
 
     def choose_emitter(z):
@@ -149,7 +148,7 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False,
         alpha=alpha,
         parallel=kernel.camera.parallel,
         join=choose_emitter if kernel.plan.direct else None,
-        guide=guide,
+        sds=kernel.sds,
     )
 
 
@@ -162,13 +161,7 @@ def _first_partial(kernel: Kernel, start):
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
         arrival = h.present(arrival)
-    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival, _no_merges(kernel, kernel.guide is None))
-
-
-def _no_merges(kernel: Kernel, asked: bool):
-    """Initial ``d_vm``; the number 0 where unused."""
-    used = kernel.merging is not None or kernel.guide is not None
-    return kernel.heuristic.zero() if asked and used else 0
+    return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
 
 
 def _first_edge(kernel: Kernel, side: str, stream, medium, ray):

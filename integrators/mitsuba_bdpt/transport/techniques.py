@@ -19,6 +19,7 @@ from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
+from .sds import SdsStrategy
 from .visibility import ShadowRay, seen
 from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit
 
@@ -35,8 +36,8 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     return active
 
 
-def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution:
-    """s = 0, or ``guided`` s = 0: the subpath has hit an emitter (eqs. 42, 43)."""
+def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribution:
+    """s = 0: the subpath has hit an emitter (eqs. 42, 43); ``sds``: the strategy beside it on SDS paths."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
     active = sees_emitter(kernel, z)
@@ -57,22 +58,11 @@ def hit_emitter(kernel: Kernel, z: Vertex, guided: bool = False) -> Contribution
         h.scale(z.partial.d_vcm, newest),
         h.scale(z.partial.d_vc, older),
     )
-    if kernel.merging is not None:  # on paths whose last edge is not connected either
-        emitted = kernel.merging.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
-        merges = h.scale(z.partial.d_vm, pdf_first * emitted)
+    sides = 0, camera_side
+    if sds is not None:
         joined = mis.is_joined(z.partial, newest)
-        camera_side = h.combine(camera_side, dr.select(joined, 0, merges))
-    light_side = 0
-    if z.guided is not None:  # the alternative of unguided or guided s = 0
-        joined = mis.is_joined(z.partial, newest)
-        other = h.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
-        if kernel.without_isolated:
-            active &= joined | (z.guided == 0)
-        elif guided:
-            light_side, active = other, active & ~joined
-        else:
-            camera_side = h.combine(camera_side, other)
-    weight, shares = h.weigh(kernel.kappa.hit, light_side, camera_side)
+        sides, active = sds.hit(kernel, z, joined, (pdf_first, pdf_second), sides, active)
+    weight, shares = h.weigh(kernel.kappa.hit, *sides)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
     emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
@@ -254,10 +244,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    if walk.isolated is not None:  # merges or guided s = 0, on paths whose last edge is not connected either
-        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
-        if kernel.merging is not None:
-            merges = h.scale(merges, kernel.merging.aim.density(emission) / emission.pdf_second)
+    if kernel.sds is not None and walk.sds is not None:  # the last edge is not connected either
+        merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
         light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     if z.surroundings is not None and kernel.emitters.at_infinity:

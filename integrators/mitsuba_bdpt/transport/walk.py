@@ -22,6 +22,7 @@ from . import bsdf, mis, scattering, spectra
 from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
+from .sds import SdsStrategy, State
 
 
 @dataclass
@@ -34,9 +35,7 @@ class Walk:
       edge; ``eta``: product of relative indices of refraction (1 if nothing refracts).
     * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
       ``edge``: its state along an edge, None without media.
-    * ``isolated``: no edge is connected by a strategy in use, see `merging` (None if unused).
-    * With guiding (`guided_hits`): ``guided``, on camera subpaths, the other density of the last non-delta
-      direction over its own; ``only_delta``, on light subpaths: all events were delta.
+    * ``sds``: see `sds.State`, None without a further strategy for SDS paths.
 
     Constants along a subpath are in `Side`: Dr.Jit records a loop twice if its state contains them.
     """
@@ -53,9 +52,7 @@ class Walk:
     broken: mi.Bool
     active: mi.Bool
     edge: Any = None  # a `media.flight.Edge`
-    isolated: mi.Bool | None = None
-    guided: mi.Float | None = None
-    only_delta: mi.Bool | None = None
+    sds: State | None = None
 
     @staticmethod
     def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
@@ -73,7 +70,6 @@ class Walk:
             broken=mi.Bool(False),
             active=active,
             edge=edge,
-            isolated=None if mis.is_absent(partial.d_vm) else mi.Bool(True),
         )
 
     @property
@@ -120,13 +116,13 @@ class Vertex:
     event: mi.UInt32
     volume: mi.Bool | None = None
     landing: Any = None  # a `media.flight.Landing`
-    # Set with a `Side.join`: its result, and an `Evaluation`.
-    endpoint: Any = None
+    # Set with a `Side.join`.
+    endpoint: Any = None  # a `Direct`, or a `CameraConnection`
     endpoint_active: Any = None
-    f: Any = None
-    # Set with guiding: `Walk.guided` on arrival, and a `guided_hits.Advice`.
-    guided: Any = None
-    advice: Any = None
+    f: Any = None  # a `bsdf.Evaluation`
+    # Set with guiding: `sds.State.guided` on arrival, and the guide.
+    guided: mi.Float | None = None
+    advice: Any = None  # an `sds.Advice`
 
     @property
     def edge(self) -> Any:
@@ -174,7 +170,6 @@ class Side:
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
     * ``join``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
       `Sensor.join`) and its `bsdf.Target`; None if no strategy does so.
-    * ``guide``, of each vertex, the walk before it and the step after it: its `guided_hits.Advice`.
     """
 
     name: str
@@ -189,7 +184,7 @@ class Side:
     join: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_delta: bool = False
-    guide: Callable[[Vertex, Walk, Any], Any] | None = None
+    sds: SdsStrategy | None = None
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
@@ -297,7 +292,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         event=walk.event,
         volume=volume,
         landing=landing,
-        guided=walk.guided,
+        guided=None if walk.sds is None else walk.sds.guided,
     )
 
 
@@ -337,8 +332,8 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.event)
     sampled = _is_sampled(side, walk, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
-    if side.guide is not None:
-        vertex.advice = side.guide(vertex, walk, step)
+    if side.sds is not None:
+        vertex.advice = side.sds.advise(kernel, side.adjoint, vertex, walk, step)
     return step
 
 
@@ -371,8 +366,7 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if side.adjoint:
         first = where_lit(kernel, first, is_lit(kernel, vertex))
     coefficient = newest_coefficient(kernel, first, walk.edges)
-    isolated, only_delta = _isolated(walk, vertex, coefficient, step), None
-    merge = _merge(kernel, walk, vertex, isolated)
+    sds, merge = _sds(kernel, side, walk, vertex, coefficient, step)
     partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
@@ -381,12 +375,10 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     # BSDFs take a non-finite shading frame (vertex normals) for a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    if side.isolated and isolated is not None:
-        active &= isolated
+    if side.isolated and sds is not None:
+        active &= sds.isolated
     if side.only_delta:
         active &= step.delta
-    if walk.only_delta is not None:
-        only_delta = walk.only_delta & step.delta
     # Roulette as in `path`; weights ignore it.
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
@@ -409,40 +401,32 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         seen=seen,
         broken=broken,
         active=active,
-        isolated=isolated,
-        guided=_guided(h, walk, vertex, step),
-        only_delta=only_delta,
+        sds=sds,
     )
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
     return _traced(kernel, after, ray, passes)
 
 
-def _merge(kernel: Kernel, walk: Walk, vertex: Vertex, isolated):
-    """The `mis.Merge` at ``vertex``; ``isolated``: `Walk.isolated` after its event.
+def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
+    """`Walk.sds` after the event, and the `mis.Merge` at ``vertex``, or None.
 
-    With guiding, on light subpaths its equivalent: the density of the direction they came from.
+    ``coefficient``: that of the class that connects the edge to it.
     """
-    if mis.is_absent(walk.partial.d_vm):
-        return None
-    if kernel.merging is not None:
-        return mis.Merge(kernel.heuristic.start(kernel.merging.weighed(vertex.si.p)), isolated)
-    return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other), isolated)
-
-
-def _isolated(walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """`Walk.isolated` after the event; ``coefficient``: class that connects the edge."""
-    if walk.isolated is None:
-        return None
-    return walk.isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
-
-
-def _guided(h: mis.Heuristic, walk: Walk, vertex: Vertex, step):
-    """`Walk.guided` after the event at ``vertex``; delta events do not change it."""
-    if walk.guided is None or vertex.advice is None:  # guided subpaths follow delta events only
-        return walk.guided
-    other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
-    return dr.select(step.delta, walk.guided, h.start(other))
+    if walk.sds is None:
+        return None, None
+    isolated, only_delta, guided = walk.sds.isolated, walk.sds.only_delta, walk.sds.guided
+    if isolated is not None:
+        isolated = isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
+    if only_delta is not None:
+        only_delta = only_delta & step.delta
+    if guided is not None and vertex.advice is not None:  # guided subpaths follow delta events only
+        other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
+        guided = dr.select(step.delta, guided, kernel.heuristic.start(other))
+    merge = None
+    if side.sds is not None and not mis.is_absent(walk.partial.d_vm):
+        merge = side.sds.merge(kernel, vertex, isolated)
+    return State(isolated, only_delta, guided), merge
 
 
 def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
@@ -455,7 +439,8 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
     possible = vertex.hit & vertex.connectible() & ~joined & (vertex.edges < kernel.max_depth)
     if vertex.volume is not None:
         possible &= ~vertex.volume
-    return possible if walk.isolated is None else possible & walk.isolated
+    isolated = None if walk.sds is None else walk.sds.isolated
+    return possible if isolated is None else possible & isolated
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:

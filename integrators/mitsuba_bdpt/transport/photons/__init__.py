@@ -1,8 +1,7 @@
 """Photons: stored vertices of light subpaths traced before the samples.
 
-`photon_pass` traces them. `merging` merges camera vertices with them (vertex merging, photon mapping) within
-`merge_radius`. `photon_guide` builds a density of directions from them, from which `guided_hits` samples
-(photon-guided BSDF sampling); `guiding_benefit` predicts the gain. `unsampled` estimates the light that no
-strategy samples. `aim` samples their first directions. All serve SDS paths (specular-diffuse-specular), which
-no connection can sample.
+`photon_pass` traces them. The component `merging` merges camera vertices with them (vertex merging, photon
+mapping). `photon_guide` builds a density of directions from them, from which `guided_hits` samples
+(photon-guided BSDF sampling); `guiding_benefit` predicts the gain. `aim` samples their first directions. All
+serve SDS paths (specular-diffuse-specular), which no connection can sample.
 """

@@ -13,7 +13,7 @@ first of the light subpath that is not delta.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -24,6 +24,7 @@ from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, spectra, techniques
 from ..contribution import one
 from ..inputs import Kernel
+from ..sds import Advice, SdsStrategy, State, begun
 from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide
 
@@ -31,17 +32,99 @@ from . import photon_guide
 _SEED = 0x5BD1E995
 
 
-@dataclass
-class Advice:
-    """The guide at a vertex: ``active`` where s = 0 can be guided.
+class Guiding(SdsStrategy):
+    """Photon-guided BSDF sampling by a ``guide``."""
 
-    ``found``: index of its photons; ``other``: density of the walk's own direction by the guide (solid angle,
-    times the number of guided samples).
-    """
+    counters = ("aimed", "guided")
 
-    active: mi.Bool
-    found: mi.UInt32
-    other: mi.Float
+    def __init__(self, guide: photon_guide.Guide):
+        self.guide = guide
+
+    def begin_light(self, kernel, walk):
+        state = State(isolated=mi.Bool(True), only_delta=mi.Bool(True))
+        return begun(walk, state, kernel.heuristic.zero())
+
+    def begin_camera(self, kernel, walk):
+        return begun(walk, State(isolated=mi.Bool(True), guided=mi.Float(0)))
+
+    def advise(self, kernel, adjoint, vertex, walk, step) -> Advice:
+        """At a light vertex ``other`` is that of the direction that the subpath came from."""
+        if adjoint:
+            possible = is_sds_vertex(kernel, kernel.kappa.direct, walk, vertex) & walk.sds.only_delta
+            return self._evaluated(kernel, vertex, -walk.d, possible)
+        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
+        return self._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
+
+    def _evaluated(self, kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
+        def look(p, d):
+            found = photon_guide.find(self.guide, p)
+            return Advice(mi.Bool(True), found, self.density(kernel, p, found, d))
+
+        def nothing(p, d):
+            return Advice(mi.Bool(False), mi.UInt32(0), mi.Float(0))
+
+        return dr.if_stmt((mi.Point3f(vertex.si.p), d), active, look, nothing, label="guide")
+
+    def density(self, kernel: Kernel, p, found, d) -> mi.Float:
+        """Density of ``d`` by the guide, times the number of guided samples."""
+        return kernel.plan.guided * photon_guide.density(self.guide, p, found, d)
+
+    def merge(self, kernel, vertex, isolated) -> mis.Merge:
+        """The density of the direction that a light subpath came from takes the place of a merge's."""
+        return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other), isolated)
+
+    def visit(self, kernel, z, walk, stream, shared, add, state):
+        """Trace guided subpaths from ``z`` where the guide is active."""
+        total, counters = state
+        total, lost, aimed, traced = dr.if_stmt(
+            (z, total, counters.non_finite, counters.aimed, counters.guided),
+            z.advice.active,
+            lambda z, *state: _follow_all(kernel, self, z, stream, shared, add, state),
+            lambda z, *state: state,
+            label="guided subpaths",
+        )
+        return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
+
+    def hit(self, kernel, z, joined, densities, sides, active):
+        light_side, camera_side = sides
+        return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, joined))), active
+
+
+class _Guided(SdsStrategy):
+    """The same at the end of a guided subpath, whose alternative is s = 0 by the BSDF."""
+
+    def hit(self, kernel, z, joined, densities, sides, active):
+        return (_other(kernel, z, joined), sides[1]), active & ~joined
+
+
+class Unguided(Guiding):
+    """Leaves out s = 0 where it could be guided, in a pilot; see `guiding_benefit`."""
+
+    counters = ()
+
+    def __init__(self):
+        pass
+
+    def begin_light(self, kernel, walk):
+        return walk
+
+    def advise(self, kernel, adjoint, vertex, walk, step) -> Advice | None:
+        """A guide that has the BSDF's density of the walk's direction."""
+        if adjoint:
+            return None
+        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
+        return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
+
+    def visit(self, kernel, z, walk, stream, shared, add, state):
+        return state
+
+    def hit(self, kernel, z, joined, densities, sides, active):
+        return sides, active & (joined | (z.guided == 0))
+
+
+def _other(kernel: Kernel, z: Vertex, joined: mi.Bool) -> mis.PartialSum:
+    """Ratio of the other density of the path to its own: s = 0 by the guide and by the BSDF."""
+    return kernel.heuristic.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
 
 
 def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
@@ -50,81 +133,31 @@ def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
     return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED))
 
 
-def advise(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """The guide at the camera vertex ``z``; ``walk`` as before its arrival."""
-    return _evaluated(kernel, z, z.si.to_world(step.wo), is_sds_vertex(kernel, kernel.kappa.splat, walk, z))
-
-
-def look_back(kernel: Kernel, y: Vertex, walk: Walk, step) -> Advice:
-    """The guide at the light vertex ``y``; ``other`` of the incident direction.
-
-    ``step`` is not used: `Side.guide` passes it.
-    """
-    possible = is_sds_vertex(kernel, kernel.kappa.direct, walk, y) & walk.only_delta
-    return _evaluated(kernel, y, -walk.d, possible)
-
-
-def mark(kernel: Kernel, z: Vertex, walk: Walk, step) -> Advice:
-    """Like `advise`, for a guide with the BSDF's density of the walk's direction."""
-    possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
-    return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
-
-
-def _evaluated(kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
-    def look(p, d):
-        found = photon_guide.find(kernel.guide, p)
-        return Advice(mi.Bool(True), found, _density(kernel, p, found, d))
-
-    def nothing(p, d):
-        return Advice(mi.Bool(False), mi.UInt32(0), mi.Float(0))
-
-    return dr.if_stmt((mi.Point3f(vertex.si.p), d), active, look, nothing, label="guide")
-
-
-def _density(kernel: Kernel, p, found, d) -> mi.Float:
-    return kernel.plan.guided * photon_guide.density(kernel.guide, p, found, d)
-
-
-def follow(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
-    """Trace guided subpaths from ``z`` where the guide is active.
-
-    ``state``: a total, to which ``add(c, total, lost)`` adds a contribution, and the numbers of non-finite
-    values, `Counters.aimed` and `Counters.guided`. Returns the new state.
-    """
-    return dr.if_stmt(
-        (z, *state),
-        z.advice.active,
-        lambda z, *state: _follow_all(kernel, z, stream, shared, add, state),
-        lambda z, *state: state,
-        label="guided subpaths",
-    )
-
-
 @dr.syntax
-def _follow_all(kernel: Kernel, z: Vertex, stream: Stream, shared, add, state):
+def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, shared, add, state):
     number = mi.UInt32(0)
     while dr.hint(
         number < kernel.plan.guided,
         label="guided subpaths of a vertex",
-        exclude=[kernel, z, stream, shared, add],
+        exclude=[kernel, guiding, z, stream, shared, add],
     ):
-        state = _follow_one(kernel, z, _numbers(stream, z.event, number), shared, add, state)
+        state = _follow_one(kernel, guiding, z, _numbers(stream, z.event, number), shared, add, state)
         number += 1
     return state
 
 
-def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
+def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared, add, state):
     def visit(vertex, state, walk):
         return dr.if_stmt(
             (vertex, *state),
             techniques.sees_emitter(kernel, vertex),
-            lambda v, total, lost: add(techniques.hit_emitter(kernel, v, True), total, lost),
+            lambda v, total, lost: add(techniques.hit_emitter(kernel, v, _Guided()), total, lost),
             lambda v, total, lost: (total, lost),
             label="guided s = 0",
         )
 
     total, lost, aimed, traced = state
-    walk = _begun(kernel, z, numbers, shared)
+    walk = _begun(kernel, guiding, z, numbers, shared)
     side = Side(
         "camera",
         shared,
@@ -140,13 +173,13 @@ def _follow_one(kernel: Kernel, z: Vertex, numbers: Stream, shared, add, state):
     return total, lost + one(walk.broken), aimed + one(begun), traced
 
 
-def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
+def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared) -> Walk:
     """A subpath that leaves ``z`` in a direction sampled from the guide."""
     h, p, points = kernel.heuristic, z.si.p, kernel.points
     u1 = points.draw_1d("camera", numbers, Purpose.LOBE, z.event)
     u2 = points.draw_2d("camera", numbers, Purpose.BSDF, z.event)
-    d, active = photon_guide.draw(kernel.guide, p, z.advice.found, u1, u2)
-    pdf, local = _density(kernel, p, z.advice.found, d), z.si.to_local(d)
+    d, active = photon_guide.draw(guiding.guide, p, z.advice.found, u1, u2)
+    pdf, local = guiding.density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
     throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)
@@ -158,4 +191,4 @@ def _begun(kernel: Kernel, z: Vertex, numbers: Stream, shared) -> Walk:
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
     guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
-    return replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, guided=guided)
+    return replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=State(guided=guided))

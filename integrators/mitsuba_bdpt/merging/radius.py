@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...geometry.boxes import scene_box
-from ...geometry.rounding import OFFSET_ULPS, offset_at
-from ...host.introspection import world_matrix
+from ..geometry.boxes import scene_box
+from ..geometry.rounding import OFFSET_ULPS, offset_at
+from ..host.introspection import world_matrix
 
 # Columns and rows of camera rays that measure the size of pixels in the scene.
 _PROBES = 64

@@ -1,11 +1,8 @@
 """Vertex merging (photon mapping) of SDS paths.
 
-Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can sample. An edge is *joined*
-if a strategy in use connects its ends: neither end is a delta event, and the strategy's class has a
-coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to the sensor, inner
-connections for the others). An *SDS path* (specular-diffuse-specular) has no joined edge: lamp, glass, wall,
-glass, camera. Only s = 0, t = 0 and merging sample it: both subpaths are traced up to the same diffuse
-vertex, and a photon within a radius of the camera vertex counts as if it were there.
+Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can sample (see `sds`). Both
+subpaths are traced up to the same diffuse vertex, and a photon within a radius of the camera vertex counts as
+if it were there.
 
 With n photon subpaths, discs of radius r(x) about camera vertices, area measure, p-> densities of the light
 subpath and p<- of the camera subpath::
@@ -18,22 +15,23 @@ and kappa n p_m in the weights. The estimate is consistent, not unbiased.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ...sampling import sobol
-from ...sampling.points import Purpose, Stream, sequential
-from ...sampling.reservoir import offer
-from .. import bsdf, mis, spectra
-from ..contribution import Contribution, size_of
-from ..inputs import Kernel
-from ..walk import Vertex
-from .aim import Aim
-from .merge_radius import Radius
-from .photon import Photon, same_surface
+from ..sampling import sobol
+from ..sampling.points import Purpose, Stream, sequential
+from ..sampling.reservoir import offer
+from ..transport import bsdf, mis, spectra
+from ..transport.contribution import Contribution, one, size_of
+from ..transport.inputs import Kernel
+from ..transport.photons.aim import Aim
+from ..transport.photons.photon import Photon, same_surface
+from ..transport.sds import SdsStrategy, State, begun
+from ..transport.walk import Vertex, is_sds_vertex
+from .radius import Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
 
 # Bits of a bucket's index in the hash table, and of each coordinate of a cell.
@@ -45,7 +43,7 @@ _FLAT = 0.25
 
 
 @dataclass
-class Merging:
+class Merging(SdsStrategy):
     """Vertex merging in one pass.
 
     ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
@@ -61,6 +59,8 @@ class Merging:
     photons: Any = None
     wavelengths: WavelengthSets | None = None
 
+    counters = ("merges",)
+
     def eta(self, p: mi.Point3f) -> mi.Float:
         """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
         return self.count * dr.pi * dr.square(self.radius.at(p))
@@ -68,6 +68,40 @@ class Merging:
     def weighed(self, p: mi.Point3f) -> mi.Float:
         """`eta` with its coefficient, as in weights."""
         return self.kappa * self.eta(p)
+
+    def begin_light(self, kernel, walk):
+        return begun(walk, State(isolated=mi.Bool(True)), kernel.heuristic.zero())
+
+    begin_camera = begin_light
+
+    def merge(self, kernel, vertex, isolated) -> mis.Merge:
+        return mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), isolated)
+
+    def visit(self, kernel, z, walk, stream, shared, add, state):
+        total, counters = state
+
+        def merged(z, total, lost, merges):
+            c = merge(kernel, self, z, stream, shared.wavelength_set)
+            return *add(c, total, lost), merges + one(c.active)
+
+        # A separate branch: few lanes are on an SDS path.
+        total, lost, merges = dr.if_stmt(
+            (z, total, counters.non_finite, counters.merges),
+            is_sds_vertex(kernel, kernel.kappa.splat, walk, z),
+            merged,
+            lambda z, total, lost, merges: (total, lost, merges),
+            label="merges",
+        )
+        return total, replace(counters, non_finite=lost, merges=merges)
+
+    def hit(self, kernel, z, joined, densities, sides, active):
+        h, (light_side, camera_side), (pdf_first, pdf_second) = kernel.heuristic, sides, densities
+        emitted = self.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
+        merges = h.scale(z.partial.d_vm, pdf_first * emitted)
+        return (light_side, h.combine(camera_side, dr.select(joined, 0, merges))), active
+
+    def arrive(self, kernel, merges, emission):
+        return kernel.heuristic.scale(merges, self.aim.density(emission) / emission.pdf_second)
 
 
 def coefficient(samples: float, radius: float) -> float:
@@ -137,14 +171,13 @@ class Sample:
     active: mi.Bool
 
 
-def sample(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
+def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
     """Draw a photon near the camera vertex ``z`` by flux.
 
     Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
     """
-    merging = kernel.merging
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
-    chosen, total = _draw(kernel, z, word, wavelength_set)
+    chosen, total = _draw(merging, z, kernel.max_depth - z.edges, word, wavelength_set)
     active = z.hit & (total > 0)
     photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
@@ -155,10 +188,9 @@ def sample(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Sa
     return Sample(photon, f, value, active & ~spectra.is_zero(value))
 
 
-def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
+def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
     """Merge the camera vertex ``z`` with one photon near it, see `sample`."""
-    h, merging = kernel.heuristic, kernel.merging
-    drawn = sample(kernel, z, stream, wavelength_set)
+    h, drawn = kernel.heuristic, sample(kernel, merging, z, stream, wavelength_set)
     photon, f = drawn.photon, drawn.f
     light_side = h.scale(photon.older, f.pdf_fwd_w)
     # t = 0, the oldest alternative of the camera's side, does not sample longer paths.
@@ -170,19 +202,18 @@ def merge(kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Con
 
 
 @dr.syntax
-def _draw(kernel: Kernel, z: Vertex, word: mi.UInt32, wavelength_set):
-    """Draw a photon in the disc at ``z`` by flux; returns its index and total flux."""
-    radius, photons = kernel.merging.radius, kernel.merging.photons
+def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
+    """Draw a photon of at most ``most`` edges in the disc at ``z`` by flux; its index, total flux."""
+    radius, photons = merging.radius, merging.photons
     r = radius.at(z.si.p)
     lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
     corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8
     corner, place, end = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
     cell, chosen, total = mi.UInt64(0), mi.UInt32(0), mi.Float(0)
-    most = kernel.max_depth - z.edges
     while dr.hint(
         (corner < corners) | (place < end),
         label="photons near a camera vertex",
-        exclude=[kernel, z, wavelength_set, radius, photons, r, lowest, corners, most],
+        exclude=[z, wavelength_set, radius, photons, r, lowest, corners, most],
     ):
         through = place >= end  # the next cell
         there = cell_at(radius, z.si.p, lowest + (corner >> 3), wavelength_set, corner & 7)

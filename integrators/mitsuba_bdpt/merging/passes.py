@@ -1,0 +1,104 @@
+"""Vertex merging in the passes of a render: photons, radius, coefficient."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UnsupportedError
+from ..host.introspection import named
+from ..sampling.points import Points
+from ..settings import Settings
+from ..transport.inputs import Kernel
+from ..transport.photons import photon_pass
+from ..transport.photons.aim import Aim
+from ..transport.photons.photon import Photon
+from ..transport.photons.photon_pass import Kept
+from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
+from .radius import SHRINKING, Footprints
+from .wavelength_sets import SETS, WavelengthSets
+
+# Camera samples of a pass per photon subpath.
+SAMPLES_PER_PHOTON = 8
+
+# Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
+_PER_DISC = 64
+
+# Bits of the edges and of the subpath's index in the sort key of photons.
+_EDGES_BITS, _LANE_BITS = 12, 32
+
+
+def check(sensor: mi.Sensor, media: bool):
+    """Raise ``UnsupportedError`` where vertex merging is not possible.
+
+    ``media``: whether the scene has participating media.
+    """
+    if sensor.shutter_open_time() > 0:
+        raise UnsupportedError(
+            f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
+            "subpaths have different times; set shutter_close to shutter_open, or leave out merging"
+        )
+    if media:
+        raise UnsupportedError(
+            "merging in scenes with participating media is not supported; leave out merging"
+        )
+
+
+class Passes:
+    """Vertex merging in one render of ``pixels`` pixels; ``aim`` of the photons."""
+
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, aim: Aim, pixels: int):
+        self._footprints = Footprints.of(scene, sensor)
+        self._radius, self._aim, self._pixels = settings.internals.merging_radius, aim, pixels
+
+    def trace(
+        self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None
+    ) -> tuple[Merging, mi.UInt64]:
+        """Trace the photons of a pass; returns its strategy, and counters.
+
+        ``samples`` of each pixel; ``done``: passes of the same image or replicate, from which the radius
+        follows; ``start``: see `WavelengthSets.of`, in spectral variants.
+        """
+        radius = self._radius * (done + 1) ** ((SHRINKING - 1) / 2)  # in pixels
+        count = photons_of_pass(samples * self._pixels, self._pixels, radius)
+        sets, wavelengths = 1, None
+        if start is not None:
+            sets, wavelengths = SETS, WavelengthSets.of(start, done)
+            count = max(count // sets, 1) * sets
+        kappa, met = (dr.opaque(mi.Float, x) for x in (coefficient(samples / sets, radius), count / sets))
+        merging = Merging(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
+        return trace(kernel, merging, points, count)
+
+
+def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
+    """Number of photon subpaths of a pass with merging; ``radius`` in pixels."""
+    most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
+    return min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most)
+
+
+def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
+    """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
+    traced = photon_pass.trace(kernel, merging, merging.aim, points, count, Kept.MERGED)
+    return replace(merging, photons=sort(merging, traced.photons, traced.count)), traced.counters
+
+
+def sort(merging: Merging, photons: Photon, count: int) -> Photons:
+    """Sort the first ``count`` photons by bucket, subpath and edge: deterministic."""
+    index = dr.arange(mi.UInt32, max(count, 1))  # without photons one in no bucket
+    found = photons.at(index)
+    radius = merging.radius
+    sets = merging.wavelengths
+    number = None if sets is None else sets.number(found.lane)
+    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)), number)
+    bucket = bucket_of(cell)
+    key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
+    order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
+    counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
+    dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
+    starts = dr.cumsum(counts)
+    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
+    dr.eval(result)
+    return result

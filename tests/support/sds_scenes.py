@@ -1,0 +1,106 @@
+"""Scenes of SDS paths: a floor under a plate of glass, lamp and camera above."""
+
+import internals
+import mitsuba as mi
+import numpy as np
+import views
+
+LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
+
+
+IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
+
+
+def transform():
+    return mi.ScalarTransform4f()
+
+
+def matte(value=ALBEDO):
+    return {"type": "diffuse", "reflectance": value}
+
+
+def point():
+    return {"type": "point", "position": list(LAMP), "intensity": INTENSITY}
+
+
+def ball(radius=0.5):
+    return {
+        "type": "sphere",
+        "center": list(LAMP),
+        "radius": radius,
+        "bsdf": matte(0.0),
+        "emitter": {"type": "area", "radiance": 10.0},
+    }
+
+
+def glass():
+    return {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
+
+
+def under_glass(light, floor=None, plate=None, kind="perspective", **more):
+    """The scene; ``more`` of its entries."""
+    lens = {"aperture_radius": 0.3, "focus_distance": 3.0} if kind == "thinlens" else {}
+    eye = views.camera(kind, origin=CAMERA, target=(0, 0, 0), fov=FOV, size=SIZE, **lens)
+    to_world = transform().translate([0, 0, 0.5]).scale([4, 4, THICKNESS / 2])
+    return {
+        "type": "scene",
+        "sensor": eye,
+        "floor": {"type": "rectangle", "to_world": transform().scale(4), "bsdf": floor or matte()},
+        "plate": {"type": "cube", "to_world": to_world, "bsdf": plate or glass()},
+        "light": light,
+        **more,
+    }
+
+
+def images(scene, spp, seeds, first=0, **parameters):
+    """(seeds, height, width) of the first colour."""
+    scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
+    method = internals.bdpt(**{"max_depth": 6, "rr_depth": 100, **parameters})
+    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
+    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+
+
+def bumpy(bsdf):
+    rng = np.random.default_rng(2)
+    heights = mi.Bitmap(rng.random((16, 16, 1), dtype=np.float32) * 0.02)
+    texture = {"type": "bitmap", "bitmap": heights, "raw": True}
+    return {"type": "bumpmap", "arbitrary": texture, "bsdf": bsdf}
+
+
+def mirror():
+    """Beside the floor, so that the camera sees it there too."""
+    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
+
+
+CASES = {
+    "diffuse": {},
+    "plastic": {"floor": {"type": "plastic"}},
+    "rough metal": {"floor": {"type": "roughconductor", "alpha": 0.3}},
+    "rough glass above": {"plate": {"type": "thindielectric"}},
+    "bumpy glass": {"plate": bumpy},
+    "bumpy floor": {"floor": bumpy},
+    "masked floor": {"floor": {"type": "mask", "opacity": 0.6, "bsdf": {"type": "diffuse"}}},
+    "mirror": {"mirror": mirror},
+    "lens": {"kind": "thinlens"},
+}
+
+
+CHANGES = {
+    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
+    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
+    "hidden lamp": {"bdpt": {"hide_emitters": True}},
+    "features": {"bdpt": {"aovs": "dd:depth"}},
+    "instance": {},
+}
+
+
+def strategy_images(scene, spp, seeds, **more):
+    """Images and layers of the first colour by name, each (seeds, height, width)."""
+    parameters = {"max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
+    method = internals.bdpt(**parameters | {"layers": "strategies"} | more)
+    found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
+    found = np.array(found, dtype=np.float64)
+    names = method.aov_names()
+    assert found.shape[-1] == 3 + len(names)
+    return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
