@@ -973,7 +973,7 @@ REFUSED_PARTS = {
                 "emitter": AREA_LIGHT,
             }
         },
-        "emitter '.*' is on a shape that Mitsuba does not tell .*use shape type ellipsoids, or a mesh",
+        "emitter '.*' is on a shape that Mitsuba does not name .*use shape type ellipsoids, or a mesh",
     ),
     "mirrored cylinder": (
         lambda _: {"lamp": {"type": "cylinder", "to_world": MIRRORED, "emitter": AREA_LIGHT}},
