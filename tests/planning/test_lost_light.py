@@ -515,6 +515,23 @@ def test_edits_of_what_is_around_a_lamp_are_seen():
     assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[1] > 0.001
 
 
+def test_each_render_of_a_scene_has_its_own_hidden_emitters():
+    """Rationale: the estimate of an earlier render is cached; camera rays pass through a lamp that is hidden.
+    Expected: behind a lamp nothing is lost where it is shown, and the light through the glass where it is
+    hidden, as in a scene without it (within 15 %, by the noise of the image).
+    """
+    shade = lamp_with_area([0, 3, 2.25], 0.7)  # right before the camera
+    scene, alone = (scene_of(LAMPS["point"], block=BLOCK, **more) for more in ({"shade": shade}, {}))
+    found = []
+    for hidden in (False, True):
+        render = Render(scene, scene.sensors()[0], bdpt(hide_emitters=hidden).settings, 0, 16)
+        lost = render._lost()
+        found.append(sum(lost.radiance.values()) if lost else 0.0)
+    render = Render(alone, alone.sensors()[0], bdpt().settings, 0, 16)
+    expected = lost_light.estimate(render.prepared, render.plan, render.settings).radiance
+    assert found[0] == 0 and found[1] == pytest.approx(sum(expected.values()), rel=0.15)
+
+
 def test_nothing_is_looked_for_where_no_light_subpath_starts():
     """Rationale: a lamp of a user's own class without area emits no light subpath that could be followed
     through glass. Expected: the render ends, without a word."""

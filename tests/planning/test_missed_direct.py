@@ -80,7 +80,13 @@ BEAM = {
 
 def of_plan(sensor, lamp, method=None, **others):
     """The warnings before a render, which is not made."""
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp} | others, optimize=False)
+    return of_scene(
+        mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp} | others, optimize=False), method
+    )
+
+
+def of_scene(scene, method):
+    """The same, of a loaded scene."""
     settings = mi.load_dict({"type": "bdpt", "max_depth": 4} | (method or {})).settings
     render = Render(scene, scene.sensors()[0], settings, 0, 1)
     found = missed_direct.warnings(render.prepared, render.plan, settings, render.findings)
@@ -98,6 +104,16 @@ def test_missing_light_through_glass_is_said(lamp):
     assert "'bulb' shines through glass or mirrors on" in warning and "leave light_paths at auto" in warning
     assert of_plan(meter(), lamp, pane=GLASS) == []
     assert of_plan(meter(), lamp, WITHOUT, pane=GLASS, blind=BLIND) == []
+
+
+def test_each_render_of_a_scene_has_its_own_hidden_emitters():
+    """Rationale: what an earlier render of the scene found is cached. Expected: direct light of a beam is
+    missing where emitters are shown, and only there, in every order of renders.
+    """
+    hidden = [{"hide_emitters": value} for value in (True, False, True)]
+    scene = mi.load_dict({"type": "scene", "sensor": meter(), "lamp": BEAM}, optimize=False)
+    found = [len(of_scene(scene, WITHOUT | parameters)) for parameters in hidden]
+    assert found == [0, 1, 0]
 
 
 def test_missing_light_through_glass_in_fog_is_said():

@@ -45,7 +45,8 @@ def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str
     """Warning about light of ``paths`` that end at the sensor; empty if none arrives."""
     direct = Start.DIRECT_DELTA_EMITTER in paths.starts
     look = partial(_arriving, prepared, plan, settings, direct)
-    found, _ = findings.find("missed direct light", (direct, settings.max_depth), look)
+    key = direct, settings.max_depth, settings.hide_emitters
+    found, _ = findings.find("missed direct light", key, look)
     if not found:
         return ""
     emitters = [prepared.scene.emitters()[i] for i in found[:NAMED]]

@@ -357,11 +357,12 @@ class Render:
 
         Estimated once per scene and plan, and again after edits.
         """
-        prepared, plan, max_depth = self.prepared, self.plan, self.settings.max_depth
-        if not lost_light.is_possible(prepared, plan, self.settings):
+        prepared, plan, settings = self.prepared, self.plan, self.settings
+        if not lost_light.is_possible(prepared, plan, settings):
             return None
-        look = partial(lost_light.estimate, prepared, plan, self.settings)
-        lost, _ = self.findings.find("lost light", (plan.splat, plan.direct, max_depth), look)
+        look = partial(lost_light.estimate, prepared, plan, settings)
+        key = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters
+        lost, _ = self.findings.find("lost light", key, look)
         return lost if lost.colours else None
 
     def predicted_loss(self) -> str:
