@@ -136,7 +136,7 @@ PREDICTED = {
     "n0c0, kappa of s=1": replace(ALONE, kappa_direct=1 / 16),
     "n1c0": SPLATS,
     "n1c1": replace(BOTH, connections="all"),
-    "n1c1, one": CONNECTED,
+    "n1c1, one": Configuration(1 / 2, "one", 1 / 2, 1.0),
 }
 
 
