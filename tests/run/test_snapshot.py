@@ -2,13 +2,14 @@
 
 import io
 import json
+import zlib
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.planning import budget, choice
 from mitsuba_bdpt.run.schedule import REPLICATES, _replicates
-from mitsuba_bdpt.run.snapshot import Snapshot
+from mitsuba_bdpt.run.snapshot import FORMAT, Snapshot
 from snapshots import ROUNDING, stopped
 
 
@@ -182,8 +183,21 @@ def test_another_format_is_refused():
     other = json.dumps({"identity": {"format": 0}, "passes": [1], "progress": {"unknown": 1}})
     file = io.BytesIO()
     np.savez(file, snapshot=np.array(other))
-    with pytest.raises(ValueError, match="another version of mitsuba-bdpt: its format is 0, here it is 6"):
+    with pytest.raises(ValueError, match="another version of mitsuba-bdpt: its format is 0, here it is 7"):
         Snapshot.from_bytes(file.getvalue())
+
+
+def test_the_format_has_a_new_number_where_names_change():
+    """Rationale: fields of pilots were renamed under one number, and a checkpoint of the version before was
+    said to be damaged. Expected: a checkpoint with a pilot has the names, and rows of the sizes, of the
+    format's number; if not, increase `snapshot.FORMAT`, and write down both here."""
+    start = stopped(bdpt(), scene(size=32), 1, spp=64)
+    with np.load(io.BytesIO(start.to_bytes())) as file:
+        sizes = {name: file[name].shape[1:] for name in sorted(file.files)}
+        found = json.loads(str(file["snapshot"]))["progress"]
+    moments, decision = found["moments"], found["decisions"][0]
+    names = [sorted(part) for part in (found, found["counts"], moments, moments["rays"], decision)]
+    assert (FORMAT, zlib.crc32(repr((names, sizes)).encode())) == (7, 3557649918)
 
 
 def test_only_the_newest_report_has_a_snapshot():
