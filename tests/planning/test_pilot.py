@@ -133,7 +133,7 @@ FEW = Configuration(1 / 16, "one", 1 / 4, 1.0)
 BOTH = Configuration(1.0, "one", 1.0, 1.0)
 PREDICTED = {
     "n0c0": ALONE,
-    "n0c0, kappa of s=1": replace(ALONE, kappa_direct=1 / 16),
+    "n0c0, kappa of s=1": replace(ALONE, kappa_direct=1 / 2),
     "n1c0": SPLATS,
     "n1c1": replace(BOTH, connections="all"),
     "n1c1, one": Configuration(1 / 2, "one", 1 / 2, 1.0),

@@ -81,7 +81,6 @@ CANDIDATES = tuple(
     Configuration(*row)
     for row in (
         # light subpaths per camera subpath, connections, kappa of t <= 1 over its count, kappa of s = 1
-        (0.0, "none", 1.0, 1 / 16),
         (0.0, "none", 1.0, 1 / 2),
         (0.0, "none", 1.0, 1.0),
         (1 / 2, "none", 1 / 8, 1.0),
