@@ -609,6 +609,25 @@ def test_mistyped_names_are_answered_with_those_that_exist(scene, capsys, argume
     assert error.startswith("error: ") and words in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "it is not in the folder '{folder}'; did you mean ball.ply?"),
+        (["-Dlihgt=1"], "; did you mean light?"),
+    ],
+)
+def test_scenes_in_several_folders_have_remedies_too(scene, capsys, arguments, words):
+    """Rationale: a remedy parses the scene again. Expected: it finds included files where the render does."""
+    Path("ball.ply").touch()
+    Path("parts").mkdir()
+    Path("parts/part.xml").write_text('<scene version="3.0.0"><shape type="sphere"/></scene>')
+    mesh = '<shape type="ply"><string name="filename" value="blal.ply"/></shape>'
+    scene.write_text(SCENE.replace("<emitter", f'{mesh}<include filename="part.xml"/><emitter'))
+    assert main(["render", str(scene), "--append", "parts", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert words.replace("{folder}", str(scene.parent)) in error, error
+
+
 @pytest.mark.parametrize("kind", ["diffuse", "obj", "cli_mirror"])
 def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, capsys, kind):
     """Expected: the same of plugins in Python, whose type Mitsuba does not know before they are made."""

@@ -92,6 +92,28 @@ def test_a_dictionary_that_changes_is_another_scene(here, change):
     assert after.name != before.name and after.sha256 != sha256
 
 
+def test_spectra_and_included_files_belong_to_a_scene_file(tmp_path):
+    """Rationale: Mitsuba's parser reads tables of spectra and included files itself, beside the scene file.
+    Expected: from another working directory too the height follows the width, and after an edit of either
+    file it is another scene."""
+    (tmp_path / "grey.spd").write_text("400 0.5\n700 0.5\n")
+    ball = '<spectrum name="reflectance" filename="grey.spd"/>'
+    ball = f'<shape type="sphere"><bsdf type="diffuse">{ball}</bsdf></shape>'
+    (tmp_path / "lamp.xml").write_text('<scene version="3.0.0"><emitter type="constant"/></scene>')
+    size = '<default name="resolution" value="32"/><default name="resolution_y" value="16"/>'
+    film = '<integer name="width" value="$resolution"/><integer name="height" value="$resolution_y"/>'
+    film = f'<sensor type="perspective"><film type="hdrfilm">{film}</film></sensor>'
+    file = tmp_path / "scene.xml"
+    file.write_text(f'<scene version="3.0.0">{size}{film}{ball}<include filename="lamp.xml"/></scene>')
+    assert [*SceneFile("scene", file).load(8).sensors()[0].film().size()] == [8, 4]
+    found = [SceneFile("scene", file).sha256]
+    for name, old, new in (("grey.spd", "0.5", "0.6"), ("lamp.xml", "<emitter", " <emitter")):
+        edited = tmp_path / name
+        edited.write_text(edited.read_text().replace(old, new))
+        found.append(SceneFile("scene", file).sha256)
+    assert len({*found}) == 3
+
+
 def test_equal_objects_are_the_same_scene():
     """Expected: what counts is what an object is, not which one."""
     balls = (mi.load_dict({"type": "sphere", "radius": 0.5}) for _ in range(2))

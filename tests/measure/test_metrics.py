@@ -1,4 +1,4 @@
-"""The measures of scripts/metrics.py against values worked out by hand.
+"""The measures of `measure.metrics` against values worked out by hand.
 
 Each docstring or comment has the arithmetic. Where a bound is statistical it is named; seeds are fixed.
 """

@@ -11,11 +11,9 @@ from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
-import mitsuba as mi
-
 from ..errors import CommandError
 from ..files.images import attribute
-from ..files.loading import named_files, parsed, searching
+from ..files.loading import named_files, parsed, searching, spectra
 from ..files.whole import check_writable, replacing
 from ..host.introspection import versions
 from ..run.snapshot import Snapshot, read
@@ -41,10 +39,8 @@ def digest(options: Namespace) -> str:
         files = named_files(state)
     for path in files:
         found.update(hashlib.sha256(path.read_bytes()).digest())
-    for node in state.nodes:
-        for name, value in node.props.items():
-            if node.props.type(name) == mi.Properties.Type.Spectrum:  # a file that the parser has read
-                found.update(repr((list(value.wavelengths), list(value.values))).encode())
+    for text in spectra(state):
+        found.update(text.encode())
     return found.hexdigest()
 
 

@@ -103,7 +103,7 @@ class Cell:
 
 
 class EmissionGuide(Protocol):
-    """Densities over the squares of primary numbers, see `guided_emission.tables.Guide`."""
+    """Densities over the squares of primary numbers, see `guided_emission.tables.EmissionGuide`."""
 
     side: int
 

@@ -88,11 +88,18 @@ def parsed(
 def named_files(state: mi.parser.ParserState) -> list[Path]:
     """Return the files of a parsed scene, and the existing ones that it names, each once.
 
-    Those of spectra are left out: the parser has read them. Has to be called within `searching`.
+    Those of spectra are left out, see `spectra`. Has to be called within `searching`.
     """
     names = (str(mi.file_resolver().resolve(name)) for name in _filenames(state))
     files = [str(file) for file in state.files]
     return [Path(name) for name in dict.fromkeys((*files, *filter(os.path.isfile, names)))]
+
+
+def spectra(state: mi.parser.ParserState) -> list[str]:
+    """Return the tables of spectra of a parsed scene, as text: the parser has read their files."""
+    held = ((node.props, name, value) for node in state.nodes for name, value in node.props.items())
+    tables = (value for props, name, value in held if props.type(name) == mi.Properties.Type.Spectrum)
+    return [repr((list(table.wavelengths), list(table.values))) for table in tables]
 
 
 def _filenames(state: mi.parser.ParserState) -> list[str]:
@@ -114,10 +121,13 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
 
     others = {name: value for name, value in definitions.items() if name != "resolution"}
     try:
-        pairs = zip(sizes(others), sizes(definitions), strict=True)
-        width, height, asked = next((w, h, asked) for (w, h), (asked, y) in pairs if asked != w and y == h)
-        both = definitions | {"resolution_y": max(round(asked * height / width), 1)}
-        sizes(both)
+        with searching(scene):
+            pairs = zip(sizes(others), sizes(definitions), strict=True)
+            width, height, asked = next(
+                (w, h, asked) for (w, h), (asked, y) in pairs if asked != w and y == h
+            )
+            both = definitions | {"resolution_y": max(round(asked * height / width), 1)}
+            sizes(both)
     except (RuntimeError, StopIteration, TypeError, ZeroDivisionError):
         return definitions  # Mitsuba's parser decides
     return both
@@ -154,14 +164,14 @@ def load(options: Namespace) -> Loaded:
             f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
             "use an LLVM variant, for example llvm_ad_rgb."
         ) from error
-    try:
-        with searching(options.scene, options.append):
+    with searching(options.scene, options.append):
+        try:
             return _load(options)
-    except RuntimeError as error:
-        better = _in_words(str(error), options)
-        if better is None:
-            raise
-        raise CommandError(better) from error
+        except RuntimeError as error:
+            better = _in_words(str(error), options)
+            if better is None:
+                raise
+            raise CommandError(better) from error
 
 
 def _load(options: Namespace) -> Loaded:

@@ -15,7 +15,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, message
-from ..files.loading import choose_sensor, in_proportion, named_files, parameters, parsed, searching
+from ..files.loading import (
+    choose_sensor,
+    in_proportion,
+    named_files,
+    parameters,
+    parsed,
+    searching,
+    spectra,
+)
 from ..host.introspection import media_of
 
 
@@ -143,7 +151,9 @@ class SceneFile(MeasuredScene):
     @property
     def sha256(self) -> str:
         with searching(self.file):
-            return digest(*named_files(parsed(self.file, {}, strict=False)[1]))
+            state = parsed(self.file, {}, strict=False)[1]
+            content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
+        return hashlib.sha256(b"".join(content)).hexdigest()
 
     @property
     def _parameters(self) -> Mapping[str, str]:
