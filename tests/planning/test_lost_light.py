@@ -476,6 +476,17 @@ def test_in_fog_the_direct_light_is_lost(monkeypatch):
     assert share == pytest.approx(expected / (expected + found), rel=0.15)
 
 
+def test_nothing_is_estimated_where_sensor_and_boundaries_contradict_each_other():
+    """Rationale: light subpaths would see another scene than the camera, which one warning says; a second one
+    blamed light_paths and decisions, which nobody had set. Expected: the first one alone, and no share."""
+    around = fog(0.8) | {"to_world": T().scale(20)}
+    scene, integrator = scene_of(LAMPS["point"], block=BLOCK, around=around), bdpt()
+    with Warned() as warnings:
+        integrator.render(scene, spp=1)
+    assert len(warnings) == 1 and "declares no medium" in warnings[0], warnings
+    assert integrator.statistics["lost_light"] == {}
+
+
 def test_lamps_of_several_colours_are_lost_together():
     """Rationale: the brightest colours of a red, a green and a blue lamp are those of three white ones.
     Expected: together they lack what a white lamp does, each in proportion to what the floor reflects of its

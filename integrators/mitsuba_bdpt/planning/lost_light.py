@@ -76,6 +76,8 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
     if plan.arrival or not prepared.emitters.traced:  # the estimate traces light subpaths
         return False
+    if prepared.light_media is not None and prepared.light_media.contradiction:  # it would see another scene
+        return False
     if plan.merging:  # which samples these paths
         return False
     if components.why_absent("merging"):  # which estimates their light
