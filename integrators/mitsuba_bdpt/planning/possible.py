@@ -199,7 +199,7 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
     if settings.max_depth < SHORTEST:
         return f"max_depth={settings.max_depth} allows no such path"
     if prepared.emitters.contrast <= EVEN:
-        return "s=0 finds an even sky by itself"
+        return "s=0 finds a uniform environment by itself"
     return _why_not_merging(prepared.emitters, prepared.delta, direct)
 
 
