@@ -14,7 +14,8 @@ REMOVED = {
     "stored_vertices": "leave it out; for path tracing alone set light_paths=0",
     "points=sampler": "use sobol, which is as good as Mitsuba's best sampler; the scene's sampler gives the "
     "number of samples alone",
-    "photon_guiding": "use guiding: always (which leaves emission to the pilot), never, or emission to guide emission alone",
+    "photon_guiding": "use guiding: always (which leaves emission to the pilot), never, or emission to guide "
+    "emission alone",
     "emission_guiding": "use guiding: never, or photons to guide BSDF sampling alone",
     "strategy_images": "use layers=strategies",
     "variance": "use layers=variance",
