@@ -308,7 +308,7 @@ def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
         reference_of(project, 2)
     making.make(job(2, seconds=0))
-    monkeypatch.setattr(scenes, "digest", lambda *paths: "another file")
+    monkeypatch.setattr(scenes.SceneFile, "sha256", "another file")
     with pytest.raises(ValueError, match=f"another cornell_box, mesh or texture; {command}"):
         reference_of(project, 2)
     with pytest.raises(ValueError, match="scene='nowhere' is neither a scene file nor the name of one"):
