@@ -4,12 +4,12 @@
     python scripts/gpu.py --output docs/reports/cuda.json --report   # the page of the file that is there
     python scripts/gpu.py --ablation --output docs/reports/cuda_ablation.json   # where time goes: ablation.py
 
-Every scene has a process of its own, eight at a time. First they render all methods once, side by side, which
+Every scene has a process of its own, twelve at a time. First they render all methods once, side by side, which
 compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed. (Thirty
 side by side run out of memory: each keeps stacks for all threads of the GPU.) 128^2 pixels, as many
 samples per pixel for every method; `path` (`volpath` in media) with the sampler `multijitter`. An error is
 the median relMSE over seeds against the reference that is committed, raw and without the worst pixels; the
-ratio over `path` that of errors times seconds. Bias: `compare_means` of 16 renders against the reference.
+ratio over `path` that of errors times seconds. Bias: `compare_means` of the renders against the reference.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import ratio, table
 from mitsuba_bdpt.measure.timing import Timed, alternating, timed
 
-SPP, SEEDS = 256, 16
+SPP, SEEDS = 256, 8
 METHODS = {
     "bdpt": ({"type": "bdpt"}, "independent"),
     "bdpt skip=none": ({"type": "bdpt", "skip": "none"}, "independent"),
     "path": ({"type": "path"}, "multijitter"),
 }
-BESIDE = 8
+BESIDE = 12
 """Processes at a time."""
 PATIENCE = 130
 """Seconds after which a scene no longer waits until all others have compiled."""
