@@ -4,9 +4,9 @@
     python scripts/gpu.py --output docs/reports/cuda.json --report   # the page of the file that is there
     python scripts/gpu.py --ablation --output docs/reports/cuda_ablation.json   # where time goes: ablation.py
 
-Every scene has a process of its own, twelve at a time. First they render all methods once, side by side, which
-compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed. (Thirty
-side by side run out of memory: each keeps stacks for all threads of the GPU.) 128^2 pixels, as many
+Every scene has a process of its own, twelve at a time. First they render all methods once, side by side,
+which compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed.
+(Thirty side by side run out of memory: each keeps stacks for all threads of the GPU.) 128^2 pixels, as many
 samples per pixel for every method; `path` (`volpath` in media) with the sampler `multijitter`. An error is
 the median relMSE over seeds against the reference that is committed, raw and without the worst pixels; the
 ratio over `path` that of errors times seconds. Bias: `compare_means` of the renders against the reference.

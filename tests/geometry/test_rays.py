@@ -603,6 +603,17 @@ def test_reach_of_triangles():
     assert reach([90, 0, 0], [97, 0, 0], [90, 3, 0], [80, 8, 0]) == [0, 0]
 
 
+def test_reach_with_optix(monkeypatch):
+    """Rationale: OptiX blocked 9 % of the rays that leave a floor of 2,000 units a unit below the camera.
+    Expected: coordinates within the surface count as well."""
+    floor = mi.load_dict({"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(1000)})
+    assert rounding.reaches(floor).tolist() == [0]
+    monkeypatch.setattr(rounding, "_counts_normals", lambda: False)
+    assert rounding.reaches(floor).tolist() == [1000]
+    cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([5, 1, 1])})
+    assert set(rounding.reaches(cube)) == {2, 10}
+
+
 def near_hits(scene, n, rng):
     """Hits near the origin, of rays from 3 units away or less: ``(si, ray)``."""
     target = mi.Point3f(_sphere(rng) * dr.cbrt(rng.next_float32()))
