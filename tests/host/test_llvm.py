@@ -178,10 +178,12 @@ def test_new_llvm_of_an_imported_drjit_is_accepted(major):
     assert (choice.path, choice.origin, choice.version) == (None, "drjit", major)
 
 
-def run(code, **env):
+def run(code, *arguments, **env):
     """Run `code` in a new Python process."""
     merged = {key: value for key, value in os.environ.items() if key != llvm.VARIABLE} | env
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=merged)
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=merged
+    )
 
 
 FAKE_DRJIT = """
@@ -281,3 +283,52 @@ assert llvm.prepare().origin == "none"
 """
     done = run(FAKE_DRJIT + code.replace("PATH", repr(str(Path(llvm.__file__)))))
     assert done.returncode == 0, done.stderr
+
+
+TWO_KERNELS = """
+import sys
+import mitsuba_bdpt
+import drjit as dr, mitsuba as mi
+from mitsuba_bdpt.host.llvm import quick_compilation
+
+def render(steps):
+    x = dr.linspace(mi.Float, 0, 1, 64)
+    for _ in range(steps):
+        x = dr.sin(x) / (1 + x * x)
+    print(x.numpy().tobytes().hex())
+
+mi.set_variant("llvm_ad_rgb")
+if sys.argv[1:] == ["quick"]:
+    with quick_compilation():
+        render(10)
+else:
+    render(10)
+render(20)
+"""
+
+
+def test_quick_compilation(tmp_path):
+    """Expected: other code of the kernel within the block, the usual code of one after it, equal results."""
+    printed, kernels = [], []
+    for way in ("usual", "again", "quick"):
+        cache = tmp_path / way
+        cache.mkdir()
+        done = run(TWO_KERNELS, way, DRJIT_CACHE_DIR=str(cache))
+        assert done.returncode == 0 and not done.stderr, done.stderr
+        printed.append(done.stdout)
+        kernels.append({file.name: file.read_bytes() for file in cache.glob("*.bin")})
+    assert printed[0] == printed[2]
+    assert kernels[0] == kernels[1], "files of kernels are not reproducible: this test shows nothing"
+    assert kernels[0].keys() == kernels[2].keys()
+    assert sum(kernels[0][name] != kernels[2][name] for name in kernels[0]) == 1
+
+
+def test_quick_compilation_leaves_unknown_libraries_alone(library, monkeypatch):
+    """Untested libraries may print each pass that they skip, or have no such option."""
+    for name in ("", os.devnull, str(library("libLLVM-15.so.1")), str(library("libLLVM-23.so"))):
+        monkeypatch.setenv(llvm.VARIABLE, name)
+        llvm._option_setter.cache_clear()
+        assert llvm._option_setter() is None
+        with llvm.quick_compilation():
+            pass
+    llvm._option_setter.cache_clear()

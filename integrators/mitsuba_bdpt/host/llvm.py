@@ -9,11 +9,15 @@ and 16 abort the process on machines with AVX-512, so this module chooses before
 4. none if there is a CUDA driver, whose variants need no LLVM.
 
 ``choose`` is a pure function of a `Machine`; only `prepare` changes the process.
+
+`quick_compilation` has LLVM compile kernels without its optional passes for a while.
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import functools
 import importlib.metadata
 import os
 import platform
@@ -28,6 +32,9 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 WHEEL = "karellen-llvm-core"
 KNOWN_GOOD = (19, 22, 23)
 """Major versions that passed this package's tests."""
+
+# Value of LLVM's option opt-bisect-limit that limits nothing.
+_ALL_PASSES = 2**31 - 1
 
 _LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 
@@ -146,6 +153,43 @@ def prepare() -> Choice:
     if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
         return Choice(None, "none", "the current variant runs on CUDA", None)
     return check_loaded(drjit.detail.llvm_version(), Machine.here())
+
+
+@contextlib.contextmanager
+def quick_compilation():
+    """Compile kernels without LLVM's optional passes.
+
+    They compile in half the time and run 1.07 to 1.17 times as long, with the same results: for kernels that
+    run only briefly. No effect where the library was not chosen here, or did not pass this package's tests.
+    """
+    set_options = _option_setter()
+    if set_options is None:
+        yield
+        return
+    set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
+    try:
+        yield
+    finally:
+        set_options(b"-opt-bisect-limit=%d" % _ALL_PASSES)
+
+
+@functools.cache
+def _option_setter() -> Callable[..., None] | None:
+    """Return what sets options of the LLVM library in use; None if that is unknown or untested."""
+    path = os.environ.get(VARIABLE, "")
+    if not path or path == os.devnull or major_version(Path(path)) not in KNOWN_GOOD:
+        return None
+    try:
+        library = ctypes.CDLL(path)  # the same copy that Dr.Jit opened, or will open
+        parse = library.LLVMParseCommandLineOptions
+    except (OSError, AttributeError):
+        return None
+
+    def set_options(*options: bytes) -> None:
+        arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
+        parse(len(arguments), arguments, b"")
+
+    return set_options
 
 
 def cuda_driver() -> bool:

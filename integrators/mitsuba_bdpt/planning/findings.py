@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import mitsuba as mi
 
+from ..host.llvm import quick_compilation
 from ..host.notices import State, cached
 from ..scene.prepared import PreparedScene
 
@@ -24,8 +25,13 @@ class Findings:
         self._state: tuple[State, int] | None = None
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
-        """Return the result of ``look()`` and whether it was cached for this ``key``."""
-        return cached(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), look)
+        """Return the result of ``look()``, whose kernels run once, and whether it was cached for ``key``."""
+
+        def compiled_quickly():
+            with quick_compilation():
+                return look()
+
+        return cached(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), compiled_quickly)
 
     def expire(self):
         """Read the parameters again before the next lookup: they may have been edited."""
