@@ -275,7 +275,7 @@ class Recursion:
         return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge])[0]
 
     def endpoints(self):
-        """(1,1) (techniques.join_endpoints)."""
+        """(1,1) (techniques.connect_endpoints)."""
         x, h, kappa = self.path, self.h, self.kappa
         if mis.is_absent(kappa.endpoints):
             return mi.Float(0)

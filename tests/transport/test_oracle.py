@@ -642,7 +642,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
     for function, edges_of in (
         (techniques.hit_emitter, lambda z, *_: (0, edges(z))),
         (techniques.next_event, lambda z, *_: (1, edges(z) + 1)),
-        (techniques.join_endpoints, lambda *_: (1, 1)),
+        (techniques.connect_endpoints, lambda *_: (1, 1)),
         (techniques.splat, lambda y, *_: (edges(y) + 1, edges(y) + 1)),
         (techniques.hit_sensor, lambda e, y, walk: (edges(walk) + 1, edges(walk))),
         (connections.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),

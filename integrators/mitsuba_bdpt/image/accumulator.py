@@ -36,7 +36,8 @@ class Block:
 
     def __init__(self, size, offset, channels: int, rfilter, mode, packet):
         self.channels, self._rfilter, self._mode, self._packet = channels, rfilter, mode, packet
-        self._length = size[0] * size[1] * channels
+        self.row = size[0] * channels
+        self._length = size[1] * self.row
         self._size = dr.opaque(mi.Point2i, size)
         self._offset = dr.opaque(mi.Point2i, offset)
         self.clear()
@@ -69,6 +70,11 @@ class Block:
             return (tap + 1,)
 
         dr.while_loop((mi.Int32(0),), lambda tap: tap < taps * taps, body, label="reconstruction filter")
+
+    def totals(self, stride: int, rows: int) -> mi.Float64:
+        """Sums in double precision of the strips of ``rows`` rows, one every ``stride`` rows."""
+        strips = mi.TensorXd(mi.Float64(self.data), (self._length // (stride * self.row), stride * self.row))
+        return dr.gather(mi.Float64, dr.sum(strips, axis=0).array, dr.arange(mi.UInt32, rows * self.row))
 
     def _add(self, pixel, values, active):
         inside = active & dr.all((pixel >= 0) & (pixel < self._size))
@@ -128,10 +134,11 @@ class Accumulator:
 
     ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
     pixels that camera samples reach beyond the crop window; ``settings``: the layers, of which the variance
-    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``.
+    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``strips``: sums
+    of each pixel's camera samples in single precision, see `batch.strips`.
     """
 
-    def __init__(self, film, colour, border: int, settings: Settings, features):
+    def __init__(self, film, colour, border: int, settings: Settings, features, strips: int = 1):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
         self.depth = settings.strategy_depth
@@ -144,11 +151,13 @@ class Accumulator:
         self._channels = Channels.of(
             film, len(colour.names), features.count if features else 0, POLARIZED if self.stokes else 0
         )
-        self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf)
+        # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
+        self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
+        rows = self.size[1] if strips == 1 else strips * self._stride
+        self._down = dr.opaque(mi.UInt32, self._stride) if strips > 1 else None
+        self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf, rows)
         # Double precision: one pixel may receive millions of splats of a small lamp.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
-        # One strip of rows per strategy, separated by the filter's border.
-        self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         rows = image_count(self.depth, settings.merge_images) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
         self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
@@ -162,12 +171,14 @@ class Accumulator:
     def alpha(self) -> bool:
         return bool(self._channels.alpha)
 
-    def put_camera(self, position, values, active):
+    def put_camera(self, position, values, active, strip=None):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept.
+        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept; ``strip``: index of its
+        sum.
         """
-        self.camera.put(position, self._channels.sample(*values), active)
+        row = 0 if strip is None else strip * self._down
+        self.camera.put(position, self._channels.sample(*values), active, row)
 
     def put_light(self, position, colours, polarized, active):
         """Add a splat at a continuous film position; ``polarized``: channels of `Stokes`."""
@@ -197,6 +208,8 @@ class Accumulator:
         """Add the sums of a pass of ``spp`` samples per pixel to the total."""
         blocks = self._blocks()
         sums = [mi.Float64(b.data) for b in blocks]
+        if self._down is not None:
+            sums[0] = self.camera.totals(self._stride, self.size[1])
         before, passes = self._done
         if before:
             sums = [a + b for a, b in zip(before, sums, strict=True)]
@@ -223,8 +236,9 @@ class Accumulator:
         """Restore the state that `store` and `halves` returned after ``passes``."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
-            if len(s) != len(block.data):
-                raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {len(block.data)}")
+            expected = self.size[1] * block.row if name == "camera" else len(block.data)
+            if len(s) != expected:
+                raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {expected}")
         self._done = (sums, tuple(passes))
         if halves is not None:
             self.replicates.restore(halves, arrays)

@@ -79,7 +79,7 @@ class Image:
         alpha = _alpha(kernel, seen)
         polarized = [dr.select(shown, value, 0) for value in polarized]
         values = dr.select(shown, colours, 0), alpha, features, polarized
-        film.put_camera(start.counted, values, sample.covered)
+        film.put_camera(start.counted, values, sample.covered, sample.strip)
         return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
     def _polarized(self, value, shared, towards) -> list:

@@ -81,7 +81,7 @@ def _merged(kernel: Kernel, merging: Merging, batch: Batch, points: Points, brok
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     walk = replace(walk, sds=None, partial=replace(walk.partial, d_vm=0))
     side = subpaths.camera_side(kernel, sample, shared, walk)
-    side = replace(side, join=None, only_delta=True, sds=None)
+    side = replace(side, connect=None, only_delta=True, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, len(kernel.scene.emitters()) * channels)
 

@@ -13,7 +13,7 @@ from .possible import UnreachablePaths, unreachable_paths
 
 # kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
 # has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
-UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 1 / 2, 2, 1 << 20
+UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 0.7, 2, 1 << 20
 
 # Multiple of the least length of a render with a pilot from which on the pilot's gain there pays for it.
 UNIFORM_TIMES = 10

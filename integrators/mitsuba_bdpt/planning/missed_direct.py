@@ -109,20 +109,20 @@ def _arrives(kernel: Kernel, emitter: mi.Emitter) -> bool:
     seen_from = dr.zeros(mi.SurfaceInteraction3f, POINTS)
     ds, _ = emitter.sample_direction(seen_from, mi.Point2f(0.5))
     if infinite:
-        join = sensor.connect_direction(-ds.d, u_lens, u_film)
+        connection = sensor.connect_direction(-ds.d, u_lens, u_film)
     else:
-        join = sensor.connect(ds.p, u_lens, u_film)
-    seen_from.p, seen_from.time, seen_from.wavelengths = join.p, shared.time, shared.wavelengths
+        connection = sensor.connect(ds.p, u_lens, u_film)
+    seen_from.p, seen_from.time, seen_from.wavelengths = connection.p, shared.time, shared.wavelengths
     ds, weight = emitter.sample_direction(seen_from, mi.Point2f(0.5))
-    lit = join.valid & dr.any(mi.unpolarized_spectrum(weight) != 0)
-    return bool(np.any(np.array(lit & ~_occluded(kernel, join, ds, infinite, shared))))
+    lit = connection.valid & dr.any(mi.unpolarized_spectrum(weight) != 0)
+    return bool(np.any(np.array(lit & ~_occluded(kernel, connection, ds, infinite, shared))))
 
 
-def _occluded(kernel: Kernel, join: CameraConnection, ds: mi.DirectionSample3f, infinite: bool, shared):
+def _occluded(kernel: Kernel, connection: CameraConnection, ds: mi.DirectionSample3f, infinite: bool, shared):
     """Mask: a surface blocks the edge."""
     if infinite:
-        ray = rays.spawn(join.anchor, -join.d, shared)
-        ray.maxt = join.reach
+        ray = rays.spawn(connection.anchor, -connection.d, shared)
+        ray.maxt = connection.reach
     else:
-        ray = rays.segment_to(join.anchor, ds.p, shared)
-    return techniques.hidden(kernel, ray, join.valid)
+        ray = rays.segment_to(connection.anchor, ds.p, shared)
+    return techniques.hidden(kernel, ray, connection.valid)

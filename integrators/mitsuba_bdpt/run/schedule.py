@@ -20,10 +20,6 @@ LAUNCH_SAMPLES = 1 << 21
 # The same on a GPU: smaller launches take less time than recording a pass (see experiments, section CUDA).
 LAUNCH_SAMPLES_CUDA = 1 << 24
 
-# Samples per pixel summed in single precision. Bounds the rounding error, which is systematic (relative error
-# 4e-6 at 2^12, 5e-5 at 2^16).
-MOST_SPP = 1 << 12
-
 # Independent images for the variance. Few, since each has its own, shorter sequence of points.
 REPLICATES = 8
 
@@ -41,7 +37,7 @@ def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) 
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels has to fit into four launches, see `batches`.
-    most = min(MOST_SPP, max(4 * limit // width, 1))
+    most = max(4 * limit // width, 1)
     size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
     sizes = []
     if small_first and spp > 1:

@@ -11,7 +11,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
     y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   subpaths.emission
-    (1,1): splat y_0 seen by the sensor                                     techniques.join_endpoints
+    (1,1): splat y_0 seen by the sensor                                     techniques.connect_endpoints
     the first edge <- a ray; it ends here if the throughput is 0 or not     subpaths.light_walk
         finite
     d_vcm <- 1 / densities of y_0 and direction (eq. 31)
@@ -223,7 +223,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         return c.counted + sink.splat(kernel, c, shared)
 
     if plan.endpoints:
-        counters += splat(techniques.join_endpoints(kernel, e, stream, mi.Bool(True)))
+        counters += splat(techniques.connect_endpoints(kernel, e, stream, mi.Bool(True)))
 
     def visit(vertex, state, walk):
         path, counters = state

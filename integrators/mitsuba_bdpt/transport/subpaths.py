@@ -22,12 +22,13 @@ from .walk import Side, Walk, not_finite
 
 @dataclass
 class CameraSample:
-    """A camera sample: start, random numbers, lens sample; ``covered``: it exists."""
+    """A camera sample: start, random numbers, lens sample; ``covered``: it exists; ``strip``: of its sum."""
 
     start: CameraStart
     stream: Stream
     u_lens: mi.Point2f
     covered: mi.Bool
+    strip: mi.UInt32 | None = None
 
 
 def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
@@ -97,7 +98,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk, sds: SdsStrategy | None)
         kernel.last_light,
         kernel.kappa.direct,
         complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
-        join=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
+        connect=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
         sds=sds,
     )
 
@@ -114,7 +115,7 @@ def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> Camera
     if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    return CameraSample(start, stream, u_lens, active)
+    return CameraSample(start, stream, u_lens, active, place.strip(slot))
 
 
 def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
@@ -147,7 +148,7 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False)
         kernel.kappa.splat,
         alpha=alpha,
         parallel=kernel.camera.parallel,
-        join=choose_emitter if kernel.plan.direct else None,
+        connect=choose_emitter if kernel.plan.direct else None,
         sds=kernel.sds,
     )
 

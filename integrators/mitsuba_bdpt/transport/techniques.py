@@ -127,7 +127,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     return seen(kernel, c, shadow_ray)
 
 
-def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
+def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
     """(1,1): connect a sampled emitter point with the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
@@ -173,7 +173,7 @@ def join_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: m
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
     """Sample a connection of the light vertex ``y`` with the sensor.
 
-    Returns the result of `Sensor.join` and its `bsdf.Target`.
+    Returns the result of `Sensor.connect` and its `bsdf.Target`.
     """
     active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
     join = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))

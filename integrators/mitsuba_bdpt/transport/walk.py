@@ -116,7 +116,7 @@ class Vertex:
     event: mi.UInt32
     volume: mi.Bool | None = None
     landing: Any = None  # a `media.flight.Landing`
-    # Set with a `Side.join`.
+    # Set with a `Side.connect`.
     endpoint: Any = None  # a `Direct`, or a `CameraConnection`
     endpoint_active: Any = None
     f: Any = None  # a `bsdf.Evaluation`
@@ -168,8 +168,8 @@ class Side:
     it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false. Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
-    * ``join``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
-      `Sensor.join`) and its `bsdf.Target`; None if no strategy does so.
+    * ``connect``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
+      `Sensor.connect`) and its `bsdf.Target`; None if no strategy does so.
     """
 
     name: str
@@ -181,7 +181,7 @@ class Side:
     complete: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Float] | None = None
     alpha: bool = False
     parallel: bool = False
-    join: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
+    connect: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_delta: bool = False
     sds: SdsStrategy | None = None
@@ -325,8 +325,8 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
         return None
     points = kernel.points
     target = None
-    if side.join is not None:
-        vertex.endpoint, target = side.join(vertex)
+    if side.connect is not None:
+        vertex.endpoint, target = side.connect(vertex)
         vertex.endpoint_active = target.active
     u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.event)
     u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.event)

@@ -74,7 +74,7 @@ def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, ad
     shared = subpaths.shared_by_lane(kernel, points.stream("light", in_sequence), in_sequence)
     sample = subpaths.camera_sample(kernel, place, shared, index, mi.Bool(True))
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
-    side = replace(subpaths.camera_side(kernel, sample, shared, walk), join=None, isolated=True, sds=None)
+    side = replace(subpaths.camera_side(kernel, sample, shared, walk), connect=None, isolated=True, sds=None)
 
     def visit(z, total, walk):
         found = estimate(kernel, estimator, z, walk, sample.stream)

@@ -97,7 +97,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     if kept is Kept.UNSAMPLED:  # s = 0 samples the others
         walk = replace(walk, active=walk.active & e.delta)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
-    side = replace(side, join=None, isolated=merges, only_delta=not merges)
+    side = replace(side, connect=None, isolated=merges, only_delta=not merges)
 
     def visit(y, counters, walk):
         older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)

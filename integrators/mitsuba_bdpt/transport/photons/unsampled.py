@@ -25,7 +25,7 @@ def arriving(kernel: Kernel, points: Points, count: int) -> mi.Bool:
     e = subpaths.emission(kernel, stream, shared)
     walk = subpaths.light_walk(kernel, e, stream, shared, None)
     walk = replace(walk, active=walk.active & e.delta)
-    side = replace(subpaths.light_side(kernel, e, stream, shared, walk, None), join=None, only_delta=True)
+    side = replace(subpaths.light_side(kernel, e, stream, shared, walk, None), connect=None, only_delta=True)
 
     def visit(y, arrived, walk):
         hit = techniques.hit_sensor(kernel, e, y, walk).active
