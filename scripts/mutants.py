@@ -131,8 +131,8 @@ MUTANTS = (
     Mutant(
         "pilots of an edited scene",
         "planning/findings.py",
-        "(self._scene_state(), key), look",
-        "key, look",
+        "(self._scene_state(), key), compiled_quickly",
+        "key, compiled_quickly",
         ("tests/host/test_edits.py::test_edits_are_seen",),
     ),
     Mutant(
