@@ -435,6 +435,13 @@ MUTANTS = (
         ("tests/images/test_coverage.py::test_meter_of_another_scene",),
     ),
     Mutant(
+        "film: sums of a pixel lie side by side",
+        "image/accumulator.py",
+        "self._down = dr.opaque(mi.UInt32, self._stride)",
+        "self._down = dr.opaque(mi.UInt32, self._stride - 1)",
+        ("tests/image/test_films.py::test_many_samples_of_a_pixel",),
+    ),
+    Mutant(
         "film: the filter's taps begin a pixel early",
         "image/accumulator.py",
         "first = mi.Point2i(dr.ceil(at - radius))",
