@@ -6,6 +6,7 @@ is Welch's t-test of tile means over seeds with Sidak's correction (`agree`); wh
 known, the t-test against it. Seeds are fixed and differ between the two sides.
 """
 
+import tracemalloc
 from functools import partial
 
 import mitsuba as mi
@@ -722,3 +723,50 @@ def test_a_crop_window_set_later_with_a_shifted_principal_point():
             params.update()
         images.append(render(scene, integrator(max_depth=3, skip="none"), [1], 16))
     np.testing.assert_allclose(images[1], images[0], rtol=1e-4, atol=1e-5)
+
+
+def patch(path, side):
+    """Write a mesh of 2 side^2 triangles, the square [-1, 1]^2 at z = 0, whose front is below."""
+    line = np.linspace(-1, 1, side + 1)
+    x, y = np.meshgrid(line, line)
+    first = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    corner, above = first + 1, first + side + 1
+    faces = np.concatenate([np.stack([first, above, corner], 1), np.stack([corner, above, above + 1], 1)])
+    mesh = mi.Mesh("patch", x.size, len(faces))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.stack([x, y, 0 * x], -1).astype(np.float32).ravel()
+    params["faces"] = faces.astype(np.uint32).ravel()
+    params.update()
+    mesh.write_ply(str(path))
+    return {"type": "ply", "filename": str(path)}
+
+
+def under_a_patch(lamp):
+    lamp |= {"emitter": {"type": "area", "radiance": 2.0}, "bsdf": diffuse(0)}
+    floor = {"type": "rectangle", "to_world": T().translate([0, 0, -2]).scale(2), "bsdf": diffuse(0.5)}
+    eye = camera((0, -5, -0.7), (0, 0, -1), size=8, up=(0, 0, 1))
+    return mi.load_dict({"type": "scene", "lamp": lamp, "floor": floor, "sensor": eye})
+
+
+def test_meshes_of_many_emitting_triangles(tmp_path):
+    """pbrt-v4 #183: a million emitting triangles took nine kilobytes each, one light per triangle.
+
+    Expected: the image of one rectangle; at most 400 bytes of NumPy's memory per triangle more for 20,000
+    than for 200 (vertices and normals in double precision: 150 bytes).
+    """
+    method = integrator(max_depth=2, skip="none")
+    peaks = []
+    for side in (10, 100):
+        scene = under_a_patch(patch(tmp_path / f"{side}.ply", side))
+        if not peaks:
+            render(scene, method, [1], 1)  # imports and kernels are not counted
+        tracemalloc.start()
+        try:
+            many = render(scene, method, range(8), 16)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+        finally:
+            tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 400 * 2 * (100**2 - 10**2)
+    rectangle = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], 180)}
+    one = render(under_a_patch(rectangle), method, range(9, 17), 16)
+    agree(tiles(many), tiles(one), 0.03)
