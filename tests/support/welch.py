@@ -18,9 +18,9 @@ from mitsuba_bdpt.measure.agreement import (  # noqa: F401  (tile_means for the 
 from mitsuba_bdpt.measure.agreement import welch as difference
 from scipy import stats
 
-# Level of a whole family of comparisons, after Sidak's correction. Seeds are fixed, so a test passes or fails
-# for good; a change of the random numbers draws anew, with this chance per family of a false alarm. So does
-# every run of a scene of several shapes, which Mitsuba puts into another order each time (``optimize``).
+# Level of a whole family of comparisons, after Sidak's correction. Seeds are fixed, so a test
+# passes or fails for good; a change of the random numbers draws anew, with this chance per family
+# of a false alarm.
 LEVEL = SIGNIFICANCE
 
 # That of `agree`, which many tests call several times each.
