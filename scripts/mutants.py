@@ -437,8 +437,8 @@ MUTANTS = (
     Mutant(
         "film: sums of a pixel lie side by side",
         "image/accumulator.py",
-        "self._down = dr.opaque(mi.UInt32, self._stride)",
-        "self._down = dr.opaque(mi.UInt32, self._stride - 1)",
+        "self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride)",
+        "self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride - 1)",
         ("tests/image/test_films.py::test_many_samples_of_a_pixel",),
     ),
     Mutant(

@@ -621,6 +621,7 @@ print(first, bdpt.statistics["kernels"]["compiled"])
     "change",
     [
         "spp, seed = 9, 2",
+        "spp = 20_000",
         "params['lamp.position'] = mi.Point3f(0.1, 0.2, 0.3)",
         "params['sensor.film.size'] = [600, 900]",
         "params['sensor.to_world'] = mi.Transform4f().look_at([0, 0.2, 0.4], [0, 0, -1], [0, 1, 0])",

@@ -53,16 +53,21 @@ def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
         assert resumed.statistics["error"] == pytest.approx(whole.statistics["error"], rel=1e-3)
 
 
-def test_few_pixels_go_on():
-    """Rationale: a film of few pixels has a light subpath for each camera subpath, which no decision says.
-    Expected: it has them too when it goes on, and when its decisions (none) are replayed."""
-    target, whole = scene(size=4), bdpt(spp_per_pass=16)
-    expected = np.array(whole.render(target, seed=1, spp=256))
-    start = stopped(bdpt(spp_per_pass=16), target, 3, seed=1, spp=256)
-    assert 0 < start.spp < 256 and whole.statistics["decisions"] == []
+@pytest.mark.parametrize(
+    "size, samples, layers", [(16, 256, ""), (5000, 20000, ""), (5000, 80000, "variance")]
+)
+def test_few_pixels_go_on(size, samples, layers):
+    """Rationale: a film of few pixels has a light subpath for each camera subpath, which no decision says,
+    and in long passes (of ``size`` samples) several sums for each pixel. Expected: it has them too when it
+    goes on, and when its decisions (none) are replayed."""
+    way = {"spp_per_pass": size, "layers": layers}
+    target, whole = scene(size=4), bdpt(**way)
+    expected = np.array(whole.render(target, seed=1, spp=samples))
+    start = stopped(bdpt(**way), target, 3, seed=1, spp=samples)
+    assert 0 < start.spp < samples and whole.statistics["decisions"] == []
     for parameters, begun in (({}, {"start": start}), ({"decisions": "[]"}, {})):
-        again = bdpt(spp_per_pass=16, **parameters)
-        image = np.array(again.render(target, seed=1, spp=256, **begun))
+        again = bdpt(**way, **parameters)
+        image = np.array(again.render(target, seed=1, spp=samples, **begun))
         np.testing.assert_allclose(image, expected, **ROUNDING)
         assert again.statistics["rays"] == whole.statistics["rays"]
 

@@ -662,7 +662,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
     path, _, _ = kernel._light_subpath(k_, sink.Image(Nothing()), k_.points.stream(), shared, None)
     scene.begin(from_light=False)
     monkeypatch.setattr(dr, "while_loop", python_loop(k))
-    place = SimpleNamespace(index=lambda i: i, pixel=lambda _: mi.Point2i(0), strip=lambda _: None)
+    place = SimpleNamespace(index=lambda i: i, pixel=lambda _: mi.Point2i(0), strip=lambda _: mi.UInt32(0))
     lane = kernel.Lane(place, shared, path)
     kernel._camera_subpath(k_, sink.Image(Nothing()), lane, u32(0), mi.Bool(True))
     dr.eval(result, world.demands)

@@ -153,9 +153,9 @@ def reaches(shape: mi.Shape) -> np.ndarray:
 
     Coordinates whose rounding moves hits within the surface do not count: corners of rectangles and edges of
     triangles are weighted by |n_i| / max |n|, so that an axis-aligned floor has 0, however large. With CUDA
-    they all count: OptiX blocks one ray in eleven that leaves such a floor 1,000 times as large as its
-    distance from the camera. For spheres, cylinders and grids all coordinates count, for instances all of
-    their shapes. 0 for disks and curves, whose accuracy does not depend on their size.
+    they all count, since OptiX blocks rays that leave such a floor (experiments, "CUDA"). For spheres,
+    cylinders and grids all coordinates count, for instances all of their shapes. 0 for disks and curves,
+    whose accuracy does not depend on their size.
     """
     kind = shape.shape_type()
     if is_instance(shape):
@@ -164,7 +164,7 @@ def reaches(shape: mi.Shape) -> np.ndarray:
         matrix = matrix_of(shape)
         corner = np.abs(matrix[:3, 3]) + np.abs(matrix[:3, :2]).sum(1)
         n = np.abs(np.cross(matrix[:3, 0], matrix[:3, 1]))
-        weights = n / n.max() if _counts_normals() else 1
+        weights = n / n.max() if _uses_embree() else 1
         return np.array([_finite((weights * corner).max())])
     if kind in _WHOLE:
         return np.array([_finite(np.abs([shape.bbox().min, shape.bbox().max]).max())])
@@ -176,8 +176,8 @@ def reaches(shape: mi.Shape) -> np.ndarray:
     return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 
 
-def _counts_normals() -> bool:
-    """Whether rays meet flat shapes as exactly as their coordinates along the normal: Embree, not OptiX."""
+def _uses_embree() -> bool:
+    """Whether Embree intersects rays (LLVM variants); OptiX is less exact on large flat shapes."""
     return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
@@ -192,7 +192,7 @@ def _reaches_of_triangles(positions, faces) -> np.ndarray:
     a, b, c = (dr.gather(mi.Point3f, p, index, known) for index in faces)
     edges = dr.maximum(dr.maximum(dr.abs(a - b), dr.abs(b - c)), dr.abs(c - a))
     n = dr.abs(dr.cross(b - a, c - a))
-    found = dr.max(n / dr.max(n) * edges) if _counts_normals() else dr.max(edges)
+    found = dr.max(n / dr.max(n) * edges) if _uses_embree() else dr.max(edges)
     return dr.select(dr.isfinite(found), found, 0).numpy().astype(np.float64)
 
 

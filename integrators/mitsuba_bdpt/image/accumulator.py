@@ -134,8 +134,8 @@ class Accumulator:
 
     ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
     pixels that camera samples reach beyond the crop window; ``settings``: the layers, of which the variance
-    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``strips``: sums
-    of each pixel's camera samples in single precision, see `batch.strips`.
+    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``strips``:
+    number of sums of each pixel's camera samples, see `batch.strip_count`.
     """
 
     def __init__(self, film, colour, border: int, settings: Settings, features, strips: int = 1):
@@ -153,8 +153,8 @@ class Accumulator:
         )
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
+        self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride)
         rows = self.size[1] if strips == 1 else strips * self._stride
-        self._down = dr.opaque(mi.UInt32, self._stride) if strips > 1 else None
         self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf, rows)
         # Double precision: one pixel may receive millions of splats of a small lamp.
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
@@ -171,14 +171,13 @@ class Accumulator:
     def alpha(self) -> bool:
         return bool(self._channels.alpha)
 
-    def put_camera(self, position, values, active, strip=None):
+    def put_camera(self, position, values, active, strip):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept; ``strip``: index of its
-        sum.
+        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept; ``strip``: index of the
+        sum to which it is added.
         """
-        row = 0 if strip is None else strip * self._down
-        self.camera.put(position, self._channels.sample(*values), active, row)
+        self.camera.put(position, self._channels.sample(*values), active, strip * self._down)
 
     def put_light(self, position, colours, polarized, active):
         """Add a splat at a continuous film position; ``polarized``: channels of `Stokes`."""
@@ -208,7 +207,7 @@ class Accumulator:
         """Add the sums of a pass of ``spp`` samples per pixel to the total."""
         blocks = self._blocks()
         sums = [mi.Float64(b.data) for b in blocks]
-        if self._down is not None:
+        if self._strips > 1:
             sums[0] = self.camera.totals(self._stride, self.size[1])
         before, passes = self._done
         if before:

@@ -13,7 +13,6 @@ import mitsuba as mi
 from .. import components
 from ..errors import UsageError
 from ..host.jit import evaluated_mode, gc_paused
-from ..host.llvm import quick_compilation
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import LIGHT_PATHS, Settings
@@ -149,8 +148,7 @@ class Planner:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
         if self.decided.pilots.asked:
-            with quick_compilation():
-                result = self._result(samples)
+            result = self._result(samples)
         else:  # the first pilot of all renders of the scene
             key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
             result, is_known = self._findings.find("results", key, lambda: self._result(samples))

@@ -32,7 +32,7 @@ from ..properties import check_film, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
-from ..transport.batch import strips
+from ..transport.batch import strip_count
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.photons import photon_pass
@@ -42,7 +42,7 @@ from ..transport.photons.photon_guide import Guide
 from ..transport.plan import Plan
 from ..transport.sds import SdsStrategy
 from . import messages
-from .schedule import REPLICATES, PassPoints, Step, batches, pass_sizes, passes_since, schedule
+from .schedule import REPLICATES, PassPoints, Step, batches, longest_pass, passes_since, schedule
 from .snapshot import Progress, Snapshot, identity
 from .statistics import Meter, rays
 
@@ -96,8 +96,8 @@ class Render:
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
         border = self.prepared.camera.region.border
-        most = max(pass_sizes(self.prepared.camera, spp, settings, small_first=False))
-        self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, strips(most))
+        sums = strip_count(longest_pass(self.prepared.camera, settings))
+        self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, sums)
         self.kernel = self._kernel()
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None

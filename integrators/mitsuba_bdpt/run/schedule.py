@@ -11,7 +11,7 @@ from ..sampling.points import Points, sequential
 from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, WAVELENGTHS, sequence_seed
 from ..sensors.records import Sensor
 from ..settings import Settings
-from ..transport.batch import Batch
+from ..transport.batch import STRIP, Batch
 
 # Samples per kernel launch (four times as many in a launch of one row, see `batches`). Bounds the duration of
 # a launch (seconds on a few cores), and thus the delay of Ctrl-C, timeout and progress; it needs no memory.
@@ -32,14 +32,20 @@ def _most_samples() -> int:
     return LAUNCH_SAMPLES_CUDA if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else LAUNCH_SAMPLES
 
 
-def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
-    """Return the samples per pixel of each pass; the first has 1 if ``small_first``."""
+def longest_pass(camera: Sensor, settings: Settings) -> int:
+    """Return the samples per pixel of a whole pass; the same for renders of any length."""
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels has to fit into four launches, see `batches`.
-    most = max(4 * limit // width, 1)
-    size = min(settings.spp_per_pass or max(limit // (width * height), 1), most)
-    sizes = []
+    most = min(max(4 * limit // width, 1), max(STRIP, limit // (width * height)))
+    if settings.merging:  # photons, radius and wavelengths are those of a pass
+        most = min(most, STRIP)
+    return min(settings.spp_per_pass or max(limit // (width * height), 1), most)
+
+
+def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
+    """Return the samples per pixel of each pass; the first has 1 if ``small_first``."""
+    size, sizes = longest_pass(camera, settings), []
     if small_first and spp > 1:
         sizes, spp = [1], spp - 1
     return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])

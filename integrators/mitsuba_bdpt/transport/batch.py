@@ -34,8 +34,8 @@ NET, NETS = 8, 2
 STRIP = 1 << 12
 
 
-def strips(samples: int) -> int:
-    """Number of sums per pixel of a launch with so many ``samples`` per pixel."""
+def strip_count(samples: int) -> int:
+    """Number of sums per pixel of a launch of ``samples`` samples per pixel."""
     return -(-samples // STRIP)
 
 
@@ -85,7 +85,6 @@ class Places:
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
-        self._has_strips = strips(batch.samples) > 1
 
     def _split(self, slot):
         if self._pilot:
@@ -112,9 +111,9 @@ class Places:
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
 
-    def strip(self, slot: mi.UInt32) -> mi.UInt32 | None:
-        """Which sum of its pixel a camera sample belongs to; None if there is one."""
-        return slot % self._samples // STRIP if self._has_strips else None
+    def strip(self, slot: mi.UInt32) -> mi.UInt32:
+        """Index of the sum of its pixel to which a camera sample is added."""
+        return (slot - slot // self._samples * self._samples) // STRIP
 
     def pixel(self, slot: mi.UInt32) -> mi.Point2i:
         pixel, _ = self._split(slot)

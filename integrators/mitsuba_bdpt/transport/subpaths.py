@@ -22,13 +22,16 @@ from .walk import Side, Walk, not_finite
 
 @dataclass
 class CameraSample:
-    """A camera sample: start, random numbers, lens sample; ``covered``: it exists; ``strip``: of its sum."""
+    """A camera sample: start, random numbers, lens sample.
+
+    ``covered``: it exists; ``strip``: index of the sum to which it is added, see `Places.strip`.
+    """
 
     start: CameraStart
     stream: Stream
     u_lens: mi.Point2f
     covered: mi.Bool
-    strip: mi.UInt32 | None = None
+    strip: mi.UInt32
 
 
 def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
