@@ -183,11 +183,10 @@ def quick_compilation():
 @functools.cache
 def _option_setter() -> Callable[..., None] | None:
     """Return what sets options of the LLVM library in use; None if that is unknown or untested."""
-    import drjit  # which must not be imported before `prepare`
-
+    drjit = sys.modules["drjit"]
     path = os.environ.get(VARIABLE, "")
     version = major_version(Path(path)) if path else None
-    if version not in KNOWN_GOOD or not _is_of(drjit.detail.llvm_version(), version):
+    if version not in KNOWN_GOOD or drjit.detail.llvm_version()[0] != version:
         return None
     try:
         library = ctypes.CDLL(path)  # the copy that Dr.Jit has opened
@@ -200,10 +199,6 @@ def _option_setter() -> Callable[..., None] | None:
         parse(len(arguments), arguments, b"")
 
     return set_options
-
-
-def _is_of(version: tuple[int, ...], major: int | None) -> bool:
-    return version[0] == major
 
 
 def cuda_driver() -> bool:
