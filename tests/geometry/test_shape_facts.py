@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.errors import UsageError
-from mitsuba_bdpt.geometry import quadrics, rounding, shape_facts
+from mitsuba_bdpt.geometry import quadrics, rounding, shape_facts, smooth_meshes
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.jit import registered_emitters
 
@@ -32,6 +32,10 @@ def found(monkeypatch):
     asked, errors, sphere = [], rounding.ShapeErrors, quadrics.Sphere.of
     monkeypatch.setattr(shape_facts, "ShapeErrors", lambda scene: (asked.append("errors"), errors(scene))[1])
     monkeypatch.setattr(quadrics.Sphere, "of", lambda shape: (asked.append("sphere"), sphere(shape))[1])
+    curved = smooth_meshes._curved_faces
+    monkeypatch.setattr(
+        smooth_meshes, "_curved_faces", lambda shape: (asked.append("faces"), curved(shape))[1]
+    )
     return asked
 
 
@@ -47,6 +51,7 @@ def test_shapes_are_asked_once(found):
     for number in range(4):
         image(scene, number, light_paths=number % 2)
     assert found.count("errors") == 2 and found.count("sphere") == 4  # of two lamps
+    assert found.count("faces") == 4
 
 
 EDITS = {

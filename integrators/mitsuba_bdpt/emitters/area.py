@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -141,6 +142,7 @@ class AreaEmitters(Group):
         self._textured = TexturedPoints(emitters, spheres, mapped)
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
+        self._facts = context.facts
         extent = 2 * scene_box(context.scene).bounding_sphere().radius
         found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
@@ -226,8 +228,11 @@ class AreaEmitters(Group):
 
     def placed(self, guide: EmissionGuide | None) -> Group:
         other = super().placed(guide)
-        other._tables = table(rows(self._emitters, _Table(), _Table.of))
+        other._tables = table(rows(self._emitters, _Table(), self._directions))
         return other
+
+    def _directions(self, emitter) -> _Table:
+        return self._facts.about("directions", partial(_Table.of, emitter), emitter.get_shape())
 
     def place(self, index, p, d, active) -> Place:
         known = look_up(self._tables, index, active)

@@ -38,9 +38,11 @@ class Surfaces:
 
     def __init__(self, emitters, context: Context, spheres, by_shape=None, textured=None):
         for emitter in filter(None, emitters):
-            context.facts.about("to_world", emitter.get_shape(), partial(_check_to_world, emitter))
+            context.facts.about("to_world", partial(_check_to_world, emitter), emitter.get_shape())
         # First: the area of a mesh whose faces have invalid vertices is arbitrary.
-        self._smooth_meshes = SmoothMeshes.of(emitters)
+        shapes = (emitter and emitter.get_shape() for emitter in emitters)
+        look = partial(SmoothMeshes.of, emitters)
+        self._smooth_meshes = context.facts.about("smooth meshes", look, *shapes)
         self.smooth = self._smooth_meshes is not None
         areas = rows(emitters, 1.0, lambda emitter: dr.slice(emitter.get_shape().surface_area()))
         if 0 in areas:
@@ -133,7 +135,7 @@ def spheres_of(emitters, context: Context) -> list[Sphere | None]:
 
     def sphere(emitter: mi.Emitter) -> Sphere | None:
         shape = emitter.get_shape()
-        return context.facts.about("sphere", shape, lambda: Sphere.of(shape))
+        return context.facts.about("sphere", lambda: Sphere.of(shape), shape)
 
     return rows(emitters, None, sphere)
 

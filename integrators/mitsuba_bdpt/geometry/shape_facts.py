@@ -27,7 +27,7 @@ class ShapeFacts:
         for shape in all_shapes(scene):
             check_inverse(shape)
         self.errors = ShapeErrors(scene)
-        self._found: dict[tuple[str, int], object] = {}
+        self._found: dict[tuple, object] = {}
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
@@ -41,12 +41,12 @@ class ShapeFacts:
         key = State.of(shapes, deep=False), tuple(own)
         return cached(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
 
-    def about(self, kind: str, shape: mi.Shape, find: Callable[[], Found]) -> Found:
-        """Return the cached result of ``find()`` for a ``kind`` of fact and a ``shape``.
+    def about(self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None) -> Found:
+        """Return the cached result of ``find()`` for a ``kind`` of fact and its ``shapes``.
 
-        It must depend on the shape's own parameters alone; errors are not cached.
+        It must depend on the own parameters of these alone; errors are not cached.
         """
-        key = kind, _number(shape)
+        key = kind, *(None if shape is None else _number(shape) for shape in shapes)
         if key not in self._found:
             self._found[key] = find()
         return self._found[key]  # type: ignore[return-value]
