@@ -605,7 +605,7 @@ def test_reach_of_triangles():
     assert reach([90, 0, 0], [97, 0, 0], [90, 3, 0], [80, 8, 0]) == [0, 0]
 
 
-@pytest.mark.skipif(variants.BACKEND == "cuda", reason="both answers are asked for by hand")
+@pytest.mark.skipif(variants.BACKEND == "cuda", reason="the first answer is that of Embree")
 def test_reach_with_optix(monkeypatch):
     """Rationale: OptiX blocked 9 % of the rays that leave a floor of 2,000 units a unit below the camera.
     Expected: coordinates within the surface count as well."""

@@ -138,7 +138,7 @@ class Accumulator:
     number of sums of each pixel's camera samples, see `batch.strip_count`.
     """
 
-    def __init__(self, film, colour, border: int, settings: Settings, features, strips: int = 1):
+    def __init__(self, film, colour, border: int, settings: Settings, features, strips: int):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
         self.depth = settings.strategy_depth

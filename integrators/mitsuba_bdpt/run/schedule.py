@@ -37,10 +37,11 @@ def longest_pass(camera: Sensor, settings: Settings) -> int:
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels has to fit into four launches, see `batches`.
-    most = min(max(4 * limit // width, 1), max(STRIP, limit // (width * height)))
+    whole = max(limit // (width * height), 1)
+    most = min(max(4 * limit // width, 1), max(STRIP, whole))
     if settings.merging:  # photons, radius and wavelengths are those of a pass
         most = min(most, STRIP)
-    return min(settings.spp_per_pass or max(limit // (width * height), 1), most)
+    return min(settings.spp_per_pass or whole, most)
 
 
 def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
