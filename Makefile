@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
 .PHONY: render test costly slow costs lint gallery pictures notebook docs package references benchmark sweep stress same \
-	endurance mutants
+	endurance mutants scale
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -120,6 +120,10 @@ benchmark: $(INSTALLED)
 	$(VENV)/bin/python scripts/floor.py --record results/benchmark/probes.json
 	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
 	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
+
+# What is fixed per render, per object and per pass, over `path`: docs/reports/scale.json and its tables.
+scale: $(INSTALLED)
+	$(VENV)/bin/python scripts/scale.py
 
 # Style, format, the order of the layers, types.
 lint: $(INSTALLED)

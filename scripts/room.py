@@ -126,30 +126,6 @@ def room(materials: int, size: int = 128) -> dict:
     return scene
 
 
-def crowd(lamps: int, bsdfs: int) -> dict:
-    """A scene of many lamps and of balls with a BSDF each, for ``mi.load_dict``."""
-    t = mi.ScalarTransform4f()
-    view = t.look_at([0, 3, 8], [0, 0, 0], [0, 1, 0])
-    scene: dict = {
-        "type": "scene",
-        "sensor": {"type": "perspective", "to_world": view, "film": {"type": "hdrfilm"}},
-    }
-    for i in range(lamps):
-        place = t.translate([i % 20 - 10, 4, i // 20 - 7]).rotate([1, 0, 0], 90).scale(0.1)
-        emitter = {"type": "area", "radiance": 1.0 + i}
-        scene[f"lamp{i}"] = {"type": "rectangle", "to_world": place, "emitter": emitter}
-    for i in range(bsdfs):
-        bsdf = (
-            {"type": "diffuse", "reflectance": 0.2 + 0.005 * i},
-            {"type": "roughconductor", "alpha": 0.1 + 0.002 * i},
-            {"type": "plastic", "int_ior": 1.3 + 0.001 * i},
-            {"type": "dielectric", "int_ior": 1.3 + 0.002 * i},
-        )[i % 4]
-        ball = {"type": "sphere", "center": [i % 10 - 5, 0, i // 10 - 5], "radius": 0.4, "bsdf": bsdf}
-        scene[f"ball{i}"] = ball
-    return scene
-
-
 def _shell(scene: dict, opening: tuple[float, float, float, float] | None = None):
     """Add a room of 8 x 3 x 8 units to ``scene``, with an ``opening`` (z, z, y, y) in its right wall."""
     t = mi.ScalarTransform4f()

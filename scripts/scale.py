@@ -1,0 +1,531 @@
+"""What is fixed per render, per object and per pass: times of `bdpt` over `path` as scenes grow.
+
+    python scripts/scale.py                          # all rows; writes docs/reports/scale.* and figures.md
+    python scripts/scale.py lamps film               # rows of these kinds, printed
+    python scripts/scale.py lamps --sizes 300 1000
+    python scripts/scale.py --list
+
+A row is a kind of object (lamps, materials, ...; or pixels, samples, edits, film filters) and a size: how
+many there are, or which. It has a process of its own with an empty kernel cache, which has rendered something
+before. There `path`, `bdpt` and path tracing alone (``light_paths=0``) each render a scene of their own for
+the first time, then all in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is
+said. Columns: processor seconds of the first image and, median, of a warm render, as ratios over `path`; what
+an object adds to the difference between `bdpt` and `path`; peak memory of the first render. A kind ends where
+a row takes longer than `PATIENCE`; the table says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import command_line
+import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
+import numpy as np
+import repository
+import room
+from mitsuba_bdpt.cli.mistakes import answered
+from mitsuba_bdpt.cli.values import number
+from mitsuba_bdpt.errors import CommandError
+from mitsuba_bdpt.files.texts import write_text
+from mitsuba_bdpt.host import memory
+from mitsuba_bdpt.host.introspection import versions
+from mitsuba_bdpt.measure.tables import ratio, replace_part, table
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
+
+RECORD = repository.ROOT / "docs" / "reports" / "scale.json"
+PAGE = RECORD.with_suffix(".md")
+FIGURES_PAGE = RECORD.with_name("figures.md")
+DEPTH = 6
+METHODS = {
+    "path": {"type": "path"},
+    "bdpt": {"type": "bdpt"},
+    "alone": {"type": "bdpt", "light_paths": 0},
+}
+"""Integrators by their names in the record; ``alone``: path tracing alone."""
+PATIENCE = 60.0
+"""Seconds of a row after which a kind has no larger one."""
+WARM_SECONDS, ROUNDS = 4.0, (3, 15)
+"""Of the warm renders of a row: how long they may take, and the least and the most rounds."""
+
+
+def view(width: int = 64, rfilter: str = "box") -> dict:
+    """A sensor above the ground, of ``width``^2 pixels."""
+    film = {"type": "hdrfilm", "width": width, "height": width, "rfilter": {"type": rfilter}}
+    place = mi.ScalarTransform4f().look_at(origin=[0, 6, 9], target=[0, 0, 0], up=[0, 1, 0])
+    return {"type": "perspective", "fov": 55, "to_world": place, "film": film}
+
+
+def ground(width: int = 64, rfilter: str = "box", **objects: dict) -> dict:
+    """A scene of a diffuse floor of 12 x 12 units and ``objects``."""
+    floor = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
+    base = {
+        "type": "scene",
+        "sensor": view(width, rfilter),
+        "floor": {"type": "rectangle", "to_world": floor},
+    }
+    return base | objects
+
+
+def facing_down(x: float, z: float, size: float, height: float = 5.0):
+    """Where a rectangle that faces down is."""
+    return mi.ScalarTransform4f().translate([x, height, z]).rotate([1, 0, 0], 90).scale(size)
+
+
+def lamp(radiance: object = 10.0, **shape) -> dict:
+    """A shape that emits; a square above the ground, if none is given."""
+    return (shape or {"type": "rectangle", "to_world": facing_down(0, 0, 1)}) | {
+        "emitter": {"type": "area", "radiance": radiance}
+    }
+
+
+def grid(count: int) -> list[tuple[float, float, float]]:
+    """Places x, z for so many objects on the ground, and the radius that a sphere has room for."""
+    side = int(np.ceil(np.sqrt(count)))
+    cell = 10 / side
+    return [((i % side + 0.5) * cell - 5, (i // side + 0.5) * cell - 5, 0.4 * cell) for i in range(count)]
+
+
+def spheres(count: int) -> dict:
+    """Spheres of one material."""
+    shared = {"type": "roughconductor", "id": "shared", "alpha": 0.2}
+    balls = {
+        f"ball{i}": {
+            "type": "sphere",
+            "center": [x, r, z],
+            "radius": r,
+            "bsdf": {"type": "ref", "id": "shared"},
+        }
+        for i, (x, z, r) in enumerate(grid(count))
+    }
+    return ground(shared=shared, lamp=lamp(), **balls)
+
+
+def instances(count: int) -> dict:
+    """Instances of one group of shapes."""
+    t = mi.ScalarTransform4f()
+    group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": {"type": "diffuse"}}}
+    placed = {
+        f"placed{i}": {
+            "type": "instance",
+            "to_world": t.translate([x, r, z]).rotate([0, 1, 0], 37 * i).scale(0.7 * r),
+            "group": {"type": "ref", "id": "group"},
+        }
+        for i, (x, z, r) in enumerate(grid(count))
+    }
+    return ground(group=group, lamp=lamp(), **placed)
+
+
+def materials(count: int) -> dict:
+    """Spheres with a material each."""
+    balls = {}
+    for i, (x, z, r) in enumerate(grid(count)):
+        colour = {"type": "rgb", "value": [0.2 + 0.6 * i / count, 0.5, 0.8 - 0.6 * i / count]}
+        bsdf = {"type": "principled", "base_color": colour, "roughness": 0.2 + 0.6 * i / count}
+        balls[f"ball{i}"] = {"type": "sphere", "center": [x, r, z], "radius": r, "bsdf": bsdf}
+    return ground(lamp=lamp(), **balls)
+
+
+def lamps(count: int) -> dict:
+    """Spherical lamps."""
+    made = {
+        f"lamp{i}": lamp(1.0 + i % 7, type="sphere", center=[x, 2.0, z], radius=0.2 * r)
+        for i, (x, z, r) in enumerate(grid(count))
+    }
+    return ground(**made)
+
+
+def textured_lamps(count: int) -> dict:
+    """Square lamps with a picture each."""
+    random = np.random.default_rng(1)
+    made = {}
+    for i, (x, z, r) in enumerate(grid(count)):
+        picture = mi.Bitmap(random.uniform(0.1, 5, (8, 8, 3)).astype(np.float32))
+        radiance = {"type": "bitmap", "bitmap": picture, "raw": True}
+        made[f"lamp{i}"] = lamp(radiance, type="rectangle", to_world=facing_down(x, z, 0.5 * r, 3.0))
+    return ground(**made)
+
+
+def waves(triangles: int, height: float) -> mi.Mesh:
+    """A mesh with vertex normals of about so many triangles, 4 x 4 units, which faces down."""
+    side = max(1, round((triangles / 2) ** 0.5))
+    x, z = np.meshgrid(*2 * [np.linspace(-2, 2, side + 1)])
+    y = height + 0.2 * np.sin(2 * x) * np.cos(2 * z)
+    first = (np.arange(side)[:, None] * (side + 1) + np.arange(side)).ravel()
+    faces = [(first, first + 1, first + side + 2), (first, first + side + 2, first + side + 1)]
+    mesh = mi.Mesh("waves", (side + 1) ** 2, 2 * side**2, has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.stack([x, y, z], -1).ravel().astype(np.float32))
+    parameters["faces"] = mi.UInt32(
+        np.concatenate([np.stack(f, -1) for f in faces]).ravel().astype(np.uint32)
+    )
+    parameters.update()
+    return mesh
+
+
+def lamp_mesh(triangles: int) -> dict:
+    """A lamp of so many triangles, from a file in the working directory."""
+    waves(triangles, 4.0).write_ply("lamp.ply")
+    return ground(lamp=lamp(type="ply", filename="lamp.ply", face_normals=False))
+
+
+def film(width: int) -> dict:
+    """A film of ``width``^2 pixels."""
+    return still("box", width)
+
+
+def still(rfilter: str, width: int) -> dict:
+    """A ball on the ground and a lamp."""
+    ball = {"type": "sphere", "center": [0, 1, 0], "radius": 1, "bsdf": {"type": "plastic"}}
+    return ground(width, rfilter, ball=ball, lamp=lamp())
+
+
+def meter(samples: int) -> dict:
+    """An irradiance meter on the ground."""
+    one = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    place = mi.ScalarTransform4f().translate([0, 0.01, 2]).rotate([1, 0, 0], -90).scale(0.1)
+    measuring = {"type": "rectangle", "to_world": place, "sensor": {"type": "irradiancemeter", "film": one}}
+    scene = still("box", 1) | {"meter": measuring}
+    del scene["sensor"]
+    return scene
+
+
+def cornell(width: int, rfilter: str = "box") -> dict:
+    """Mitsuba's Cornell box."""
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] |= {"width": width, "height": width, "rfilter": {"type": rfilter}}
+    return scene
+
+
+def edited(kind: str) -> dict:
+    """What edits change: a lamp, a picture on the floor, a mesh, a camera."""
+    waves(1000, 0.5).write_ply("waves.ply")
+    scene = still("box", 64)
+    picture = mi.Bitmap(np.random.default_rng(1).uniform(0.2, 0.8, (64, 64, 3)).astype(np.float32))
+    scene["floor"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": picture}}
+    grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}  # the mesh faces down
+    return scene | {"mesh": {"type": "ply", "filename": "waves.ply", "bsdf": grey}}
+
+
+EDITS = {
+    "nothing": None,
+    "lamp": "lamp.emitter.radiance.value",
+    "material": "ball.bsdf.diffuse_reflectance.value",
+    "texture": "floor.bsdf.reflectance.data",
+    "vertices": "mesh.vertex_positions",
+    "camera": "sensor.to_world",
+}
+"""Parameters that are edited before each render, by what is edited."""
+
+
+def edit(scene: mi.Scene, name: str, seed: int) -> None:
+    """Change a parameter of `EDITS` a little, by another amount for each seed."""
+    if (key := EDITS[name]) is None:
+        return
+    parameters = mi.traverse(scene)
+    if name == "camera":
+        parameters[key] = mi.Transform4f(
+            mi.ScalarTransform4f().look_at([0.01 * seed, 6, 9], [0, 0, 0], [0, 1, 0])
+        )
+    else:
+        parameters[key] = parameters[key] * (1 + 0.001 * (seed % 7 - 3))
+    parameters.update()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What there is more and more of: ``what`` in words, ``sizes`` (numbers, or names), the scene of a size.
+
+    ``spp``: samples per pixel of a size. ``before``: called with scene, size and seed before each render.
+    """
+
+    what: str
+    sizes: tuple[int | str, ...]
+    scene: Callable[..., dict]
+    spp: Callable[..., int] = field(default=lambda size: 16)
+    before: Callable[[mi.Scene, str, int], None] | None = None
+
+
+KINDS = {
+    "spheres": Kind("spheres of one material", (10, 100, 1000, 10000), spheres),
+    "instances": Kind("instances", (10, 100, 300, 1000), instances),
+    "materials": Kind("spheres with a material each", (10, 100, 300, 1000), materials),
+    "rooms": Kind("materials of a room, see room.py", (10, 27, 40), lambda count: room.room(count, 64)),
+    "lamps": Kind("spherical lamps", (10, 100, 1000, 10000), lamps),
+    "textured lamps": Kind("square lamps with a picture each", (10, 128, 1000), textured_lamps),
+    "lamp mesh": Kind("triangles of one lamp", (1000, 10000, 100000, 1000000), lamp_mesh),
+    "film": Kind(
+        "pixels a side, 2^20 samples in all, one a pixel at least",
+        (1, 16, 256, 1024, 4096),
+        film,
+        lambda width: max(1, 2**20 // width**2),
+    ),
+    "samples": Kind("samples of one pixel", (1, 100, 10**4, 10**6, 10**7), lambda n: film(1), lambda n: n),
+    "meter": Kind("samples of an irradiance meter", (10**4, 10**6), meter, lambda n: n),
+    "previews": Kind(
+        "samples per pixel, `cornell_box`, 64^2", (1, 8, 64), lambda n: cornell(64), lambda n: n
+    ),
+    "edits": Kind("an edit before each render", tuple(EDITS), edited, before=edit),
+    "filters": Kind(
+        "film filter, `cornell_box`, 128^2, 64 samples per pixel",
+        ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos"),
+        lambda name: cornell(128, name),
+        lambda name: 64,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A ratio over `path` that a row should not exceed: ``method`` of `METHODS`, ``figure`` of `FIGURES`."""
+
+    kind: str
+    size: int | str
+    figure: str
+    most: float
+    method: str = "bdpt"
+
+
+def over_path(row: dict, figure: str, method: str) -> float:
+    """A time (``first``, ``warm``) of a method over that of `path`."""
+    return row[method][figure] / row["path"][figure]
+
+
+def slope(rows: list[dict], row: dict, method: str) -> float:
+    """Milliseconds that an object adds to a warm render beyond `path`, since the next smaller row."""
+    last = rows[rows.index(row) - 1]
+    extra = [1e3 * (of[method]["warm"] - of["path"]["warm"]) for of in (last, row)]
+    return (extra[1] - extra[0]) / (row["size"] - last["size"])
+
+
+FIGURES = {
+    "warm": ("warm render", lambda rows, row, method: over_path(row, "warm", method)),
+    "first": ("first image", lambda rows, row, method: over_path(row, "first", method)),
+    "slope": ("ms an object", slope),
+    "over box": (
+        "ratio over that of the box filter",
+        lambda rows, row, method: over_path(row, "warm", method) / over_path(rows[0], "warm", method),
+    ),
+}
+"""Figures of a row, given the rows of its kind: in words, and the function."""
+
+GOALS = (
+    Goal("samples", 10**6, "warm", 2),
+    Goal("meter", 10**6, "warm", 2),
+    Goal("lamp mesh", 10**6, "warm", 1.5),
+    Goal("materials", 300, "warm", 2),
+    Goal("lamps", 1000, "warm", 1.5),
+    Goal("lamps", 1000, "slope", 0.2),
+    Goal("textured lamps", 128, "warm", 2),
+    Goal("instances", 100, "warm", 1.3),
+    Goal("instances", 300, "first", 2),
+    Goal("edits", "lamp", "warm", 2),
+    Goal("edits", "texture", "warm", 2),
+    Goal("edits", "vertices", "warm", 2),
+    Goal("edits", "lamp", "warm", 1.1, "alone"),
+    Goal("filters", "gaussian", "over box", 1.1),
+    Goal("filters", "lanczos", "over box", 1.2),
+)
+
+
+def taken(kind: Kind, size: int | str, scene: mi.Scene, integrator: mi.Integrator, seed: int) -> dict:
+    """Processor and wall seconds of an edit, if the kind has one, and a render."""
+    dr.sync_thread()
+    started, cpu_started = time.perf_counter(), time.process_time()
+    if kind.before:
+        kind.before(scene, str(size), seed)
+    dr.eval(mi.render(scene, integrator=integrator, spp=kind.spp(size), seed=seed))
+    dr.sync_thread()
+    return {"cpu": time.process_time() - cpu_started, "wall": time.perf_counter() - started}
+
+
+def forget_peak() -> int:
+    """Free what Dr.Jit keeps, forget the peak of this process's memory; return the bytes it takes now."""
+    gc.collect()
+    dr.flush_malloc_cache()
+    if Path("/proc/self/clear_refs").exists():  # Linux
+        Path("/proc/self/clear_refs").write_text("5")
+    return memory.peak() or 0
+
+
+def here(kind: Kind, size: int | str) -> dict:
+    """The times of a size, rendered in this process: {method: {figure: value}}, see `FIGURES`."""
+    integrators = {name: mi.load_dict(given | {"max_depth": DEPTH}) for name, given in METHODS.items()}
+    small = mi.load_dict(ground(16, sky={"type": "constant"}))
+    found, renders = {}, {}
+    for integrator in integrators.values():
+        dr.eval(mi.render(small, integrator=integrator, spp=1))
+    for name, integrator in integrators.items():
+        renders[name] = partial(taken, kind, size, mi.load_dict(kind.scene(size)), integrator)
+        before = forget_peak()
+        first = renders[name](0)
+        found[name] = {
+            "first": first["cpu"],
+            "first_wall": first["wall"],
+            "memory": (memory.peak() or 0) - before,
+        }
+    warm: dict[str, list[dict]] = {name: [] for name in METHODS}
+    started, seed = time.perf_counter(), 0
+    while seed < ROUNDS[0] or (seed < ROUNDS[1] and time.perf_counter() - started < WARM_SECONDS):
+        seed += 1
+        for name in list(METHODS)[:: 1 if seed % 2 else -1]:
+            warm[name].append(renders[name](seed))
+    for name, times in warm.items():
+        found[name]["warm"] = statistics.median(one["cpu"] for one in times)
+        found[name]["warm_wall"] = statistics.median(one["wall"] for one in times)
+    return found
+
+
+def apart(name: str, size: int | str) -> dict:
+    """The row of a size, rendered in a new process with an empty kernel cache."""
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory() as empty:
+        done = subprocess.run(
+            [sys.executable, __file__, "--here", name, str(size)],
+            env=os.environ | {"DRJIT_CACHE_DIR": empty, "HOME": empty},
+            capture_output=True,
+            text=True,
+            cwd=empty,
+        )
+    if done.returncode:
+        raise CommandError(f"{name} {size} ended with status {done.returncode}: {done.stderr[-500:]}")
+    row = {"kind": name, "size": size} | json.loads(done.stdout.splitlines()[-1])
+    return row | {"seconds": round(time.perf_counter() - started, 1)}
+
+
+def rows_of(name: str, sizes: Iterable[int | str]) -> list[dict]:
+    """The rows of a kind, up to one that takes longer than `PATIENCE`; says each."""
+    rows: list[dict] = []
+    for size in sizes:
+        if rows and rows[-1]["seconds"] > PATIENCE:
+            print(f"{name} {size}: not tried, the last took {rows[-1]['seconds']} s", flush=True)
+            continue
+        rows.append(apart(name, size))
+        print(" | ".join(cells(rows, rows[-1])), f"({rows[-1]['seconds']} s)", flush=True)
+    return rows
+
+
+HEAD = (
+    "size",
+    "first image: `path`, s",
+    "`bdpt`",
+    "path tracing alone",
+    "warm: `path`, ms",
+    "`bdpt`",
+    "path tracing alone",
+    "an object, ms beyond `path`: `bdpt`",
+    "path tracing alone",
+    "memory, GiB: `path`",
+    "`bdpt`",
+)
+
+
+def cells(rows: list[dict], row: dict) -> list[str]:
+    """A line of a table: columns `HEAD` after the first, which is kind and size."""
+    path = row["path"]
+    counted = row is not rows[0] and isinstance(row["size"], int)
+    slopes = [f"{slope(rows, row, method):.3g}" if counted else "–" for method in ("bdpt", "alone")]
+    return [
+        f"{row['size']:,}" if isinstance(row["size"], int) else row["size"],
+        f"{path['first']:.2g}",
+        *(ratio(over_path(row, "first", method)) for method in ("bdpt", "alone")),
+        f"{1e3 * path['warm']:.3g}",
+        *(ratio(over_path(row, "warm", method)) for method in ("bdpt", "alone")),
+        *slopes,
+        *(f"{row[method]['memory'] / 2**30:.2f}" for method in ("path", "bdpt")),
+    ]
+
+
+def tables(record: dict) -> str:
+    """The tables of a record, as Markdown: one of all kinds' rows each."""
+    parts = []
+    for name, kind in KINDS.items():
+        rows = [row for row in record["rows"] if row["kind"] == name]
+        left = [str(size) for size in kind.sizes if size not in [row["size"] for row in rows]]
+        note = (
+            f" Not tried, as the row before takes over {PATIENCE:.0f} s: {', '.join(left)}." if left else ""
+        )
+        parts.append(f"**{name}**: {kind.what}.{note}\n\n" + table(HEAD, [cells(rows, row) for row in rows]))
+    return "\n".join(parts)
+
+
+def goals(record: dict) -> str:
+    """What was aimed at and what was measured, as Markdown."""
+    lines = []
+    for goal in GOALS:
+        rows = [row for row in record["rows"] if row["kind"] == goal.kind]
+        found = next((row for row in rows if row["size"] == goal.size), None)
+        words, figure = FIGURES[goal.figure]
+        size = f"{goal.size:,}" if isinstance(goal.size, int) else goal.size
+        what = f"{goal.kind}, {size}, {words}" + (", path tracing alone" if goal.method == "alone" else "")
+        measured = f"{figure(rows, found, goal.method):.3g}" if found else "not measured"
+        lines.append([what, f"{goal.most:g}", measured])
+    return table(["over `path`", "at most", "measured"], lines)
+
+
+def write(record: dict) -> None:
+    """The record as data, its tables as a page, and the goals in the page of figures."""
+    write_text(RECORD, json.dumps(record, indent=1) + "\n")
+    write_text(PAGE, replace_part(PAGE.read_text(), "scale", tables(record)))
+    write_text(FIGURES_PAGE, replace_part(FIGURES_PAGE.read_text(), "scale goals", goals(record)))
+
+
+def main(arguments=None) -> int:
+    """Run the command line."""
+    parser = command_line.parser(__doc__)
+    parser.add_argument("kinds", nargs="*", help="kinds of rows; default: all, and the page is written")
+    parser.add_argument("--sizes", nargs="+", help="sizes of these kinds, instead of those of the table")
+    parser.add_argument("--list", action="store_true", help="print kinds and sizes, render nothing")
+    parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
+    asked = parser.parse_args(arguments)
+    mi.set_variant("llvm_ad_rgb")
+    if asked.here:
+        name, size = asked.here
+        print(json.dumps(here(KINDS[name], parsed(KINDS[name], size))))
+        return 0
+    for name in asked.kinds:
+        if name not in KINDS:
+            raise CommandError(f"kind={name!r} is not known; use some of {', '.join(KINDS)}")
+    if asked.sizes and not asked.kinds:
+        raise CommandError("--sizes needs kinds")
+    if asked.list:
+        for name, kind in KINDS.items():
+            print(f"{name} ({kind.what}): {', '.join(map(str, kind.sizes))}")
+        return 0
+    rows = []
+    for name in asked.kinds or KINDS:
+        kind = KINDS[name]
+        print(f"{name}: {' | '.join(HEAD)}")
+        rows += rows_of(name, [parsed(kind, size) for size in asked.sizes or kind.sizes])
+    if not asked.kinds:
+        write({"versions": versions(), "rows": rows})
+    return 0
+
+
+def parsed(kind: Kind, size: int | str) -> int | str:
+    """A size as the kind has them; raises ``CommandError`` if it cannot have it."""
+    if isinstance(kind.sizes[0], str):
+        if size not in kind.sizes:
+            raise CommandError(f"size={size!r} is not known; use some of {', '.join(map(str, kind.sizes))}")
+        return size
+    try:
+        return number(int, 1)(str(size))
+    except argparse.ArgumentTypeError as error:
+        raise CommandError(f"size={size!r}: {error}") from None
+
+
+if __name__ == "__main__":
+    sys.exit(answered(main))
