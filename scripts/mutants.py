@@ -614,7 +614,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        "media: the near side's medium where a join starts",
+        "media: the near side's medium where a connection starts",
         "transport/walk.py",
         "self.si.target_medium(d)",
         "self.si.target_medium(-d)",
@@ -669,8 +669,8 @@ MUTANTS = (
     Mutant(
         "polarized: splats arrive from where they go",
         "transport/techniques.py",
-        "sides=sides, towards=join.d)",
-        "sides=sides, towards=-join.d)",
+        "sides=sides, towards=connection.d)",
+        "sides=sides, towards=-connection.d)",
         ("tests/images/test_polarized.py::test_strategies_agree_in_every_component",),
     ),
     Mutant(
@@ -1032,7 +1032,7 @@ MUTANTS = (
     Mutant(
         "guided s = 0: s = 0 does not know of it",
         "transport/photons/guided_hits.py",
-        "kernel.heuristic.combine(camera_side, _other(kernel, z, joined))",
+        "kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))",
         "camera_side",
         ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
     ),
@@ -1065,9 +1065,9 @@ MUTANTS = (
         ("tests/images/test_guided_hits.py::test_the_guide_is_the_same_in_any_order",),
     ),
     Mutant(
-        "guided s = 0: joined paths too",
+        "guided s = 0: connectible paths too",
         "transport/photons/guided_hits.py",
-        "sides[1]), active & ~joined",
+        "sides[1]), active & ~connectible",
         "sides[1]), active",
         ("tests/images/test_guided_hits.py::test_a_lamp_below_the_plate",),
     ),
@@ -1079,7 +1079,7 @@ MUTANTS = (
         ("tests/transport/test_oracle.py::test_recursion_with_merges[n1c1-balance]",),
     ),
     Mutant(
-        "merging: a path is isolated again after an edge that is joined",
+        "merging: a path is isolated again after an edge that is connectible",
         "transport/walk.py",
         "isolated = isolated & (step.delta",
         "isolated = (step.delta",
@@ -1165,14 +1165,14 @@ MUTANTS = (
     Mutant(
         "merging: s = 0 does not know of merges",
         "merging/merging.py",
-        "dr.select(joined, 0, merges))",
+        "dr.select(connectible, 0, merges))",
         "0)",
         ("tests/images/test_merging.py::test_large_lamps_look_as_without[diffuse-default]",),
     ),
     Mutant(
         "merging: t = 0 does not know of merges",
         "transport/techniques.py",
-        "dr.select(mis.is_joined(partial, newest), 0, merges))",
+        "dr.select(mis.is_connectible(partial, newest), 0, merges))",
         "0)",
         ("tests/images/test_merging.py::test_a_lens_and_a_point_lamp",),
     ),

@@ -522,7 +522,7 @@ def parsed(kind: Kind, size: int | str) -> int | str:
             raise CommandError(f"size={size!r} is not known; use some of {', '.join(map(str, kind.sizes))}")
         return size
     try:
-        return number(int, 1)(str(size))
+        return int(number(int, 1)(str(size)))
     except argparse.ArgumentTypeError as error:
         raise CommandError(f"size={size!r}: {error}") from None
 

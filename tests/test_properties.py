@@ -708,7 +708,7 @@ METER = {"type": "rectangle"}
 @pytest.mark.parametrize(
     "lamp, area, parameters, expected",
     [
-        (GLASS_LAMP, False, {}, ["no two neighbours can be joined"]),
+        (GLASS_LAMP, False, {}, ["no two neighbours can be connected"]),
         (GLASS_LAMP, False, {"light_paths": 0}, ["needs t=1", "needs inner", "no two neighbours"]),
         (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "no two neighbours"]),
         (GLASS_LAMP, True, {}, []),

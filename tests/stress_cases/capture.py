@@ -196,11 +196,11 @@ class Capture(Observer):
         dr.eval(self.walking.origin)
         if side.adjoint and self.plan.endpoints:
             u = techniques._sensor_points(bound, stream)
-            join = bound.camera.connect(self.emission.si.p, *u)
+            connection = bound.camera.connect(self.emission.si.p, *u)
             if not bound.camera.parallel:
                 distant = bound.camera.connect_direction(self.emission.d, *u)
-                join = dr.select(self.emission.infinite, distant, join)
-            self._keep_endpoint(1, 1, join)
+                connection = dr.select(self.emission.infinite, distant, connection)
+            self._keep_endpoint(1, 1, connection)
 
     def vertex(self, side, walk, vertex, step):
         """A subpath has reached a vertex."""
@@ -363,8 +363,8 @@ class Capture(Observer):
         if t >= 2:
             last = [self._free(camera.origin)]
         elif t == 1:
-            join = y.endpoint if y is not None else self.endpoint[1, 1]
-            last, towards = [self._free(join.p)], join.d
+            connection = y.endpoint if y is not None else self.endpoint[1, 1]
+            last, towards = [self._free(connection.p)], connection.d
         else:
             last = [self._free(self.endpoint[s, 0])]
         if y is not None and z is not None:

@@ -170,7 +170,7 @@ class Recursion:
 
     def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, i, isolated):
         is_delta = self.path.delta[i]
-        isolated &= is_delta | ~mis.is_joined(partial, coefficient)
+        isolated &= is_delta | ~mis.is_connectible(partial, coefficient)
         merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), isolated)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
@@ -248,7 +248,7 @@ class Recursion:
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
         if self.eta is not None:
             merges = h.scale(h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf), self.aimed / x.second)
-            light_side = h.combine(light_side, dr.select(mis.is_joined(arrived, newest), 0, merges))
+            light_side = h.combine(light_side, dr.select(mis.is_connectible(arrived, newest), 0, merges))
         return h.weight(kappa.arrival, light_side, mi.Float(0))
 
     def merge(self, m):
@@ -267,7 +267,7 @@ class Recursion:
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
         if self.eta is not None:
             merges = h.scale(last.d_vm, x.first * self.aimed)
-            camera_side = h.combine(camera_side, dr.select(mis.is_joined(last, newest), 0, merges))
+            camera_side = h.combine(camera_side, dr.select(mis.is_connectible(last, newest), 0, merges))
         return h.weight(1, mi.Float(0), camera_side)
 
     def _joined(self, kappa, light_side, camera_side, edge):

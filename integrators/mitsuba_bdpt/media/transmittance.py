@@ -95,7 +95,9 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
     clear = mi.Bool(active)
     depth = mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0)
     segments, collisions = mi.UInt32(0), mi.UInt32(0) if media.grids else None
-    while dr.hint(going, label="segments of a join", exclude=[space, media, scene, ray, active, own, hidden]):
+    while dr.hint(
+        going, label="segments of a connection", exclude=[space, media, scene, ray, active, own, hidden]
+    ):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
         si = scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
         hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)

@@ -94,11 +94,11 @@ class Merging(SdsStrategy):
         )
         return total, replace(counters, non_finite=lost, merges=merges)
 
-    def hit(self, kernel, z, joined, densities, sides, active):
+    def hit(self, kernel, z, connectible, densities, sides, active):
         h, (light_side, camera_side), (pdf_first, pdf_second) = kernel.heuristic, sides, densities
         emitted = self.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
         merges = h.scale(z.partial.d_vm, pdf_first * emitted)
-        return (light_side, h.combine(camera_side, dr.select(joined, 0, merges))), active
+        return (light_side, h.combine(camera_side, dr.select(connectible, 0, merges))), active
 
     def arrive(self, kernel, merges, emission):
         return kernel.heuristic.scale(merges, self.aim.density(emission) / emission.pdf_second)

@@ -18,7 +18,7 @@ _RESTS = {
     Rest.SEEN_VERTEX: ", a {vertex} that the sensor sees",
     Rest.VERTICES: ", two other {vertices} or more, delta surfaces or none, sensor",
     Rest.VERTEX_BETWEEN_DELTA: ", a single other {vertex}, delta surfaces, sensor (no two neighbours can be "
-    "joined)",
+    "connected)",
     Rest.SENSOR: ", sensor",
     Rest.LONG: ", ... on paths longer than {longest} edges",
 }
@@ -71,7 +71,7 @@ def explain(
     ]
     lines = [
         f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.camera_paths_per_light_path)}"
-        + (f", each of which is joined with {p.joined} of them" if p.joined > 1 else "")
+        + (f", each of which is connected with {p.joined} of them" if p.joined > 1 else "")
         if p.light
         else f"heuristic {settings.heuristic}, no light subpaths"
     ]

@@ -150,7 +150,7 @@ def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -
     if settings.hide_emitters:
         return "hide_emitters: emitters are not seen directly"
     if emitters.count and not emitters.connectible_to_sensor:
-        return "no point of the emitters can be joined with the sensor"
+        return "no point of the emitters can be connected with the sensor"
     if emitters.count and camera.delta and not emitters.hittable:
         return "delta emitters are not seen by a sensor without area (measure zero)"
     if emitters.count and camera.parallel and not emitters.finite_hittable:
@@ -180,7 +180,7 @@ def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
     if not emitters.traced:
         return _UNTRACED
     if direct and not (delta or emitters.beams):
-        return "without delta surfaces next-event estimation joins all that light meets first"
+        return "without delta surfaces next-event estimation connects all that light meets first"
     return ""
 
 

@@ -71,7 +71,7 @@ class Merge:
     isolated: mi.Bool
 
 
-def is_joined(partial: Partial, coefficient: Coefficient):
+def is_connectible(partial: Partial, coefficient: Coefficient):
     """Mask: a strategy with this ``coefficient`` connects the edge to the vertex."""
     if is_absent(coefficient):
         return mi.Bool(False)

@@ -1,10 +1,11 @@
 """Hooks of the strategies that sample SDS paths: vertex merging, and photon-guided BSDF sampling.
 
-An edge is *joined* if a strategy in use connects its ends: neither end is a delta event, and the strategy's
-class has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to the sensor,
-inner connections for the others). An *SDS path* (specular-diffuse-specular) has no joined edge: lamp, glass,
-wall, glass, camera. Of the classes of `Plan` only s = 0 and t = 0 sample it. The kernel has at most one
-further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at fixed points.
+An edge is *connectible* if a strategy in use connects its ends: neither end is a delta event, and the
+strategy's class has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to
+the sensor, inner connections for the others). An *SDS path* (specular-diffuse-specular) has no connectible
+edge: emitter, glass, wall, glass, camera. Of the classes of `Plan` only s = 0 and t = 0 sample it. The kernel
+has at most one further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at
+fixed points.
 """
 
 from __future__ import annotations
@@ -20,9 +21,9 @@ from . import mis
 class State:
     """What a walk knows of an SDS path; None where it is not needed.
 
-    ``isolated``: no edge is joined; ``only_delta``, on light subpaths with guiding: all events were delta;
-    ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction (s = 0 by
-    the guide, or by the BSDF) over its own.
+    ``isolated``: no edge is connectible; ``only_delta``, on light subpaths with guiding: all events were
+    delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
+    (s = 0 by the guide, or by the BSDF) over its own.
     """
 
     isolated: mi.Bool | None = None
@@ -77,7 +78,7 @@ class SdsStrategy:
         """
         return state
 
-    def hit(self, kernel, z, joined: mi.Bool, densities, sides, active: mi.Bool):
+    def hit(self, kernel, z, connectible: mi.Bool, densities, sides, active: mi.Bool):
         """Alternatives of s = 0 at the emitter point ``z``.
 
         ``densities`` of emission (`Emitters.hit_densities`); ``sides``: light and camera side. Returns new

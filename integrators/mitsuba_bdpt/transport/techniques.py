@@ -60,8 +60,8 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     )
     sides = 0, camera_side
     if sds is not None:
-        joined = mis.is_joined(z.partial, newest)
-        sides, active = sds.hit(kernel, z, joined, (pdf_first, pdf_second), sides, active)
+        connectible = mis.is_connectible(z.partial, newest)
+        sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
     weight, shares = h.weigh(kernel.kappa.hit, *sides)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
@@ -131,42 +131,42 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     """(1,1): connect a sampled emitter point with the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
-    join = kernel.camera.connect(emission.si.p, *u)
+    connection = kernel.camera.connect(emission.si.p, *u)
     if kernel.camera.parallel:
         active &= ~emission.infinite  # measure zero
     else:
-        join = dr.select(emission.infinite, kernel.camera.connect_direction(emission.d, *u), join)
-    active &= join.valid & ~(emission.pdf_first == 0) & ~emission.beam
+        connection = dr.select(emission.infinite, kernel.camera.connect_direction(emission.d, *u), connection)
+    active &= connection.valid & ~(emission.pdf_first == 0) & ~emission.beam
     if kernel.camera.delta:
         active &= ~emission.delta  # measure zero: `path` sees nothing either
-    radiance = kernel.emitters.radiance_towards(emission, join.d, active)
-    cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, join.d)))
-    geometry = cos / join.dist2
-    value = radiance * (geometry * join.importance / (emission.pdf_first * kernel.count_light))
+    radiance = kernel.emitters.radiance_towards(emission, connection.d, active)
+    cos = dr.select(emission.infinite | emission.delta, 1, dr.abs(dr.dot(emission.anchor.n, connection.d)))
+    geometry = cos / connection.dist2
+    value = radiance * (geometry * connection.importance / (emission.pdf_first * kernel.count_light))
     active &= ~spectra.is_zero(value)
     # s = 0: the camera subpath hits the same point.
-    ratio = join.pdf_w * geometry / emission.pdf_first
+    ratio = connection.pdf_w * geometry / emission.pdf_first
     light_side = h.scale(h.start(dr.select(emission.delta, 0, ratio)), kernel.kappa.hit)
     camera_side = 0
     if kernel.plan.arrival:
-        pdf_second = kernel.emitters.direction_density(emission, join.p, join.d, active)
-        covered = ~emission.infinite | kernel.emitters.covers(join.p, join.d)
+        pdf_second = kernel.emitters.direction_density(emission, connection.p, connection.d, active)
+        covered = ~emission.infinite | kernel.emitters.covers(connection.p, connection.d)
         pdf_second = dr.select(covered, pdf_second, 0)
-        camera_side = h.scale(h.start(pdf_second * join.arrival), kernel.kappa.arrival)
+        camera_side = h.scale(h.start(pdf_second * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.endpoints, light_side, camera_side
     weight, shares = h.weigh(*sides)
 
-    ray = rays.segment(emission.anchor, join.anchor, emission.si)
+    ray = rays.segment(emission.anchor, connection.anchor, emission.si)
     if kernel.space is not None:  # the sensor's medium is known in every direction
-        ray = rays.segment(join.anchor, emission.anchor, emission.si)
+        ray = rays.segment(connection.anchor, emission.anchor, emission.si)
     # From the sensor towards infinity, for light from infinity.
-    away = rays.spawn(join.anchor, -join.d, emission.si)
-    away.maxt = join.reach  # camera rays see the environment behind the far plane
+    away = rays.spawn(connection.anchor, -connection.d, emission.si)
+    away.maxt = connection.reach  # camera rays see the environment behind the far plane
     ray = dr.select(emission.infinite, away, ray)
     counted = Counters(shadow_t1=one(active))
     ends = mi.UInt32(1), mi.UInt32(1)
-    c = Contribution(value, weight, *ends, active, shares, "light", join.position, counted, sides)
-    c = replace(c, towards=join.d)
+    c = Contribution(value, weight, *ends, active, shares, "light", connection.position, counted, sides)
+    c = replace(c, towards=connection.d)
     return seen(kernel, c, ShadowRay(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
@@ -176,39 +176,42 @@ def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraCon
     Returns the result of `Sensor.connect` and its `bsdf.Target`.
     """
     active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
-    join = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
-    active &= join.valid
+    connection = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
+    active &= connection.valid
     if kernel.plan.hide_emitters:
         on_emitter = y.si.shape.emitter() != dr.zeros(mi.EmitterPtr)
         active &= ~on_emitter
-    cos_ratio = y.cosine(join.d) / y.cos
-    return join, bsdf.Target(y.si.to_local(join.d), active, cos_ratio)
+    cos_ratio = y.cosine(connection.d) / y.cos
+    return connection, bsdf.Target(y.si.to_local(connection.d), active, cos_ratio)
 
 
 def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: connect a light vertex with `look_at_sensor`'s point (eqs. 46, 47)."""
-    h, join, f = kernel.heuristic, y.endpoint, y.f
-    to_area = y.cosine(join.d) / join.dist2
-    estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (join.importance / join.dist2)
+    h, connection, f = kernel.heuristic, y.endpoint, y.f
+    to_area = y.cosine(connection.d) / connection.dist2
+    estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (
+        connection.importance / connection.dist2
+    )
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
     direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
     newest = newest_coefficient(kernel, direct, y.edges)
-    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, join.pdf_w * to_area)
+    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, connection.pdf_w * to_area)
     camera_side = 0
     if kernel.plan.arrival:
-        camera_side = h.scale(h.start(f.pdf_fwd_w * join.arrival), kernel.kappa.arrival)
+        camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     weight, shares = h.weigh(*sides)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
-    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", join.position)
+    c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", connection.position)
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
-    ray = rays.segment(y.anchor, join.anchor, y.si)
-    shadow_ray = ShadowRay(ray, medium=y.medium_towards(kernel, join.d), hidden=kernel.plan.hide_emitters)
-    c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=join.d)
+    ray = rays.segment(y.anchor, connection.anchor, y.si)
+    medium = y.medium_towards(kernel, connection.d)
+    shadow_ray = ShadowRay(ray, medium=medium, hidden=kernel.plan.hide_emitters)
+    c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
     return seen(kernel, c, shadow_ray.numbered(kernel, stream, y.event))
 
 
@@ -246,7 +249,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     if kernel.sds is not None and walk.sds is not None:  # the last edge is not connected either
         merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
-        light_side = h.combine(light_side, dr.select(mis.is_joined(partial, newest), 0, merges))
+        light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly

@@ -417,7 +417,7 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
         return None, None
     isolated, only_delta, guided = walk.sds.isolated, walk.sds.only_delta, walk.sds.guided
     if isolated is not None:
-        isolated = isolated & (step.delta | ~mis.is_joined(vertex.partial, coefficient))
+        isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
     if only_delta is not None:
         only_delta = only_delta & step.delta
     if guided is not None and vertex.advice is not None:  # guided subpaths follow delta events only
@@ -435,8 +435,8 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
     No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
     path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
     """
-    joined = mis.is_joined(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
-    possible = vertex.hit & vertex.connectible() & ~joined & (vertex.edges < kernel.max_depth)
+    connectible = mis.is_connectible(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
+    possible = vertex.hit & vertex.connectible() & ~connectible & (vertex.edges < kernel.max_depth)
     if vertex.volume is not None:
         possible &= ~vertex.volume
     isolated = None if walk.sds is None else walk.sds.isolated

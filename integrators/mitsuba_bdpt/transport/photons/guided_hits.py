@@ -85,16 +85,16 @@ class Guiding(SdsStrategy):
         )
         return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
 
-    def hit(self, kernel, z, joined, densities, sides, active):
+    def hit(self, kernel, z, connectible, densities, sides, active):
         light_side, camera_side = sides
-        return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, joined))), active
+        return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))), active
 
 
 class _Guided(SdsStrategy):
     """The same at the end of a guided subpath, whose alternative is s = 0 by the BSDF."""
 
-    def hit(self, kernel, z, joined, densities, sides, active):
-        return (_other(kernel, z, joined), sides[1]), active & ~joined
+    def hit(self, kernel, z, connectible, densities, sides, active):
+        return (_other(kernel, z, connectible), sides[1]), active & ~connectible
 
 
 class Unguided(Guiding):
@@ -118,13 +118,13 @@ class Unguided(Guiding):
     def visit(self, kernel, z, walk, stream, shared, add, state):
         return state
 
-    def hit(self, kernel, z, joined, densities, sides, active):
-        return sides, active & (joined | (z.guided == 0))
+    def hit(self, kernel, z, connectible, densities, sides, active):
+        return sides, active & (connectible | (z.guided == 0))
 
 
-def _other(kernel: Kernel, z: Vertex, joined: mi.Bool) -> mis.PartialSum:
+def _other(kernel: Kernel, z: Vertex, connectible: mi.Bool) -> mis.PartialSum:
     """Ratio of the other density of the path to its own: s = 0 by the guide and by the BSDF."""
-    return kernel.heuristic.scale(dr.select(joined, 0, z.guided), kernel.kappa.hit)
+    return kernel.heuristic.scale(dr.select(connectible, 0, z.guided), kernel.kappa.hit)
 
 
 def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
