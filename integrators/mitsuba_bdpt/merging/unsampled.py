@@ -1,7 +1,8 @@
 """Light that no strategy in use samples, found by subpaths that follow delta events only.
 
-An SDS path (no edge is connectible, see `sds`) from an emitter that no ray can hit is not sampled. Here camera
-subpaths merge with photons at a path's only non-delta vertex, which samples it in one way: the weight is 1. Not included: paths with several non-delta vertices, on surfaces or in media, of which no two are
+An SDS path (no edge is connectible, see `sds`) from an emitter that no ray can hit is not sampled. Here
+camera subpaths merge with photons at a path's only non-delta vertex, which samples it in one way: the weight
+is 1. Not included: paths with several non-delta vertices, on surfaces or in media, of which no two are
 neighbours; with light_paths=0 also those with neighbours.
 """
 
