@@ -25,6 +25,8 @@ def test_a_bar_shows_rate_and_time_left():
     bar = progress.Bar(8.0, True, console=Console(file=io.StringIO()))
     bar(report(8, total=1 << 16, rays=2000))
     assert bar.description == "8 spp, 1 k rays/s, 6 s left" and bar.completed == 0.25
+    bar(report(8, total=1 << 16, rays=0, seconds=9.0))
+    assert bar.description == "8 spp, stopped after 8 s" and bar.completed == 1
     bar = progress.Bar(console=Console(file=io.StringIO()))
     bar(report(1 << 14, total=1 << 16))
     assert bar.description.startswith("16384/65536 spp, ") and bar.description.endswith(" s left")

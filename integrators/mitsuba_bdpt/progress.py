@@ -61,7 +61,9 @@ def in_words(report: Report, limit: float | None = None, open_ended: bool = Fals
     text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp"
     if report.rays:  # unknown for other integrators
         text += f", {readable(report.rays / max(report.seconds, 1e-9))} rays/s"
-    if limit or not open_ended:
+    if limit and report.seconds >= limit and report.spp_done < report.spp_total:
+        text += f", stopped after {limit:g} s"
+    elif limit or not open_ended:
         text += f", {seconds_left(report, limit):.0f} s left"
     return text if report.error is None else f"{text}, relMSE {report.error:.2g}"
 

@@ -20,10 +20,10 @@ from .image.layers import film_layers
 from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
-# Meaning of numeric arguments of a render, for messages; for parameters see `settings.PARAMETERS`.
+# Valid values of a render's arguments, for messages; for parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
-    "spp": f"samples per pixel, at most {UNLIMITED}, 0 for the sampler's sample_count",
-    "seed": "any number from 0 to 2^32 - 1",
+    "spp": f"an integer from 1 to {UNLIMITED}, or 0 for the sampler's sample_count",
+    "seed": f"an integer from 0 to {UNLIMITED}",
 }
 
 # Remedies for parameters that are mistaken for ours. Mitsuba's upgrade of scene files of version 0.6 writes
@@ -47,12 +47,12 @@ REMEDIES = {
 
 def integer(value, name: str, low: float, high: float = UNLIMITED) -> int:
     """Return an int in [low, high]; raises ``UsageTypeError`` and ``UsageError``."""
-    what = ARGUMENTS[name] if name in ARGUMENTS else PARAMETERS[name].what
     number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
+    what = f"must be {ARGUMENTS[name]}" if name in ARGUMENTS else ""
     if not number or not math.isfinite(value) or value != int(value):
-        raise UsageTypeError(f"{name}={value!r} must be an integer: {what}")
+        raise UsageTypeError(f"{name}={value!r} {what or f'must be an integer: {PARAMETERS[name].what}'}")
     if not low <= value <= high:
-        raise UsageError(f"{name}={value!r} is out of range; it is {what}")
+        raise UsageError(f"{name}={value!r} {what or f'is out of range; it is {PARAMETERS[name].what}'}")
     return int(value)
 
 
@@ -179,7 +179,7 @@ def _check_together(settings: Settings):
             "set max_depth, for example to 5"
         )
     by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
-    if settings.decisions and (by_hand or settings.strategy_images):
+    if settings.decisions is not None and (by_hand or settings.strategy_images):
         raise UsageError(
             "decisions together with light_paths, connections, skip or layers=strategies is "
             "contradictory; leave out one or the other"

@@ -95,6 +95,21 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("properties", "decided"), [([], True), ([("skip", "none")], False), ([("light_paths", 0)], False)]
+)
+def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
+    """Expected: parts of a render whose strategies parameters fix have these alone, since decisions beside
+    them are contradictory; parts of others have the client's decisions, none of a render without a pilot."""
+    arguments = ["render", str(SCENE), "--spp", "1", "-D", "resolution=8"]
+    options = build_parser().parse_args(arguments)
+    options.properties = properties
+    scene, integrator, _ = load(options)
+    job = cluster._job(scene, integrator, options, 1)
+    assert ("decisions" in dict(json.loads(job)["properties"])) == decided
+    assert cluster._loaded(job)[2].settings.decisions == (() if decided else None)
+
+
 def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
     values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the

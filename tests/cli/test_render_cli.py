@@ -478,7 +478,31 @@ def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
 
 def test_no_time_at_all_is_one_pass(scene, capsys):
     assert main(["render", str(scene), "--integrator", "bdpt", "--time", "0", "-o", "a.exr"]) == 0
-    assert " 1 spp " in capsys.readouterr().out
+    assert " 1 spp (24 samples); stopped by --time 0 after 1 spp" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("time", "target_error", "compiling", "words"),
+    [
+        (3.0, None, 55.0, "stopped by --time 3 after 1 of 1000000000 spp, compiling took 55 s"),
+        (3.0, None, 0.2, "stopped by --time 3 after 1 of 1000000000 spp"),
+        (None, 0.25, 55.0, "stopped by --target-error 0.25 after 1 of 1000000000 spp"),
+        (None, None, 0.2, "stopped by timeout=7 after 1 of 1000000000 spp"),
+    ],
+)
+def test_the_closing_line_says_what_stopped_a_render(time, target_error, compiling, words):
+    """Expected: the option or parameter, the samples there are and those there were to be, and the time of
+    compilation where it took much of the limit; nothing for a whole or interrupted render."""
+    job = SimpleNamespace(spp=10**9, time=time, target_error=target_error)
+    settings = SimpleNamespace(timeout=7.0 if time is None else time, target_error=target_error or 0.0)
+    integrator = SimpleNamespace(assemble=None, settings=settings)
+    statistics = {"seconds": {"compile": compiling}, "error": 0.2 if target_error else float("inf")}
+    outcome = render.Outcome(58.0, 1, statistics=statistics)
+    assert render.stopped_by(job, integrator, outcome, 10**9) == words
+    text = render.summary(Path("a.exr"), outcome, (6, 4), target_error or 0.0, words)
+    assert f"1 spp (24 samples); {words}; relMSE" in text
+    assert not render.stopped_by(job, integrator, render.Outcome(1.0, 10**9), 10**9)
+    assert not render.stopped_by(job, integrator, render.Outcome(1.0, 1, interrupted=True), 10**9)
 
 
 @pytest.mark.parametrize("kind", ["prb", "prbvolpath"])
@@ -555,7 +579,8 @@ def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
         np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
     arguments = ["--integrator", kind, "--time", "60", "--spp", "24", "-o", "b.exr"]
     assert main(["render", str(scene), *arguments]) == 0
-    assert " 24 spp " in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert " 24 spp " in out and "stopped" not in out
 
 
 @pytest.mark.parametrize(
@@ -663,7 +688,18 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
         (
             (),
             ["--integrator", "bdpt", "--spp", "9999999999"],
-            "spp=9999999999 is out of range.*at most 42949672",
+            "spp=9999999999 must be an integer from 1 to 4294967295, or 0 for the sampler's sample_count\n",
+        ),
+        ((), ["-P", "max_dept=4", "--integrator", "bdpt"])
+        + ("error: -P max_dept=4 is not a parameter; did you mean max_depth? Parameters:",),
+        ((), ["-P", "max_depth=four", "--integrator", "bdpt"])
+        + ("error: -P max_depth='four' must be an integer: the longest path",),
+        ((), ["-P", "decisions=[]", "-P", "skip=none", "--integrator", "bdpt"])
+        + ("error: -P decisions together with light_paths, connections, skip or",),
+        (
+            ("<boolean", '<integer name="max_dept" value="4"/><boolean'),
+            ["-P", "skip=none", "--integrator", "scene", "-D", "integrator=bdpt"],
+            "plain.xml (line 6, col 6): failed.*bdpt: max_dept=4 is not a parameter",
         ),
         (('"constant"', '"cnstant"'), [], 'Plugin "cnstant" not found! Did you mean constant?'),
         (('"hdrfilm"', '"hdr"'), [], "Did you mean hdrfilm?"),
@@ -804,6 +840,22 @@ def test_bad_values_are_usage_errors(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         build_parser().parse_args(["render", "scene.xml", *arguments])
     assert caught.value.code == 2 and "which must" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e9", 10**9), ("1.5e1", 15), ("16", 16), ("1.5", None), ("1e99", None), ("nan", None)],
+)
+def test_whole_numbers_may_have_an_exponent(text, value, capsys):
+    """Expected: any notation of a whole number that a float holds exactly; others are usage errors."""
+    arguments = ["render", "scene.xml", "--spp", text, "--threads", text]
+    if value is None:
+        with pytest.raises(SystemExit):
+            build_parser().parse_args(arguments)
+        assert f"got {text!r}, which must be a whole number of at least 1" in capsys.readouterr().err
+    else:
+        options = build_parser().parse_args(arguments)
+        assert options.spp == value == options.threads and isinstance(options.spp, int)
 
 
 @pytest.mark.parametrize(

@@ -814,6 +814,9 @@ def test_decisions_by_two_hands():
         bdpt(decisions=text, light_paths=1)
     with pytest.raises(RuntimeError, match="skip or layers=strategies is contradictory"):
         bdpt(decisions=text, layers="strategies")
+    for given in ({"skip": "none"}, {"light_paths": 0}, {"layers": "strategies", "max_depth": 3}):
+        with pytest.raises(RuntimeError, match="is contradictory"):  # no decision is a choice too
+            bdpt(decisions="[]", **given)
     with pytest.raises(RuntimeError, match="decisions=3 must be a string"):
         bdpt(decisions=3)
 

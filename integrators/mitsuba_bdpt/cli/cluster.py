@@ -19,6 +19,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, behind
 from ..files.loading import load
+from ..planning.budget import is_by_hand
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
@@ -92,6 +93,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     cover the parts that arrived. Raises errors of `connected`, and those before the first part.
     """
     started, merged = time.perf_counter(), Merged()
+    integrator.statistics = {}  # not those of the previous render
     ended: BaseException | None = None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
@@ -138,7 +140,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     The absolute path of the scene file, the options of `loading.load`, and the pilot's decisions.
     """
     properties, settings = dict(options.properties), integrator.settings
-    if settings.decisions is None:  # an empty list if there is no choice
+    if not is_by_hand(settings):  # an empty list if no pilot runs: parts, which are shorter, run none either
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")

@@ -148,7 +148,8 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
             write_json(job.statistics, {"settings": settings(job, spp)} | found)
         outcome.written()
         target = integrator.settings.target_error if is_ours(integrator) else 0
-        say(summary(job.output, outcome, sensor.film().crop_size(), target))
+        stopped = stopped_by(job, integrator, outcome, spp)
+        say(summary(job.output, outcome, sensor.film().crop_size(), target, stopped))
     finally:
         ending.patient = False
     if outcome.error is not None:
@@ -388,11 +389,35 @@ def plain(value):
     return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
-def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float) -> str:
+def stopped_by(job: Namespace, integrator: mi.Integrator, outcome: Outcome, spp: int) -> str:
+    """Return what ended a render before all of its ``spp`` samples per pixel; empty if nothing did.
+
+    With the time of compilation if that is a large part of a time limit.
+    """
+    if outcome.interrupted or outcome.spp >= spp:
+        return ""
+    done = f"{outcome.spp} spp" if is_open_ended(job) else f"{outcome.spp} of {spp} spp"
+    timeout, target = -1.0, 0.0
+    if is_ours(integrator):
+        timeout, target = integrator.settings.timeout, integrator.settings.target_error
+    if 0 < target and outcome.statistics.get("error", math.inf) <= target:
+        option = "target_error=" if job.target_error is None else "--target-error "
+        return f"stopped by {option}{target:g} after {done}"
+    option, limit = ("timeout=", timeout) if job.time is None else ("--time ", job.time)
+    if limit < 0:
+        return ""
+    compiling = outcome.statistics.get("seconds", {}).get("compile", 0)
+    spent = f", compiling took {compiling:.0f} s" if compiling > max(limit / 4, 1) else ""
+    return f"stopped by {option}{limit:g} after {done}{spent}"
+
+
+def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float, stopped: str) -> str:
+    """Return the closing line; ``stopped``: see `stopped_by`."""
     width, height = size
     parts = [
         f"{output}: {outcome.seconds:.1f} s",
         f"{outcome.spp} spp ({readable(outcome.spp * width * height)} samples)",
+        *([stopped] if stopped else []),
     ]
     rays = outcome.statistics.get("rays")
     if rays:

@@ -15,6 +15,9 @@ PropertyValue = bool | int | float | str
 RESUME = ("auto", "must", "never")
 """When a render goes on from a checkpoint: if there is one, in any case, or not at all."""
 
+MOST_EXACT = 2**53
+"""Up to this all whole numbers are exact as ``float``."""
+
 MOST_FRAMES = 1 << 20
 """Sensors in a range, at most."""
 
@@ -25,13 +28,25 @@ def number(kind: type, least: float, most: float = math.inf) -> Callable[[str], 
 
 
 def within(bounds: Number) -> Callable[[str], float]:
+    read = whole if bounds.kind is int else bounds.kind
+
     def parse(text: str) -> float:
         with contextlib.suppress(ValueError):
-            if bounds.holds(value := bounds.kind(text)):
+            if bounds.holds(value := read(text)):
                 return value
         raise argparse.ArgumentTypeError(f"got {text!r}, which must be {bounds}")
 
     return parse
+
+
+def whole(text: str) -> int:
+    """Parse a whole number, also with an exponent such as ``1e6``; ``ValueError`` for others."""
+    with contextlib.suppress(ValueError):
+        return int(text)
+    value = float(text)
+    if not value.is_integer() or abs(value) > MOST_EXACT:
+        raise ValueError(text)
+    return int(value)
 
 
 def size(text: str) -> tuple[int, ...]:

@@ -395,6 +395,8 @@ def _in_words(error: str, options: Namespace) -> str | None:
         return f"{error}{_files_near(options, missing[1])}"
     if suggested := _unused_parameters(error, options):
         return suggested
+    if ours := _of_the_command(error, options):
+        return ours
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
     given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
     if strange and given:
@@ -411,6 +413,15 @@ def _in_words(error: str, options: Namespace) -> str | None:
     if missing[1] == options.integrator:
         return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
     return f"{error} {question.capitalize()}".rstrip() if question else None
+
+
+def _of_the_command(error: str, options: Namespace) -> str | None:
+    """Return `bdpt`'s ``error`` about a property of the command line, without its place in the scene file.
+
+    None for other errors.
+    """
+    found = re.search(r'integrator plugin of type "bdpt": .*\b\w+Error: bdpt: ((\w+)\b.*)', error, re.DOTALL)
+    return f"-P {found[1]}" if found and found[2] in dict(options.properties) else None
 
 
 def _unused_parameters(error: str, options: Namespace) -> str | None:
