@@ -6,6 +6,7 @@ import mitsuba_bdpt.workers  # (it chooses the LLVM library; it must precede mit
 import mitsuba as mi
 import leftovers
 import pytest
+import short_pilots  # noqa: F401
 import variants
 from costs import (  # noqa: F401  (hooks of pytest)
     pytest_addoption,

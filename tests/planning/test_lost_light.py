@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
 
 from stress_cases.warned import Warned
@@ -217,22 +218,25 @@ def said_before(integrator, scene, spp, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "parameters, spp, passes",
+    "parameters, spp, long, passes",
     [
-        ({}, 64, [(64, 1)]),
-        ({}, 4, [(1, 0), (3, 1)]),
-        ({"skip": "none"}, 4, [(1, 0), (3, 1)]),
-        ({"light_paths": 0, "skip": "none"}, 4, [(1, 0), (3, 1)]),
+        ({}, 64, True, [(64, 1)]),
+        ({}, 4, True, [(1, 0), (3, 1)]),
+        ({"skip": "none"}, 4, True, [(1, 0), (3, 1)]),
+        ({"light_paths": 0, "skip": "none"}, 4, True, [(1, 0), (3, 1)]),
+        ({}, 4, False, [(4, 0)]),
     ],
-    ids=["pilot", "no pilot", "all strategies", "path tracing"],
+    ids=["pilot", "no pilot", "all strategies", "path tracing", "short"],
 )
-def test_it_is_said_before_the_samples_are_traced(parameters, spp, passes, monkeypatch):
+def test_it_is_said_before_the_samples_are_traced(parameters, spp, long, passes, monkeypatch):
     """Rationale: the warning came after the last pass, when the time was spent. Expected: before the first
-    pass where a pilot knows how bright the image is, else after a first pass of one sample per pixel, and not
-    again; the share that is stated is that of the whole image, within a fifth (both have the same estimate of
-    what is lost; noise of the image's mean, of 1,024 samples at least).
+    pass where a pilot knows how bright the image is, else after a first pass of one sample per pixel, or at
+    the end of a short render, and not again; the share that is stated is that of the whole image, within a
+    fifth (both have the same estimate of what is lost; noise of the image's mean, of 1,024 samples at least).
     """
     scene, integrator = scene_of(LAMPS["point"], block=BLOCK), bdpt(**parameters)
+    if long:
+        monkeypatch.setattr(rendering, "TWO_PASSES", 0)
     begun, warnings = said_before(integrator, scene, spp, monkeypatch)
     assert begun == passes and len(warnings) == 1
     share = float(re.search("about ([0-9]+) %", warnings[0])[1]) / 100

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import short_pilots
 from mitsuba_bdpt.planning import budget
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport import bsdf
@@ -109,6 +110,51 @@ def test_lit_rooms_are_decided(light):
         assert not render.plan.light
 
 
+@pytest.mark.parametrize(
+    ("spp", "expected"), [(1, [1]), (16, [16]), (64, [1, 63])], ids=["one sample", "an edit", "longer"]
+)
+def test_a_short_render_has_one_pass(spp, expected):
+    """Rationale: a first pass of one sample, from which roulette has its scale, has everything recorded a
+    second time, which takes longer than what roulette saves in a short render. Expected: one pass in a render
+    of 64^2 pixels and 16 samples each, as after an edit, without a pilot; two where the render is longer."""
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] |= {"width": 64, "height": 64}
+    scene, integrator = mi.load_dict(scene), mi.load_dict({"type": "bdpt", "skip": "impossible"})
+    render = Render(scene, scene.sensors()[0], integrator.settings, 0, spp)
+    assert [step.size for step in render._steps()] == expected
+
+
+def test_an_edit_of_a_small_render_asks_no_pilot(monkeypatch):
+    """Rationale: after each edit a render of 65,536 samples ran a pilot that took twice as long as itself.
+    Expected: 64^2 pixels of 16 samples run none, of 64 samples they do."""
+    monkeypatch.setattr(budget, "LEAST_SAMPLES", short_pilots.LEAST_SAMPLES)
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] |= {"width": 64, "height": 64}
+    scene, integrator = mi.load_dict(scene), mi.load_dict({"type": "bdpt"})
+    for spp, asked in ((16, False), (64, True)):
+        render = Render(scene, scene.sensors()[0], integrator.settings, 0, spp)
+        assert render.planner.begin(()) == asked
+
+
+GLASS = {"type": "sphere", "radius": 0.1, "bsdf": {"type": "dielectric"}}
+LAMPS = {f"lamp{i}": {"type": "point", "position": [0.1 * i, 0, 0]} for i in range(budget.MANY_EMITTERS)}
+
+
+@pytest.mark.parametrize(
+    ("more", "size", "served"),
+    [({}, 16, budget.UNFOCUSED), ({"ball": GLASS}, 16, 4), (LAMPS, 16, 4), ({}, 4, 1)],
+    ids=["diffuse", "glass", "many lamps", "few pixels"],
+)
+def test_light_subpaths_without_a_decision(more, size, served):
+    """Expected: few light subpaths in a diffuse room, more where glass focuses light or where next-event
+    estimation chooses among many lamps, and as many as camera subpaths on a film of few pixels."""
+    scene = mi.cornell_box()
+    scene["sensor"]["film"] |= {"width": size, "height": size}
+    scene, integrator = mi.load_dict(scene | more), mi.load_dict({"type": "bdpt"})
+    render = Render(scene, scene.sensors()[0], integrator.settings, 0, 1)
+    assert render.plan.camera_paths_per_light_path == served
+
+
 def test_rooms_of_many_bsdfs_ask_a_pilot():
     """Expected: one of 256 x 144 pixels and 32 samples each does, in a room of 40 materials, the most
     that `room` makes, of all its kinds."""
@@ -160,7 +206,7 @@ def test_bitmaps_do_not_cut_kernels(kernels):
     in rooms two seconds of a short render's four. Expected: of a scene that was just loaded all passes run
     the same kernel."""
     scene = mi.load_dict(room(2, 16))
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "decisions": "[]"})
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "decisions": "[]", "spp_per_pass": 2})
     integrator.render(scene, spp=4)
     assert len(integrator.statistics["passes"]) == 2
     large = [kernel for kernel in kernels if "Symbolic loop" in kernel]

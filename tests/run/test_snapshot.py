@@ -28,6 +28,7 @@ def bdpt(**parameters):
     ("rfilter", "parameters", "after"),
     [
         ("box", {}, 1),
+        ("box", {"skip": "impossible"}, 1),
         ("gaussian", {"skip": "none"}, 3),
         ("box", {"layers": "variance", "aovs": "dd:depth"}, 5),
         ("box", {"target_error": 1e-9}, 9),

@@ -2,6 +2,8 @@
 
 from importlib import import_module
 
+import short_pilots  # noqa: F401
+
 from .case import Case
 
 # Modules of this package, in the order of the table; each has a tuple ``CASES``.

@@ -161,7 +161,7 @@ class Accumulator:
         rows = image_count(self.depth, settings.merge_images) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
         self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
-        self._share = [self._covered(n) for n in self.size]
+        self._share = self._covered()
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
         size = [self.size[0], height or self.size[1]]
@@ -285,18 +285,21 @@ class Accumulator:
         x, y = self._share
         return spp * y[:, None] * x[None, :]
 
-    def _covered(self, n: int):
-        """Return each pixel's integral of the 1D filter over the camera samples' region."""
+    def _covered(self) -> list[np.ndarray]:
+        """Return each pixel's integral of the 1D filter over the camera samples' region, by axis."""
         if self.rfilter.is_box_filter():
-            return np.ones(n)  # camera samples lie in the pixel itself
+            return [np.ones(n) for n in self.size]  # camera samples lie in the pixel itself
         radius, steps = self.rfilter.radius(), 4096
         edges = np.linspace(-radius, radius, 2 * steps + 1)
         middle = (edges[1:] + edges[:-1]) / 2
         density = np.array(self.rfilter.eval(mi.Float(middle)), dtype=np.float64)
         cumulative = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
-        centre = np.arange(n) + 0.5
-        high = np.interp(n + self.border - centre, edges, cumulative)
-        return high - np.interp(-self.border - centre, edges, cumulative)
+        found = []
+        for n in self.size:
+            centre = np.arange(n) + 0.5
+            high = np.interp(n + self.border - centre, edges, cumulative)
+            found.append(high - np.interp(-self.border - centre, edges, cumulative))
+        return found
 
     def finish(self):
         """Store the image of all passes so far in the film."""

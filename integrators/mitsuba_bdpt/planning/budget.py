@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.bsdf import Traits
 from ..transport.plan import Plan
 
 # The pilot's share of a render's samples, bounds of the pilot's samples, and bounds of the render's samples:
-# a render below `LEAST_SAMPLES` runs no pilot; from `CHEAP_SAMPLES` on recording the pilot takes about 2 % of
-# the render. In between the pilot runs where the scene alone does not decide, once for all renders of a
-# scene. See docs/method/skipping.md and experiments, "First images".
+# from `LEAST_SAMPLES` on the pilot's gain pays for it in the first render of a scene; from `CHEAP_SAMPLES` on
+# recording the pilot takes about 2 % of the render. See experiments, "Short renders".
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
-LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14, 1 << 24
+LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 18, 1 << 24
 
 # Compilation per kind of BSDF and recording per BSDF of a pilot's kernel in a scene of many BSDFs
 # (`bsdf.MANY`), in samples of a render without a pilot. Longer renders run a pilot.
-SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 16, 1 << 11
+SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 15, 1 << 11
 
 # Multiple of that length from which on the pilot also predicts the gain of photon-guided BSDF sampling, which
 # takes three kernels instead of one; see experiments, "Choice of strategies".
@@ -35,6 +35,10 @@ EVEN = 100
 # light subpath per camera subpath, since camera subpaths that share one are correlated.
 FEW_PIXELS = 64
 
+# Camera subpaths per light subpath without a decision, in scenes without delta lobes and media and with fewer
+# emitters than `MANY_EMITTERS`; in others `possible.plan` has four. See experiments, "Short renders".
+UNFOCUSED, MANY_EMITTERS = 16, 16
+
 
 def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
     """Number of samples still to come in a render with at most ``left`` more.
@@ -47,10 +51,13 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
 
 def least_samples(traits: Traits) -> int:
     """Least number of samples of a render that runs a pilot; ``traits`` of the BSDFs."""
+    return max(LEAST_SAMPLES, samples_of_kernel(traits))
+
+
+def samples_of_kernel(traits: Traits) -> int:
+    """Compilation and recording of a pilot's kernel in samples; 0 without many BSDFs."""
     asked = traits.asked
-    if not asked.many:
-        return LEAST_SAMPLES
-    return SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count
+    return SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count if asked.many else 0
 
 
 def predicts_guiding(traits: Traits, samples: int) -> bool:
@@ -63,14 +70,16 @@ def lanes(samples: int) -> int:
     return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
-def first_plan(full: Plan, settings: Settings, pixels: int) -> Plan:
-    """The plan before any decision.
-
-    ``full``, but on few pixels with one light subpath per camera subpath, unless set by parameters.
-    """
-    return (
-        replace(full, camera_paths_per_light_path=1) if _is_auto(settings) and pixels < FEW_PIXELS else full
-    )
+def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: int) -> Plan:
+    """The plan before any decision: ``full`` with a number of light subpaths, unless set by parameters."""
+    if not full.light or not _is_auto(settings):
+        return full
+    if pixels < FEW_PIXELS:
+        return replace(full, camera_paths_per_light_path=1)
+    many = prepared.emitters.count >= MANY_EMITTERS
+    if many or prepared.delta or prepared.space is not None or settings.strategy_images:
+        return full
+    return replace(full, camera_paths_per_light_path=UNFOCUSED)
 
 
 def is_open(full: Plan, settings: Settings) -> bool:

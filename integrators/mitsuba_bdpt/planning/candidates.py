@@ -15,7 +15,8 @@ from .possible import UnreachablePaths, unreachable_paths
 # has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
 UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 0.7, 2, 1 << 20
 
-# Multiple of the least length of a render with a pilot from which on the pilot's gain there pays for it.
+# Multiple of the samples that a pilot's kernel takes (`budget.samples_of_kernel`) from which on the pilot's
+# gain there pays for it.
 UNIFORM_TIMES = 10
 
 # As in ``statistics["skipped"]``.
@@ -51,16 +52,16 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
 
 
 def without_pilot(
-    prepared: PreparedScene, full: Plan, settings: Settings, samples: int, least: int
+    prepared: PreparedScene, full: Plan, settings: Settings, samples: int, of_kernel: int
 ) -> Decision | None:
     """Decision for a render of ``samples`` samples that needs no pilot, or None.
 
-    Path tracing alone under a uniform environment in a render too short for a pilot (``least`` samples
-    elsewhere): camera subpaths hit the environment wherever its light enters, caustics included, and light
-    subpaths rarely find the way in.
+    Path tracing alone under a uniform environment in a render too short for a pilot, whose kernel takes as
+    long as ``of_kernel`` samples: camera subpaths hit the environment wherever its light enters, caustics
+    included, and light subpaths rarely find the way in.
     """
     contrast = prepared.emitters.contrast
-    most = max(UNIFORM_TIMES * least, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
+    most = max(UNIFORM_TIMES * of_kernel, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
     if samples >= most or not contrast <= EVEN:  # also if it is NaN
         return None
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):

@@ -116,7 +116,8 @@ class Planner:
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
         self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
         self._pixels = int(prepared.camera.region.size.prod())
-        self.full = self.plan = budget.first_plan(plan(prepared, settings), settings, self._pixels)
+        full = plan(prepared, settings)
+        self.full = self.plan = budget.first_plan(full, prepared, settings, self._pixels)
         self.threshold, self.changes, self.decided = None, 0, Decided()
         # Moments of the newest pilot with tables of emission.
         self._with_tables: Moments | None = None
@@ -328,8 +329,10 @@ class Planner:
             return f"it says nothing about films of fewer than {budget.FEW_PIXELS} pixels", None
         samples = self._expected(passes)
         whole = sum(passes) * self._pixels + samples
-        least = budget.least_samples(self._prepared.traits)
-        if decision := without_pilot(self._prepared, self.full, self._settings, whole, least):
+        least, of_kernel = (
+            count(self._prepared.traits) for count in (budget.least_samples, budget.samples_of_kernel)
+        )
+        if decision := without_pilot(self._prepared, self.full, self._settings, whole, of_kernel):
             return "the scene alone decides in a render as short as this", decision
         if samples < least:
             return f"{samples} samples are too few, it takes {least}", None

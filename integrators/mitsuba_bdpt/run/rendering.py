@@ -49,6 +49,10 @@ from .statistics import Meter, rays
 if TYPE_CHECKING:
     from ..merging import Passes
 
+# Least samples of a render whose first pass has one sample per pixel. In shorter ones recording a second pass
+# takes longer than what roulette saves.
+TWO_PASSES = 1 << 18
+
 
 @dataclass(frozen=True)
 class PassReport(Report):
@@ -210,10 +214,11 @@ class Render:
         Under ``timeout``, a pass takes at most about a tenth of it.
         """
         if self._small_first is None:
-            plan, decisions = self.plan, self.settings.decisions
+            decisions = self.settings.decisions
             known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
-            wanted = (plan.roulette and plan.light) or self._lost() is not None
-            self._small_first = bool(wanted and not known)
+            long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
+            wanted = long and not known and (self._plays_roulette() or self._lost() is not None)
+            self._small_first = bool(wanted)
         earlier = sum(self.passes)
         for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
@@ -234,7 +239,8 @@ class Render:
 
     def _pass(self, step: Step):
         """Trace one pass, with a launch for each batch."""
-        first = not self.passes and self.planner.threshold is None
+        if len(self.passes) == 1 and self.planner.threshold is None and self._plays_roulette():
+            self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
         if self.plan.guided:
             guide = self._guide()
             self.kernel.sds = None if guide is None else Guiding(guide)
@@ -250,8 +256,10 @@ class Render:
                 self.accumulator.evaluate(counts)
             self.meter.launched(counts)
         self.accumulator.close_pass(step.size)
-        if first and self.plan.roulette:
-            self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
+
+    def _plays_roulette(self) -> bool:
+        """Return whether contributions of strategies in use may play roulette."""
+        return self.plan.roulette and self.plan.light
 
     def _photons(self, step: Step, merging: Passes) -> SdsStrategy:
         """Trace the photons of a pass; returns their merging."""
