@@ -190,7 +190,7 @@ def test_sampled_density_is_the_density(name, mode):
     smooth, sampled, pdf = in_numpy(n, mi.Float(dr.select(smooth, 1, 0)), bs.pdf, pdf)
     used = smooth > 0
     assert used.any() == mi.has_flag(plugin.flags(), mi.BSDFFlags.Smooth)
-    if not draws.needs_full_pdf([plugin]):
+    if not draws.needs_full_pdf(draws.nested([plugin])):
         np.testing.assert_allclose(sampled[used], pdf[used], rtol=1e-3)
 
 
@@ -228,8 +228,8 @@ def test_nested_plugins_are_found(monkeypatch):
         tilted,
     ):
         for deep in (wrap, lambda b, wrap=wrap: {"type": "mask", "nested": wrap(b)}):
-            assert draws.needs_full_pdf([mi.load_dict(deep(ROUGH))])
-            assert not draws.needs_full_pdf([mi.load_dict(deep(GREY))])
+            assert draws.needs_full_pdf(draws.nested([mi.load_dict(deep(ROUGH))]))
+            assert not draws.needs_full_pdf(draws.nested([mi.load_dict(deep(GREY))]))
 
 
 def test_every_plugin_is_covered():

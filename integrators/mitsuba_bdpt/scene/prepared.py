@@ -37,7 +37,7 @@ class PreparedScene:
         self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
         delta = int(mi.BSDFFlags.Delta)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
-        self.traits = bsdf.Traits.of(found)
+        self.traits = bsdf.Traits.of(found, sum(map(is_instance, scene.shapes())))  # a BSDF each
         self.space = self.light_media = None
         if media := media_of(scene, [sensor]):
             self.space, self.light_media = components.media.prepare(
@@ -60,7 +60,8 @@ def _prepare_bitmaps(found):
     the first pass into two kernels.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
-    held = (v for owner in draws.nested(found) for v in children(owner).values() if isinstance(v, mi.Texture))
+    owners = draws.nested({id(b): b for b in found}.values())
+    held = (v for owner in owners for v in children(owner).values() if isinstance(v, mi.Texture))
     for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
         for evaluate in (texture.eval, texture.eval_1, texture.eval_3):
             try:

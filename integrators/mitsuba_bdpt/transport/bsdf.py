@@ -9,9 +9,9 @@ bump and normal maps, interpolated normals and hair; Mitsuba's importance mode w
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -89,15 +89,26 @@ class Traits:
         return self.asked(si.bsdf(), ask, si, active)
 
     @staticmethod
-    def of(bsdfs: Sequence[mi.BSDF]) -> Traits:
-        """Traits of BSDFs that one virtual call may visit."""
+    def of(bsdfs: Iterable[mi.BSDF], unhit: int = 0) -> Traits:
+        """Traits of the BSDFs that rays can hit; ``unhit``: number of the scene's others, see `Asked`.
+
+        BSDFs nested in ``bsdfs`` do not count as ``unhit``.
+        """
+        hit = {id(bsdf): bsdf for bsdf in bsdfs}
+        inner = {id(bsdf): bsdf for bsdf in nested(hit.values())}
+        flags = [int(bsdf.flags()) for bsdf in hit.values()]
         through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
-        glossy = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) for bsdf in bsdfs)
-        transmits = any(bsdf.flags() & through for bsdf in bsdfs)
-        mapped = any(b.class_name() in draws.MAPS for b in nested(bsdfs))
-        parts = any(draws.by_parts(b) for b in bsdfs)
+        parts = any(draws.by_parts(b) for b in hit.values())
+        full_pdf = needs_full_pdf(inner.values())
+        unhit += len(inner.keys() - hit.keys())
         return Traits(
-            needs_full_pdf(bsdfs), needs_round_trip(bsdfs), Asked(bsdfs), glossy, transmits, mapped, parts
+            full_pdf=full_pdf,
+            round_trip=needs_round_trip(inner.values()),
+            asked=Asked(hit.values(), None if full_pdf or parts else unhit),
+            glossy=any(f & int(mi.BSDFFlags.Glossy) for f in flags),
+            transmits=any(f & through for f in flags),
+            mapped=any(b.class_name() in draws.MAPS for b in inner.values()),
+            parts=parts,
         )
 
 
@@ -107,21 +118,28 @@ class Traits:
 # `planning.choice.MANY_KINDS`.
 MANY = 10
 
+# Largest number of the scene's BSDFs that no ray hits, relative to the others, up to which Mitsuba's virtual
+# calls are used. Recorded in C++, a call of a simple BSDF costs a quarter of one through Python.
+_UNHIT = 0.25
+
 # Points at which null transmission is tested.
 _ASKED = 4096
 
 
 class Asked:
-    """Virtual calls of ``bsdfs`` only.
+    """Virtual calls of ``bsdfs``.
 
     Mitsuba's visit all BSDFs of the process, each with a function in the kernel: also nested ones, which no
-    ray hits, and those of other scenes.
+    ray hits, and those of other scenes. They are used for `MANY` BSDFs none of which needs a correction,
+    beside few that no ray hits (``unhit``; None: some need a correction). Other scenes do not decide, since
+    an image must not depend on them. Else calls go through Python to ``bsdfs`` alone.
     """
 
-    def __init__(self, bsdfs: Iterable[mi.BSDF]):
+    def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
         by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
         self.bsdfs = list(by_id.values())
         self.many = len(by_id) >= MANY
+        self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
         numbers = [0] * (max(by_id, default=0) + 1)
         for number, index in enumerate(by_id):
             numbers[index] = number
@@ -131,7 +149,7 @@ class Asked:
     def count(self) -> int:
         return len(self.bsdfs)
 
-    @property
+    @cached_property
     def kinds(self) -> int:
         """Number of BSDF structures; BSDFs of one share the functions of a kernel."""
         return len({draws.structure(bsdf) for bsdf in self.bsdfs})
@@ -142,7 +160,7 @@ class Asked:
         A BSDF instead of a pointer needs no virtual call.
         """
         # In evaluated mode calls of Python functions fail for `plastic`; its own methods do not.
-        if isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
+        if self.by_mitsuba or isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
             return question(bsdf, *args)
         number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
         return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
@@ -194,14 +212,19 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
     """Value and densities of ``wo`` and the reverse; the other direction is ``si.wi``."""
 
     def ask(self, si, wo, active):
-        ctx = mi.BSDFContext()
-        if traits.mapped:  # Mitsuba's bump shadowing squares the cosine: 0 times infinity in one plane
-            active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
-        value, pdf = self.eval_pdf(ctx, si, wo, active)
-        value = polarization.in_world(si, value, -wo, si.wi)
-        return value, pdf, self.pdf(ctx, with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
+        value, pdf = _value_and_pdf(self, si, wo, active, traits)
+        pdf_rev_w = self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
+        return value, pdf, pdf_rev_w
 
     return traits.asked(bsdf, ask, si, wo, active)
+
+
+def _value_and_pdf(bsdf, si, wo, active, traits: Traits):
+    """Value (in world frames) and density of the local direction ``wo``, in one call."""
+    if traits.mapped:  # Mitsuba's bump shadowing squares the cosine: 0 times infinity in one plane
+        active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    return polarization.in_world(si, value, -wo, si.wi), pdf
 
 
 def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
@@ -267,7 +290,7 @@ def sample_adjoint(
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=True)
-        weight = _adjoint_weight(bsdf, si, drawn, sampled, traits)
+        weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
         return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
 
     drawn, weight, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
@@ -287,13 +310,10 @@ def _answers(questions, asked: Asked, target, bsdf, *args):
     return asked.together(bsdf, lambda bsdf, *args: questions(bsdf, *args[:-1]), *args, *joined, mask)
 
 
-def _adjoint_weight(bsdf, si, drawn: _Drawn, active, traits: Traits):
+def _adjoint_weight(si, drawn: _Drawn, traits: Traits):
     """Weight of a light subpath's sample without the ratio of geometric cosines."""
     bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-    weight = mi.Spectrum(0)
-    if not traits.only_delta:
-        f = _evaluation(*_evaluated_adjoint(bsdf, si, bs.wo, active & ~delta, traits))
-        weight = f.value / drawn.density
+    weight = mi.Spectrum(0) if drawn.value is None else drawn.value / drawn.density
     # Removes the factor eta^-2 of radiance on camera subpaths.
     eta2 = dr.square(bs.eta)
     delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
@@ -308,7 +328,9 @@ class _Drawn:
 
     ``weight`` and densities (delta: ``pdf_fwd_w`` is the probability of the event, ``pdf_rev_w`` unset);
     ``back``, if `_asks_back`: weight of the delta event sampled from its other end, 0 if it does not lead
-    back; ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled by parts.
+    back; ``value``, of light subpaths with more than delta lobes: of the direction from its other end (NaN
+    as in `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled
+    by parts.
     """
 
     bs: mi.BSDFSample3f
@@ -316,6 +338,7 @@ class _Drawn:
     pdf_fwd_w: mi.Float
     pdf_rev_w: mi.Float
     back: mi.Spectrum
+    value: mi.Spectrum | None = None
     of_parts: tuple[mi.Float, mi.Bool] | None = None
 
     @property
@@ -345,10 +368,16 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         density = found.density if draws.by_parts(self) else pdf_fwd_w
-        pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth) if traits.reverse else mi.Float(0)
+        value, pdf_rev_w, reverse = None, mi.Float(0), with_wi(si, bs.wo)
+        if adjoint and not traits.only_delta:
+            value, pdf = _value_and_pdf(self, reverse, si.wi, smooth, traits)
+            value = _evaluation(value, pdf_fwd_w, pdf).value
+            pdf_rev_w = pdf if traits.reverse else pdf_rev_w
+        elif traits.reverse:
+            pdf_rev_w = self.pdf(ctx, reverse, si.wi, smooth)
         asks = _asks_back(traits, adjoint)
         back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
-        answers = bs, weight, pdf_fwd_w, pdf_rev_w, back
+        answers = bs, weight, pdf_fwd_w, pdf_rev_w, back, value
         return (*answers, (density, found.rejected)) if traits.parts else answers
 
     return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
@@ -428,11 +457,11 @@ def _is_scalar(matrix: mi.Spectrum) -> bool:
 
 
 def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether a delta event may exist from one end only: with bump or normal maps.
+    """Whether a delta event of ``bsdfs``, nested ones included, may exist from one end only.
+
+    That is, with bump or normal maps.
 
     Mitsuba's maps reject sampled directions (not incident ones) on different sides of the surface and of the
     perturbed normal, and flip the normal towards the incident direction.
     """
-    return any(
-        b.class_name() in draws.MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in nested(bsdfs)
-    )
+    return any(b.class_name() in draws.MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in bsdfs)

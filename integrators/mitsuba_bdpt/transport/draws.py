@@ -197,12 +197,12 @@ def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
 
 
 def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether a BSDF's sample() may report a density other than its pdf().
+    """Whether sample() of one of ``bsdfs``, nested ones included, may report a density other than its pdf().
 
     The density of the picked lobe gives an unbiased ``weight``, but serves neither in weights of multiple
     importance sampling nor as divisor of a full evaluation.
     """
-    return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in nested(bsdfs))
+    return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in bsdfs)
 
 
 def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
