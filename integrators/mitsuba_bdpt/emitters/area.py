@@ -21,6 +21,7 @@ from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import children, named, number, own_parameters
+from ..host.notices import State
 from .group import Context, Group, HitOnlyEmitters, weight_over
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .surfaces import Surfaces, spheres_of
@@ -139,7 +140,7 @@ class AreaEmitters(Group):
         self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
         self.redraws = rows(how, False, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE))
         self._redrawn = Mask([e and r for e, r in zip(emitters, self.redraws, strict=True)])
-        self._textured = TexturedPoints(emitters, spheres, mapped)
+        self._textured = TexturedPoints(emitters, spheres, mapped, context.facts)
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
         self._facts = context.facts
@@ -154,7 +155,13 @@ class AreaEmitters(Group):
         self._spheres = table(found)
         for index, (emitter, _) in enumerate(pairs):
             if how[index] in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or found[index].inner_radius > 0:
-                check_densities(self, emitter, index, how[index] is not _Sampled.BY_MAP)
+                self._check_densities(emitter, index, how[index], context)
+
+    def _check_densities(self, emitter, index: int, how: _Sampled, context: Context):
+        """`check_densities`, repeated after an edit of the shape or of the radiance."""
+        check = partial(check_densities, self, emitter, index, how is not _Sampled.BY_MAP)
+        state = how, context.by_shapes, State.of([emitter])
+        context.facts.about("densities", check, emitter.get_shape(), state=state)
 
     # -- densities of points ----------------------------------------------------------------
 

@@ -44,7 +44,7 @@ class Surfaces:
         look = partial(SmoothMeshes.of, emitters)
         self._smooth_meshes = context.facts.about("smooth meshes", look, *shapes)
         self.smooth = self._smooth_meshes is not None
-        areas = rows(emitters, 1.0, lambda emitter: dr.slice(emitter.get_shape().surface_area()))
+        areas = rows(emitters, 1.0, partial(_area, context))
         if 0 in areas:
             emitter = emitters[areas.index(0)]
             raise UsageError(
@@ -55,7 +55,8 @@ class Surfaces:
         dr.make_opaque(self.inv_area)
         self._emitters, self._shape_errors = emitters, context.shape_errors
         by_shape = by_shape or rows(emitters, None, lambda _: False)
-        self._textured = textured or TexturedPoints(emitters, spheres, rows(emitters, None, lambda _: False))
+        none = rows(emitters, None, lambda _: False)
+        self._textured = textured or TexturedPoints(emitters, spheres, none, context.facts)
         mapped = self._textured.chosen
         self.own = Mask(
             [
@@ -68,7 +69,7 @@ class Surfaces:
         if any(turned):
             pairs = zip(spheres, turned, strict=True)
             self._turned = table([_Turned(s.center, s.outward) if t else _Turned() for s, t in pairs])
-        self._reversed = Mask([e and is_reversed(e.get_shape()) for e in emitters])
+        self._reversed = Mask(rows(emitters, None, partial(_is_reversed, context)))
 
     def sample(self, chosen, u, shared, active):
         """Sample a ``PositionSample3f`` (density over area) and its geometric normal."""
@@ -138,6 +139,16 @@ def spheres_of(emitters, context: Context) -> list[Sphere | None]:
         return context.facts.about("sphere", lambda: Sphere.of(shape), shape)
 
     return rows(emitters, None, sphere)
+
+
+def _is_reversed(context: Context, emitter: mi.Emitter) -> bool:
+    shape = emitter.get_shape()
+    return context.facts.about("reversed", partial(is_reversed, shape), shape)
+
+
+def _area(context: Context, emitter: mi.Emitter) -> float:
+    shape = emitter.get_shape()
+    return context.facts.about("area", lambda: dr.slice(shape.surface_area()), shape)
 
 
 def _check_to_world(emitter: mi.Emitter) -> None:

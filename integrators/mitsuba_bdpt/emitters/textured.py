@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry.quadrics import Sphere, sphere_normal
+from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import children, matrix_of
 from .tables import Mask, look_up, switch, table
 
@@ -61,12 +62,18 @@ class _Map:
 class TexturedPoints:
     """The lights among ``emitters`` (see `surfaces.Surfaces`) that ``chosen`` flags."""
 
-    def __init__(self, emitters, spheres, chosen):
+    def __init__(self, emitters, spheres, chosen, facts: ShapeFacts):
         self.chosen, self.mask = chosen, Mask(chosen)
-        if self.mask.any:
-            found = list(zip(emitters, spheres, chosen, strict=True))
-            self._textures = [children(e)["radiance"] if c else None for e, _, c in found]
-            self._maps = table([_Map.of(e.get_shape(), s) if c else _Map() for e, s, c in found])
+        if not self.mask.any:
+            return
+
+        def map_of(emitter: mi.Emitter, sphere: Sphere | None) -> _Map:
+            shape = emitter.get_shape()
+            return facts.about("map", lambda: _Map.of(shape, sphere), shape)
+
+        found = list(zip(emitters, spheres, chosen, strict=True))
+        self._textures = [children(e)["radiance"] if c else None for e, _, c in found]
+        self._maps = table([map_of(e, s) if c else _Map() for e, s, c in found])
 
     def sample(self, index, time, u, active):
         """Sample a ``PositionSample3f`` (density over area) of the light ``index``."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import TypeVar
 
 import drjit as dr
@@ -27,7 +27,7 @@ class ShapeFacts:
         for shape in all_shapes(scene):
             check_inverse(shape)
         self.errors = ShapeErrors(scene)
-        self._found: dict[tuple, object] = {}
+        self._found: dict[tuple, tuple[Hashable, object]] = {}
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
@@ -41,15 +41,19 @@ class ShapeFacts:
         key = State.of(shapes, deep=False), tuple(own)
         return cached(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
 
-    def about(self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None) -> Found:
+    def about(
+        self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None, state: Hashable = None
+    ) -> Found:
         """Return the cached result of ``find()`` for a ``kind`` of fact and its ``shapes``.
 
-        It must depend on the own parameters of these alone; errors are not cached.
+        It must depend on the own parameters of these and on ``state`` alone, of which the latest is cached;
+        errors are not.
         """
         key = kind, *(None if shape is None else _number(shape) for shape in shapes)
-        if key not in self._found:
-            self._found[key] = find()
-        return self._found[key]  # type: ignore[return-value]
+        known = self._found.get(key)
+        if known is None or known[0] != state:
+            known = self._found[key] = state, find()
+        return known[1]  # type: ignore[return-value]
 
 
 def _number(shape: mi.Shape) -> int:
