@@ -31,6 +31,7 @@ import variants
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.emitters import emitters
 from mitsuba_bdpt.geometry import rays, rounding
+from mitsuba_bdpt.geometry.hits import Hits
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
@@ -603,6 +604,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         points=Nothing(),
         within_store=lambda edges: mi.Bool(edges <= k),
         shape_errors=Flat(),
+        hits=Hits(scene, None),
         space=None,
         light_media=None,
         sds=None,

@@ -13,7 +13,7 @@ from ..geometry import rays
 from ..geometry.quadrics import Sphere, sphere_normal
 from ..geometry.smooth_meshes import SmoothMeshes
 from ..geometry.to_world import check_to_world, is_reversed
-from ..host.introspection import named
+from ..host.introspection import named, number
 from .group import Context
 from .tables import Mask, look_up, rows, switch, table
 from .textured import TexturedPoints
@@ -148,7 +148,7 @@ def _is_reversed(context: Context, emitter: mi.Emitter) -> bool:
 
 def _area(context: Context, emitter: mi.Emitter) -> float:
     shape = emitter.get_shape()
-    return context.facts.about("area", lambda: dr.slice(shape.surface_area()), shape)
+    return context.facts.about("area", lambda: number(shape.surface_area()), shape)
 
 
 def _check_to_world(emitter: mi.Emitter) -> None:

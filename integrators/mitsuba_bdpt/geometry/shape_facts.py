@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from typing import TypeVar
 
-import drjit as dr
 import mitsuba as mi
 
-from ..host.introspection import all_shapes
+from ..host.introspection import all_shapes, registry_index
 from ..host.notices import State, cached
+from .hits import Instances
 from .rounding import ShapeErrors
 from .to_world import check_inverse
 
@@ -17,7 +17,7 @@ Found = TypeVar("Found")
 
 
 class ShapeFacts:
-    """The `ShapeErrors` of a scene (``errors``), and facts about single shapes.
+    """The `ShapeErrors` (``errors``) and `Instances` of a scene, and facts about single shapes.
 
     Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
     own calls disagree (`check_inverse`).
@@ -26,7 +26,7 @@ class ShapeFacts:
     def __init__(self, scene: mi.Scene):
         for shape in all_shapes(scene):
             check_inverse(shape)
-        self.errors = ShapeErrors(scene)
+        self.errors, self.instances = ShapeErrors(scene), Instances.of(scene)
         self._found: dict[tuple, tuple[Hashable, object]] = {}
 
     @classmethod
@@ -37,7 +37,7 @@ class ShapeFacts:
         looked up: the cache may belong to another scene, see `notices.notes`.
         """
         shapes = all_shapes(scene)
-        own = [(_number(s), s.class_name(), s.has_flipped_normals(), repr(s.bbox())) for s in shapes]
+        own = [(registry_index(s), s.class_name(), s.has_flipped_normals(), repr(s.bbox())) for s in shapes]
         key = State.of(shapes, deep=False), tuple(own)
         return cached(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
 
@@ -49,13 +49,8 @@ class ShapeFacts:
         It must depend on the own parameters of these and on ``state`` alone, of which the latest is cached;
         errors are not.
         """
-        key = kind, *(None if shape is None else _number(shape) for shape in shapes)
+        key = kind, *(None if shape is None else registry_index(shape) for shape in shapes)
         known = self._found.get(key)
         if known is None or known[0] != state:
             known = self._found[key] = state, find()
         return known[1]  # type: ignore[return-value]
-
-
-def _number(shape: mi.Shape) -> int:
-    """Registry index of a shape in Dr.Jit."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])

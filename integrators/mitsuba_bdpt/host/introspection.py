@@ -37,11 +37,25 @@ def is_instance(shape: mi.Shape) -> bool:
     return shape.class_name() == "Instance"
 
 
+def shape_groups(scene: mi.Scene) -> list[mi.Shape]:
+    """Return the scene's shape groups."""
+    shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
+    return [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
+
+
+def shapes_in(group: mi.Shape) -> list[mi.Shape]:
+    """Return the shapes of a shape group, in the order of their indices at hits."""
+    return [shape for shape in children(group).values() if isinstance(shape, mi.Shape)]
+
+
+def registry_index(shape: mi.Shape) -> int:
+    """Index of a shape in Dr.Jit's registry."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+
+
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes in the scene's shape groups, which instances do not expose."""
-    shapes = [c for c in children(scene).values() if isinstance(c, mi.Shape)]
-    groups = [shape for shape in shapes if shape.class_name().startswith("ShapeGroup")]
-    return [s for group in groups for s in children(group).values() if isinstance(s, mi.Shape)]
+    return [shape for group in shape_groups(scene) for shape in shapes_in(group)]
 
 
 def all_shapes(scene: mi.Scene) -> list[mi.Shape]:

@@ -7,6 +7,7 @@ import mitsuba as mi
 
 from .. import components
 from ..emitters.emitters import Emitters
+from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, check_not_animated, children, is_instance, media_of
 from ..sensors.checks import check_sensor, views
@@ -19,9 +20,9 @@ from .plugin_claims import check_plugins
 class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
-    ``emitters``, ``camera``: the endpoints; ``smooth``, ``delta``, ``refracts``: some BSDF has such a lobe;
-    ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``, in which light subpaths
-    start, are None in scenes without media.
+    ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``smooth``, ``delta``, ``refracts``:
+    some BSDF has such a lobe; ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``,
+    in which light subpaths start, are None in scenes without media.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -29,7 +30,8 @@ class PreparedScene:
         self.scene = scene
         check_plugins(scene, sensor)
         self.surfaces = bool(scene.shapes())
-        self.emitters = Emitters(scene, ShapeFacts.of(scene, sensor))
+        facts = ShapeFacts.of(scene, sensor)
+        self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.instances)
         check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)

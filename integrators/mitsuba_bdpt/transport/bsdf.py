@@ -213,7 +213,9 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
 
     def ask(self, si, wo, active):
         value, pdf = _value_and_pdf(self, si, wo, active, traits)
-        pdf_rev_w = self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
+        pdf_rev_w = (
+            self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
+        )
         return value, pdf, pdf_rev_w
 
     return traits.asked(bsdf, ask, si, wo, active)

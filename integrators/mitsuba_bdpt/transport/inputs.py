@@ -94,7 +94,7 @@ class Kernel:
         tables = plan.emission
         self.emitters = prepared.emitters if tables is None else tables.guided(prepared.emitters)
         self.plan, self.heuristic = plan, heuristic
-        self.shape_errors = prepared.emitters.shape_errors
+        self.shape_errors, self.hits = prepared.emitters.shape_errors, prepared.hits
         self.surfaces, self.refracts = prepared.surfaces, prepared.refracts
         # Whether a strategy in use starts from the light's side, so that weights need reverse densities.
         self.reverse = plan.light or plan.merging or plan.guided > 0

@@ -15,7 +15,6 @@ import mitsuba as mi
 
 from ..emitters.records import Direct
 from ..geometry import polarization, rays
-from ..host import renamed
 from ..sampling.points import Purpose
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, scattering, spectra
@@ -245,13 +244,13 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
     landing = tr = volume = None
     if kernel.space is None:
-        si = walk.pi.compute_surface_interaction(ray, renamed.hit_flags(), walk.active)
+        si = kernel.hits.at(walk.pi, ray, walk.active)
         hit = walk.active & si.is_valid()
         throughput = walk.throughput
     else:
         landing = _landing(kernel, side, walk, ray, stream)
         ray.o, volume, throughput = landing.o, landing.collided, landing.throughput
-        si = _landed(landing, ray, walk.active)
+        si = _landed(kernel, landing, ray, walk.active)
         hit = walk.active & (si.is_valid() | volume)
         tr = landing.edge.weight_transmittance()
     cos = volume_cosine(si, walk.d, volume)
@@ -310,9 +309,9 @@ def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream):
     return kernel.space.advance(ray, walk, word, hidden)
 
 
-def _landed(landing, ray, active) -> mi.SurfaceInteraction3f:
+def _landed(kernel: Kernel, landing, ray, active) -> mi.SurfaceInteraction3f:
     """The surface at the end of an edge; in a medium a point without normal and shape."""
-    si = landing.pi.compute_surface_interaction(ray, renamed.hit_flags(), active & ~landing.collided)
+    si = kernel.hits.at(landing.pi, ray, active & ~landing.collided)
     point = dr.zeros(mi.SurfaceInteraction3f)
     point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
     point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
