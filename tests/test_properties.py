@@ -697,7 +697,7 @@ def test_explain():
             "wall": {"type": "sphere", "radius": 3, "bsdf": diffuse()},
         }
     )
-    assert "lost: " in integrator(light_paths=0).explain(glass)
+    assert "not sampled: " in integrator(light_paths=0).explain(glass)
 
 
 BEAM = {"type": "rectangle", "emitter": {"type": "directionalarea", "radiance": 1.0}}
@@ -708,21 +708,21 @@ METER = {"type": "rectangle"}
 @pytest.mark.parametrize(
     "lamp, area, parameters, expected",
     [
-        (GLASS_LAMP, False, {}, ["no two neighbours can be connected"]),
-        (GLASS_LAMP, False, {"light_paths": 0}, ["needs t=1", "needs inner", "no two neighbours"]),
-        (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "no two neighbours"]),
+        (GLASS_LAMP, False, {}, ["SDS: no connectible edge"]),
+        (GLASS_LAMP, False, {"light_paths": 0}, ["needs t=1", "needs inner", "SDS"]),
+        (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "SDS"]),
         (GLASS_LAMP, True, {}, []),
-        (GLASS_LAMP, True, {"stored_vertices": 4}, ["longer than 4 edges"]),
+        (GLASS_LAMP, True, {"stored_vertices": 4}, ["more than 4 edges"]),
         (
             GLASS_LAMP,
             True,
             {"light_paths": 0},
-            ["needs t=1", "needs inner", "no two", "needs t=0", r"delta emitter, sensor .needs \(1,1\)"],
+            ["needs t=1", "needs inner", "SDS", "needs t=0", r"delta emitter - sensor .needs \(1,1\)"],
         ),
         (BEAM, False, {}, []),
         (BEAM, False, {"light_paths": 0}, ["directionalarea.*needs t=1", "directionalarea.*needs inner"]),
         (BEAM, False, {"connections": "none"}, ["directionalarea.*needs inner"]),
-        (BEAM, True, {"light_paths": 0}, ["needs t=1", "needs inner", "directionalarea, sensor .needs t=0"]),
+        (BEAM, True, {"light_paths": 0}, ["needs t=1", "needs inner", "directionalarea - sensor .needs t=0"]),
     ],
 )
 def test_explain_says_what_is_lost(lamp, area, parameters, expected):
@@ -738,13 +738,13 @@ def test_explain_says_what_is_lost(lamp, area, parameters, expected):
     wall = {"type": "sphere", "radius": 3, "bsdf": diffuse()}
     scene = mi.load_dict({"type": "scene", "lamp": lamp, "ball": ball, "wall": wall, **eye})
     text = integrator(max_depth=32, **parameters).explain(scene)
-    lost = [line for line in text.splitlines() if line.startswith("lost: ")]
+    lost = [line for line in text.splitlines() if line.startswith("not sampled: ")]
     assert len(lost) == len(expected), text
     for line, pattern in zip(lost, expected, strict=True):
         assert re.search(pattern, line), text
 
 
-@pytest.mark.parametrize("albedo, vertex", [(0.5, "surface or scattering in a medium"), (0.0, "surface")])
+@pytest.mark.parametrize("albedo, vertex", [(0.5, "vertex (on a surface or in a medium)"), (0.0, "vertex")])
 def test_explain_says_what_is_lost_in_fog(albedo, vertex):
     """Rationale: in fog a path between two panes of glass has a scattering in the place of a surface, and
     null surfaces are no delta surfaces. Expected: the sentence names both, where the fog scatters; without
@@ -757,10 +757,11 @@ def test_explain_says_what_is_lost_in_fog(albedo, vertex):
         wall = {"type": "sphere", "radius": 3, "bsdf": diffuse()}
         scene = mi.load_dict({"type": "scene", "lamp": GLASS_LAMP, "ball": ball, "wall": wall, "eye": eye})
         text = integrator(max_depth=32).explain(scene)
-        return [line for line in text.splitlines() if line.startswith("lost: ")]
+        return [line for line in text.splitlines() if line.startswith("not sampled: ")]
 
     (line,) = lost("dielectric")
-    assert f"a single other {vertex}, delta surfaces, sensor" in line
+    assert f"specular - one non-specular {vertex} - specular - sensor (SDS: no connectible edge" in line
+    assert ("leaves out vertices in media" in line) == (albedo > 0)
     assert not lost("null")
 
 

@@ -68,9 +68,9 @@ assert np.array(images["point in glass, path"]).max() == 0
 # %% [markdown]
 # ## Reading `explain`
 #
-# Which strategies are used, which are skipped and why. With `spp` it runs the pilot of such a render too: a table of
-# ways to render, with the time that each needs for the same error over that of the best. "impossible" follows from the
-# scene, "not worth its cost here" from the pilot.
+# Which strategies are used, which are skipped and why, and which paths are not sampled. With `spp` it runs the pilot of
+# such a render too: a table of configurations, with the time that each needs for the same error relative to the chosen
+# one. "impossible" follows from the scene, "not worth its cost here" from the pilot.
 
 # %%
 print(bdpt.explain(glass, spp=4096))

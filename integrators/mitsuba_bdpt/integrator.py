@@ -174,12 +174,13 @@ class BDPTIntegrator(metaclass=ABCMeta):
             render.replay()
         planner = render.planner
         confidence = planner.confidence(render.passes) if table else 0.0
-        lost = planner.lost_by_pilots()
-        text = explain(render.prepared, render.plan, self.settings, table, confidence, lost)
-        if loss := render.predicted_loss():
-            text += f"\nlost light: {loss.removeprefix(UsageError.prefix)}"
+        invalid, loss = planner.lost_by_pilots(), render.predicted_loss().removeprefix(UsageError.prefix)
+        text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, loss)
         if spp is None and is_open(render.plan, self.settings):
-            return f"{text}\nspp not given: a render may leave out more, by the scene or a pilot"
+            return (
+                f"{text}\nno spp given: this is the plan before the pilot; with spp=..., the scene or a "
+                "pilot may choose other numbers of light subpaths, other weights and guided emission"
+            )
         return text if table or spp is None else f"{text}\n{planner.why_no_pilot()}"
 
     @_without_gradients

@@ -69,7 +69,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     if name == "cornell_box":  # tables of emission and all else that was decided go to the parts
         assert decided["emission"] and decided["joined"] == 4
     assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15", scene=path)) == 0
-    assert "samples are too few" in rendered.image(tmp_path / "short.exr", "RGB")[1]["no_pilot"]
+    assert "samples, a pilot needs" in rendered.image(tmp_path / "short.exr", "RGB")[1]["no_pilot"]
     options = Namespace(
         scene=path,
         defines=[("resolution", "32")],

@@ -383,10 +383,10 @@ def test_bdpt_reports_its_statistics(scene, capsys):
     assert statistics["rays"]["camera"] == 4 * 6 * 4
     out = capsys.readouterr().out
     assert "rays (camera 96" in out and out.count("\n") == 1
-    assert "no pilot: there is nothing to choose: chosen by hand" in out
+    assert "no pilot: nothing to choose with skip=none" in out
     for arguments, why in (
-        (["--spp", "4"], "no pilot: it says nothing about films of fewer than 64 pixels"),
-        (["-P", "light_paths=0"], "no pilot: there is nothing to choose: chosen by hand"),
+        (["--spp", "4"], "no pilot: the film has fewer than 64 pixels"),
+        (["-P", "light_paths=0"], "no pilot: nothing to choose with light_paths=0"),
     ):
         assert main(["render", str(scene), "-Dintegrator=bdpt", *arguments, "-o", "a.exr"]) == 0
         assert why in capsys.readouterr().out

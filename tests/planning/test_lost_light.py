@@ -182,7 +182,7 @@ def test_what_a_lamp_with_area_adds_is_what_is_lost(glass, monkeypatch):
             BEAM,
             {},
             {"light_paths": 0},
-            ["directionalarea on shape 'lamp' shines on what is seen: this light, nearly all"],
+            ["sampled, nearly all of the image's light: the directionalarea on shape 'lamp' shines on what"],
         ),
         ("point", {"ball": BALL}, {}, []),
         ("point", {"ball": BALL | {"center": [30, 0.6, 0]}}, {}, []),
@@ -202,7 +202,7 @@ def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
     assert len(warnings) == len(said), warnings
     for text, pattern in zip(warnings, said, strict=True):
         share = sum(integrator.statistics["lost_light"].values())
-        assert re.search(pattern, text) and "is missing" in text, text
+        assert re.search(pattern, text) and text.startswith("not sampled, "), text
         assert lost_light.WORTH_A_WORD < share <= 1
 
 
@@ -246,10 +246,17 @@ def test_it_is_said_before_the_samples_are_traced(parameters, spp, long, passes,
 def test_explain_knows_the_share():
     """Expected: with a pilot the text of the warning, without one only that such paths are not sampled."""
     scene = scene_of(LAMPS["point"], block=BLOCK)
-    said = "lost light: point light 'lamp' shines through glass or mirrors on what is seen through 'block'"
-    assert said in bdpt().explain(scene, spp=64)
-    without = bdpt().explain(scene)
-    assert "lost: delta emitter" in without and said not in without
+    said = (
+        "\nnot sampled, about [0-9]+ % of the image's light: point light 'lamp' shines through glass or "
+        "mirrors on what is seen through 'block'"
+    )
+    paths = (
+        "\nnot sampled: delta emitter - specular - one non-specular vertex - specular - sensor (SDS: no "
+        "connectible edge)\n"
+    )
+    text, without = bdpt().explain(scene, spp=64), bdpt().explain(scene)
+    assert re.search(said, text) and text.count("not sampled") == 2 and paths in text
+    assert without.count("not sampled") == 1 and paths in without and "no spp given" in without
 
 
 def test_given_decisions_know_the_share(monkeypatch):
@@ -316,8 +323,8 @@ def test_what_is_not_finite_is_said(lamp, called):
     with Warned() as warnings:
         for seed in range(2):
             integrator.render(scene, spp=4, seed=seed)
-    said = [text for text in warnings if "cannot be told" in text]
-    assert len(said) == 1 and f"how much light of {called} is missing" in said[0], warnings
+    said = [text for text in warnings if "is unknown, since" in text]
+    assert len(said) == 1 and f"how much light of {called} is not sampled is unknown" in said[0], warnings
     assert integrator.statistics["lost_light"] == {}
 
 
@@ -328,7 +335,7 @@ def test_what_is_not_finite_out_of_view_is_not_said():
     scene = scene_of(LAMPS["point"] | {"intensity": 1e38}, block=beneath)
     with Warned() as warnings:
         bdpt(light_paths=0).render(scene, spp=4)
-    assert not [text for text in warnings if "cannot be told" in text]
+    assert not [text for text in warnings if "is unknown, since" in text]
 
 
 def test_a_lens_finds_it():

@@ -39,8 +39,8 @@ def said(capfd, sensor, lamp, method=None, **others):
     method = mi.load_dict({"type": "bdpt", "max_depth": 4} | (method or {}))
     method.render(scene, spp=1)
     lines = capfd.readouterr().out.splitlines()
-    warnings = [line for line in lines if "this light is missing" in line and "on what is seen" not in line]
-    return warnings, [line for line in method.explain(scene, spp=1).splitlines() if "lost: " in line]
+    warnings = [line for line in lines if "bdpt: not sampled: " in line]
+    return warnings, [line for line in method.explain(scene, spp=1).splitlines() if "not sampled: " in line]
 
 
 WITHOUT = {"light_paths": 0}
@@ -67,7 +67,7 @@ def test_missing_direct_light_is_said(case, lamp, capfd):
     warnings, lost = said(capfd, sensor(), LAMPS[lamp], method, floor=FLOOR)
     assert len(warnings) == 1
     assert "'bulb' shines directly on" in warnings[0] and remedy in warnings[0]
-    assert "lost: delta emitter, sensor (needs (1,1))" in lost
+    assert "not sampled: delta emitter - sensor (needs (1,1))" in lost
 
 
 GLASS = {"type": "rectangle", "to_world": T().translate([0, 0, 0.3]), "bsdf": {"type": "thindielectric"}}
@@ -175,6 +175,6 @@ def test_nothing_is_said_where_nothing_is_missing(sensor, lamp, method, others, 
     """Rationale: a warning about light that is not missing teaches to overlook them.
 
     Expected: none where (1,1) takes part, where s = 0 finds the lamp, where a surface or the back of the
-    meter stops the light, where the lamp is hidden on purpose, and of sensors without area.
+    meter stops the light, where the lamp is hidden on purpose, and of pinhole sensors.
     """
     assert said(capfd, sensor(), lamp, method, **others)[0] == []

@@ -205,8 +205,10 @@ def test_choice(make, light, monkeypatch):
         assert statistics["seconds"]["pilot"] > 0
     text = integrator.explain(target, spp=32)
     assert "confidence: in " in text
-    assert "pilot: time to the same error" in text and ("no light subpaths" in text) != light
-    assert "pilot: time" not in integrator.explain(target)
+    assert "  relative time  cost per sample     error  configuration\n           1.00  " in text
+    assert ("no light subpaths" in text) != light and "this is the plan before the pilot" not in text
+    text = integrator.explain(target)
+    assert "relative time" not in text and text.count("no spp given: this is the plan before the pilot") == 1
 
 
 def test_few_pixels():
@@ -455,7 +457,9 @@ def test_decisions_in_explain():
     """Expected: what is replayed is explained, without a pilot."""
     target = cornell(128)
     text = forced(decision(ALONE)).explain(target, spp=64)
-    assert "no light subpaths" in text and "pilot: time" not in text and "(by hand): t<=1: decisions" in text
+    assert (
+        "no light subpaths" in text and "relative time" not in text and "(by hand): t<=1: decisions" in text
+    )
 
 
 def surroundings(bright=1.0, **emitters):
@@ -515,9 +519,16 @@ def test_an_uniform_decides_without_a_pilot(monkeypatch):
 
 def test_why_there_is_no_pilot():
     """Expected: `explain` with a number of samples says why it shows no table."""
-    assert "no pilot: 4096 samples are too few" in bdpt().explain(cornell(), spp=4)
+    assert "no pilot: the render has 4096 samples, a pilot needs 16384" in bdpt().explain(cornell(), spp=4)
     assert "no pilot: the scene alone decides" in bdpt().explain(sky(), spp=4)
-    assert "no pilot: there is nothing to choose" in bdpt(light_paths=1).explain(cornell(), spp=4)
+    fixed = bdpt(light_paths=1, connections="one").explain(cornell(), spp=4)
+    assert "no pilot: nothing to choose with light_paths=1 and connections=one" in fixed
+    assert "no pilot: nothing to choose with skip=none" in bdpt(skip="none").explain(cornell(), spp=4)
+    assert "no pilot: nothing to choose with decisions" in forced(decision(ALONE)).explain(cornell(), spp=4)
+    assert "no pilot: nothing to choose with layers=strategies" in bdpt(
+        layers="strategies", max_depth=3
+    ).explain(cornell(), spp=4)
+    assert "no pilot: no light subpaths are possible" in bdpt(max_depth=1).explain(cornell(), spp=4)
     assert "no pilot" not in bdpt().explain(cornell(), spp=1024)
 
 
@@ -578,8 +589,10 @@ def test_explained_tables_say_why(monkeypatch):
     monkeypatch.setattr(choice, "CAUTION", 3.0)
     target = mi.load_file(str(SCENES / "veach_bidir.xml"), resolution=64, parallel=False, optimize=False)
     text = bdpt(max_depth=7).explain(target, spp=64)
-    rows = re.findall(r"^ +([\d.]+)  light_paths=[^;\n]*(; not chosen: \S+)?", text, re.MULTILINE)
-    assert rows[0] == ("1.00", "")
+    rows = re.findall(
+        r"^ +([\d.]+) +[\d.]+ +[\d.e-]+  light_paths=[^;\n]*(; not chosen: \S+)?", text, re.MULTILINE
+    )
+    assert rows[0] == ("1.00", "") and "light_paths=1, " in text and "1/1," not in text
     assert any(why for _, why in rows) and all(why for ratio, why in rows if float(ratio) < 1)
 
 
@@ -781,11 +794,11 @@ def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     monkeypatch.setattr(uniform, "UNIFORM_SAMPLES", 0)
     scene = mi.load_dict({"type": "scene", "sky": {"type": "constant"}, "sensor": camera(24)})
     integrator = bdpt()
-    assert "time to the same error" not in integrator.explain(scene, spp=1024)
+    assert "relative time" not in integrator.explain(scene, spp=1024)
     integrator.render(scene, spp=1024)
     assert integrator.statistics["decisions"] == []
     assert integrator.statistics["no_pilot"] == (
-        "it found no light but that of emitters which the sensor sees directly"
+        "the pilot found no light but that of emitters which the sensor sees directly"
     )
 
 
@@ -796,7 +809,7 @@ def test_pilots_without_a_finite_value_say_so():
     scene = mi.load_dict({"type": "scene", "lamp": lamp, "floor": floor, "sensor": camera(24)})
     integrator = bdpt()
     integrator.render(scene, spp=1024)
-    assert integrator.statistics["no_pilot"] == "it found no finite value"
+    assert integrator.statistics["no_pilot"] == "the pilot found only invalid samples (NaN or infinite)"
 
 
 def test_decisions_that_never_begin_are_named():

@@ -339,7 +339,7 @@ def _pilot() -> Outcome:
         with Warned() as warnings:
             bdpt.render(scene, spp=PILOTED)
         text = bdpt.explain(scene, spp=PILOTED)
-        return bdpt.statistics, warnings, "not finite" in text
+        return bdpt.statistics, warnings, "\ninvalid samples" in text
 
     (statistics, warnings, explained), (twin, quiet, silent) = met(NAN), met(0.0)
     found, same = statistics["non_finite_in_pilot"], decided(statistics) == decided(twin)

@@ -433,7 +433,8 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
     if outcome.statistics.get("non_finite"):
-        parts.append(f"{outcome.statistics['non_finite']} values were not finite and count as zero")
+        invalid = outcome.statistics["non_finite"]
+        parts.append(f"{invalid} invalid samples (NaN or infinite) count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     if outcome.interrupted:
         parts.append("interrupted")

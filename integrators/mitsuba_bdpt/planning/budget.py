@@ -88,8 +88,17 @@ def is_open(full: Plan, settings: Settings) -> bool:
 
 
 def is_by_hand(settings: Settings) -> bool:
-    """Whether parameters fix the strategies (strategy images need all of them)."""
-    return not _is_auto(settings) or settings.decisions is not None or settings.strategy_images
+    """Whether parameters fix the strategies."""
+    return bool(fixed_by(settings))
+
+
+def fixed_by(settings: Settings) -> list[str]:
+    """The parameters that fix the strategies, with their values (strategy images need all strategies)."""
+    values = {name: getattr(settings, name) for name in ("skip", "light_paths", "connections")}
+    texts = {name: value if isinstance(value, str) else f"{value:g}" for name, value in values.items()}
+    fixed = [f"{name}={text}" for name, text in texts.items() if text != "auto"]
+    fixed += ["decisions"] * (settings.decisions is not None)
+    return fixed + ["layers=strategies"] * settings.strategy_images
 
 
 def _is_auto(settings: Settings) -> bool:

@@ -10,28 +10,32 @@ from .configuration import Configuration
 from .possible import Rest, Start, UnreachablePaths, unreachable_paths
 
 _STARTS = {
-    Start.DELTA_EMITTER: "delta emitter, delta surfaces",
+    Start.DELTA_EMITTER: "delta emitter - specular",
     Start.BEAM: "directionalarea",
     Start.DIRECT_DELTA_EMITTER: "delta emitter",
 }
 _RESTS = {
-    Rest.SEEN_VERTEX: ", a {vertex} that the sensor sees",
-    Rest.VERTICES: ", two other {vertices} or more, delta surfaces or none, sensor",
-    Rest.VERTEX_BETWEEN_DELTA: ", a single other {vertex}, delta surfaces, sensor (no two neighbours can be "
-    "connected)",
-    Rest.SENSOR: ", sensor",
-    Rest.LONG: ", ... on paths longer than {longest} edges",
+    Rest.SEEN_VERTEX: "one non-specular vertex{where} - sensor",
+    Rest.VERTICES: "two or more non-specular vertices{where} - specular or nothing - sensor",
+    Rest.VERTEX_BETWEEN_DELTA: "one non-specular vertex{where} - specular - sensor (SDS: no connectible "
+    "edge{share})",
+    Rest.SENSOR: "sensor",
+    Rest.LONG: "any path of more than {longest} edges",
 }
 
 
 def words(lost: UnreachablePaths) -> str:
-    """Describe paths that no strategy in use can sample."""
+    """Describe paths that no strategy in use can sample, from the emitter to the sensor."""
     starts = " or ".join(_STARTS[start] for start in lost.starts)
-    vertex, vertices = "surface", "surfaces"
-    if lost.volumes:
-        vertex, vertices = "surface or scattering in a medium", "surfaces or scatterings in media"
-    rest = _RESTS[lost.rest].format(longest=lost.longest, vertex=vertex, vertices=vertices)
-    return f"{starts}{rest} (needs {lost.needs})" if lost.needs else f"{starts}{rest}"
+    where = " (on a surface or in a medium)" if lost.volumes else ""
+    share = "; an estimate of its share leaves out vertices in media" if lost.volumes else ""
+    rest = _RESTS[lost.rest].format(longest=lost.longest, where=where, share=share)
+    return f"{starts} - {rest} (needs {lost.needs})" if lost.needs else f"{starts} - {rest}"
+
+
+def fraction(light_paths: float) -> str:
+    """Number of light subpaths per camera subpath as the parameter has it: ``0``, ``1/4``, ``1``."""
+    return f"1/{round(1 / light_paths)}" if 0 < light_paths < 1 else f"{light_paths:g}"
 
 
 def subpaths(count: int) -> str:
@@ -45,12 +49,13 @@ def explain(
     settings: Settings,
     table: list[Prediction],
     confidence: float = 0.0,
-    lost_by_pilot: int = 0,
+    invalid: int = 0,
+    not_sampled: str = "",
 ) -> str:
     """Describe the strategies in use and those skipped.
 
     ``table``: a pilot's predictions (`choice.choose`), with `choice.confidence`; empty without a pilot.
-    ``lost_by_pilot``: number of non-finite values of the pilot.
+    ``invalid``: number of non-finite values of the pilot; ``not_sampled``: sentence about unsampled light.
     """
     used = [
         name
@@ -84,17 +89,18 @@ def explain(
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
-    missing = unreachable_paths(prepared, p, settings)
-    lines += [f"lost: {words(lost)}" for lost in missing]
-    if any(lost.volumes for lost in missing):
-        lines.append("lost light: the estimate of its share leaves out vertices in media")
+    lines += [f"not sampled: {words(lost)}" for lost in unreachable_paths(prepared, p, settings)]
+    if not_sampled:
+        lines.append(not_sampled)
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
             "one kernel"
         )
-    if lost_by_pilot:
-        lines.append(f"not finite: {lost_by_pilot} values of the pilot, which decided from the rest")
+    if invalid:
+        lines.append(
+            f"invalid samples (NaN or infinite): {invalid} of the pilot, which decided from the rest"
+        )
     return "\n".join(lines + _pilot(settings, table, confidence))
 
 
@@ -102,18 +108,18 @@ def _guided_emission(p: Plan) -> str:
     if p.emission is None:
         return ""
     return (
-        f"guided emission (light subpaths are aimed; the pilot predicts that {p.emission.left:.0%} of their "
-        "part of the squared error is left)"
+        "guided emission (the pilot predicts that it lowers the squared error of strategies with light "
+        f"subpaths to {p.emission.left:.0%})"
     )
 
 
 def _named(candidate: Configuration) -> str:
     """Describe a candidate by parameters and coefficients."""
     if not candidate.light_paths:
-        return f"light_paths=0, coefficient of s=1 {candidate.kappa_direct:g}"
+        return f"light_paths=0, coefficient of s=1: {candidate.kappa_direct:g}"
     guided = f", guided={candidate.guided}" if candidate.guided else ""
-    light = f"light_paths=1/{candidate.camera_paths_per_light_path}, connections={candidate.connections}"
-    return f"{light}{guided}, coefficient of t<=1 {candidate.kappa_light:g}"
+    light = f"light_paths={fraction(candidate.light_paths)}, connections={candidate.connections}"
+    return f"{light}{guided}, coefficient of t<=1: {candidate.kappa_light:g}"
 
 
 def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
@@ -121,15 +127,16 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
     if not table:
         return []
     head = (
-        "pilot: time to the same error, over that of the chosen (cost of a sample; its relMSE, including the "
+        "pilot: predictions, the chosen configuration first (time to the same error; cost relative to path "
     )
-    lines = [head + "stratification gain):"]
+    lines = [
+        head + "tracing; error: relMSE of one sample per pixel, including the stratification gain)",
+        "  relative time  cost per sample     error  configuration",
+    ]
     for row in table:
         why = why_not(row, table[0])
-        lines.append(
-            f"  {row.time / table[0].time:8.2f}  {_named(row.candidate)} ({row.cost:.2f}, {row.variance:.3g})"
-            + (f"; not chosen: {why}" if why else "")
-        )
+        figures = f"{row.time / table[0].time:15.2f}  {row.cost:15.2f}  {row.variance:8.3g}"
+        lines.append(f"{figures}  {_named(row.candidate)}" + (f"; not chosen: {why}" if why else ""))
     if table[0].candidate.guided:
         lines.append(
             f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of SDS paths, which none of "
@@ -138,7 +145,9 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
     if table[0].without_tables:
         lines.append("  guided emission is in none of these figures")
     if (joined := table[0].candidate.joined) > 1:
-        lines.append(f"  they are of one light subpath at a time, not of {joined}")
+        lines.append(
+            f"  these figures are of connections with one light subpath; the render connects with {joined}"
+        )
     lines.append(
         f"  confidence: in {confidence:.0%} of bootstrap resamples of the pilot the chosen configuration is "
         f"within {NEAR:g}x of the best"

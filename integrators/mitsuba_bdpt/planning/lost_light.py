@@ -139,7 +139,7 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     emitters = prepared.scene.emitters()
     lamps = " and ".join(called(emitters[i]) for i in indices[:NAMED])
     text = (
-        f"bdpt: how much light of {lamps} is missing cannot be told, since the estimate is NaN or infinite; "
+        f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or infinite; "
         "look for such numbers, or very large ones, in the lamp and in the BSDFs that its light meets"
     )
     warn_once(prepared.scene, prepared.camera.sensor, text)
@@ -167,7 +167,7 @@ def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
 
 
 def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], through: Iterable[str]) -> str:
-    """Warning about missing light with its remedy; empty below `WORTH_A_WORD`.
+    """Warning about unsampled light with its remedy; empty below `WORTH_A_WORD`.
 
     ``shares`` of the image's light by emitter index; ``through``: see `LostLight`.
     """
@@ -179,7 +179,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], thro
     lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * lost][:NAMED]
     what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
-    why, remedy = "a lamp without area cannot be found that way", _remedy(prepared, lamps)
+    why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
         what += f" on what is seen through {' and '.join(map(repr, through)) or 'them'}"
     elif not prepared.camera.connectible:
@@ -188,7 +188,7 @@ def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], thro
         why = "the render does without light tracing (t=1)"
         remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
     share = "nearly all" if lost > 0.99 else f"about {100 * lost:.0f} %"
-    return f"bdpt: {what}: this light, {share} of the image's, is missing, because {why}; {remedy}"
+    return f"bdpt: not sampled, {share} of the image's light: {what} ({why}); {remedy}"
 
 
 def called(emitter: mi.Emitter) -> str:

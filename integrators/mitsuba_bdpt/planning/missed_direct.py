@@ -36,7 +36,7 @@ HITTING = 1 << 18
 
 
 def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
-    """Warnings about such light, direct and by delta events; empty if none is missing."""
+    """Warnings about such light, direct and by delta events; empty if all is sampled."""
     lost = [paths for paths in unreachable_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
     return [_warning(prepared, plan, settings, findings, paths) for paths in lost]
 
@@ -55,7 +55,7 @@ def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str
     how = "directly" if direct or not prepared.delta else "through glass or mirrors"
     why, remedy = _cause(prepared, plan, settings, paths.needs)
     sensor = checks.called(prepared.camera.sensor)
-    return f"bdpt: {lamps} {shine} {how} on {sensor}: this light is missing, because {why}; {remedy}"
+    return f"bdpt: not sampled: {lamps} {shine} {how} on {sensor} ({why}); {remedy}"
 
 
 def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: str) -> tuple[str, str]:

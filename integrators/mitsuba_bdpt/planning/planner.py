@@ -57,8 +57,8 @@ UNMEASURED = (
 )
 
 # Why a pilot decides nothing. Directly seen emission is the same for all candidates.
-SAW_NOTHING = "it found no light but that of emitters which the sensor sees directly"
-NOT_FINITE = "it found no finite value"
+SAW_NOTHING = "the pilot found no light but that of emitters which the sensor sees directly"
+NOT_FINITE = "the pilot found only invalid samples (NaN or infinite)"
 
 
 class Pilots(NamedTuple):
@@ -270,7 +270,7 @@ class Planner:
                 before = self._lost(self.full)
                 for lost in self._lost(self.plan):
                     if lost not in before:
-                        mi.Log(mi.LogLevel.Warn, f"bdpt: decisions leave out light: {words(lost)}")
+                        mi.Log(mi.LogLevel.Warn, f"bdpt: by decisions, not sampled: {words(lost)}")
 
     def _lost(self, p: Plan):
         return unreachable_paths(self._prepared, p, self._settings)
@@ -322,11 +322,10 @@ class Planner:
         An empty reason means that one runs.
         """
         if not budget.is_open(self.full, self._settings):
-            by_hand = budget.is_by_hand(self._settings)
-            why = "chosen by hand" if by_hand else "light subpaths cannot add anything"
-            return f"there is nothing to choose: {why}", None
+            fixed = " and ".join(budget.fixed_by(self._settings))
+            return f"nothing to choose with {fixed}" if fixed else "no light subpaths are possible", None
         if self._pixels < budget.FEW_PIXELS:
-            return f"it says nothing about films of fewer than {budget.FEW_PIXELS} pixels", None
+            return f"the film has fewer than {budget.FEW_PIXELS} pixels", None
         samples = self._expected(passes)
         whole = sum(passes) * self._pixels + samples
         least, of_kernel = (
@@ -335,7 +334,7 @@ class Planner:
         if decision := without_pilot(self._prepared, self.full, self._settings, whole, of_kernel):
             return "the scene alone decides in a render as short as this", decision
         if samples < least:
-            return f"{samples} samples are too few, it takes {least}", None
+            return f"the render has {samples} samples, a pilot needs {least}", None
         return "", None
 
     def _alternatives(self, samples: int) -> choice.Alternatives:

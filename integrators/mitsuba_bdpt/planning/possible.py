@@ -152,7 +152,7 @@ def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -
     if emitters.count and not emitters.connectible_to_sensor:
         return "no point of the emitters can be connected with the sensor"
     if emitters.count and camera.delta and not emitters.hittable:
-        return "delta emitters are not seen by a sensor without area (measure zero)"
+        return "delta emitters are not seen by a pinhole (delta) sensor (measure zero)"
     if emitters.count and camera.parallel and not emitters.finite_hittable:
         return "a direction of the surroundings is not that of the sensor's rays (measure zero)"
     return _why_no_light(emitters, settings)

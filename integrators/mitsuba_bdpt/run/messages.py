@@ -101,11 +101,11 @@ def warn_of_non_finite(statistics: dict, scene):
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return
-    some = "1 value was not finite and counts" if lost == 1 else f"{lost} values were not finite and count"
-    parts = [f"{some} as zero"] if lost else []
-    if in_pilot:
-        which = "so did" if lost else "values that were not finite count as zero:"
-        parts.append(f"{which} {in_pilot} of the pilot, which decided from the rest")
+    some = f"{lost} of the image" if lost else ""
+    some += " and " * bool(
+        lost and in_pilot
+    ) + f"{in_pilot} of the pilot, which decided from the rest" * bool(in_pilot)
+    parts = [f"invalid samples (NaN or infinite) count as zero: {some}"]
     named = not_finite(scene)
     parts.append(
         f"NaN or infinity is in {_some(named)}"
