@@ -533,6 +533,27 @@ MUTANTS = (
         ("tests/run/test_first_image.py::test_rooms_of_many_bsdfs_ask_a_pilot",),
     ),
     Mutant(
+        "pilot: one runs after each edit of a small render",
+        "planning/budget.py",
+        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 18,",
+        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14,",
+        ("tests/run/test_first_image.py::test_an_edit_of_a_small_render_asks_no_pilot",),
+    ),
+    Mutant(
+        "passes: a short render records its kernel twice",
+        "run/rendering.py",
+        ">= TWO_PASSES",
+        ">= 0",
+        ("tests/run/test_first_image.py::test_a_short_render_has_one_pass",),
+    ),
+    Mutant(
+        "light subpaths: few without a decision, also where glass focuses light",
+        "planning/budget.py",
+        "if many or prepared.specular or",
+        "if many or",
+        ("tests/run/test_first_image.py::test_light_subpaths_without_a_decision",),
+    ),
+    Mutant(
         "pilot: what looks better has no reason beside it",
         "planning/choice.py",
         "    if gain <= 1:\n",

@@ -142,12 +142,19 @@ LAMPS = {f"lamp{i}": {"type": "point", "position": [0.1 * i, 0, 0]} for i in ran
 
 @pytest.mark.parametrize(
     ("more", "size", "served"),
-    [({}, 16, budget.UNFOCUSED), ({"ball": GLASS}, 16, 4), (LAMPS, 16, 4), ({}, 4, 1)],
-    ids=["diffuse", "glass", "many lamps", "few pixels"],
+    [
+        ({}, 16, budget.UNFOCUSED),
+        ({"ball": GLASS | {"bsdf": {"type": "plastic"}}}, 16, budget.UNFOCUSED),
+        ({"ball": GLASS}, 16, 4),
+        (LAMPS, 16, 4),
+        ({}, 4, 1),
+    ],
+    ids=["diffuse", "plastic", "glass", "many lamps", "few pixels"],
 )
 def test_light_subpaths_without_a_decision(more, size, served):
-    """Expected: few light subpaths in a diffuse room, more where glass focuses light or where next-event
-    estimation chooses among many lamps, and as many as camera subpaths on a film of few pixels."""
+    """Expected: few light subpaths in a diffuse room, also beside a coat, more where glass focuses light or
+    where next-event estimation chooses among many lamps, and as many as camera subpaths on a film of few
+    pixels."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": size, "height": size}
     scene, integrator = mi.load_dict(scene | more), mi.load_dict({"type": "bdpt"})

@@ -35,8 +35,8 @@ EVEN = 100
 # light subpath per camera subpath, since camera subpaths that share one are correlated.
 FEW_PIXELS = 64
 
-# Camera subpaths per light subpath without a decision, in scenes without delta lobes and media and with fewer
-# emitters than `MANY_EMITTERS`; in others `possible.plan` has four. See experiments, "Short renders".
+# Camera subpaths per light subpath without a decision, in scenes without glass, mirrors and media and with
+# fewer emitters than `MANY_EMITTERS`; in others `possible.plan` has four. See experiments, "Short renders".
 UNFOCUSED, MANY_EMITTERS = 16, 16
 
 
@@ -77,7 +77,7 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
     if pixels < FEW_PIXELS:
         return replace(full, camera_paths_per_light_path=1)
     many = prepared.emitters.count >= MANY_EMITTERS
-    if many or prepared.delta or prepared.space is not None or settings.strategy_images:
+    if many or prepared.specular or prepared.space is not None or settings.strategy_images:
         return full
     return replace(full, camera_paths_per_light_path=UNFOCUSED)
 

@@ -21,8 +21,9 @@ class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
     ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``smooth``, ``delta``, ``refracts``:
-    some BSDF has such a lobe; ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``,
-    in which light subpaths start, are None in scenes without media.
+    some BSDF has such a lobe; ``specular``: some BSDF, as of glass or mirrors, has delta lobes alone;
+    ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``, in which light subpaths
+    start, are None in scenes without media.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -36,8 +37,10 @@ class PreparedScene:
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
         _prepare_bitmaps(found)
-        self.smooth = any(mi.has_flag(b.flags(), mi.BSDFFlags.Smooth) for b in found)
-        delta = int(mi.BSDFFlags.Delta)
+        flags, delta = {b.flags() for b in found}, int(mi.BSDFFlags.Delta)
+        smooth, null = (int(f) for f in (mi.BSDFFlags.Smooth, mi.BSDFFlags.Null))
+        self.smooth = any(f & smooth for f in flags)
+        self.specular = any(f & delta & ~null and not f & smooth for f in flags)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         self.traits = bsdf.Traits.of(found, sum(map(is_instance, scene.shapes())))  # a BSDF each
         self.space = self.light_media = None
@@ -45,8 +48,8 @@ class PreparedScene:
             self.space, self.light_media = components.media.prepare(
                 media, self.emitters, sensor, found, self.traits
             )
-            delta &= ~int(mi.BSDFFlags.Null)  # which edges pass
-        self.delta = any(b.flags() & delta for b in found)
+            delta &= ~null  # which edges pass
+        self.delta = any(f & delta for f in flags)
 
     def stored_vertices(self, settings: Settings) -> int:
         """Longest path, in edges, that uses all strategies."""
