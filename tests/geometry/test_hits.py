@@ -1,11 +1,11 @@
-"""Surfaces at hits of instances, which are looked up, beside Mitsuba's own call."""
+"""Surfaces at hits of instances and spheres, which are looked up, beside Mitsuba's own call."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.geometry import hits
-from mitsuba_bdpt.geometry.hits import Hits, Instances
+from mitsuba_bdpt.geometry.hits import Hits, HitTables
 from mitsuba_bdpt.host import renamed
 
 FIELDS = "t time p n uv dp_du dp_dv dn_du dn_dv duv_dx duv_dy wi prim_index".split()
@@ -45,37 +45,74 @@ def rays(count):
     return ray
 
 
+def balls(count, others=1):
+    """Spheres, placed, scaled, turned, mirrored and flipped, of which the first are lamps, and rectangles."""
+    at, rng = mi.ScalarTransform4f(), np.random.default_rng(7)
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    place = at.look_at([0, -6, 2], [0, 0, 0], [0, 0, 1])
+    scene = {"type": "scene", "sensor": {"type": "perspective", "to_world": place, "film": film}}
+    for i in range(others):
+        scene[f"floor{i}"] = {"type": "rectangle", "to_world": at.translate([0, 0, -3 - i]).scale(4)}
+    for i in range(count):
+        to_world = at.translate((6 * rng.random(3) - 3).tolist())
+        to_world = to_world @ (at, at.rotate([0.6, 0.8, 0], 50), at.scale([1, -1, 1]), at.scale(-1))[i % 4]
+        ball = {"type": "sphere", "to_world": to_world.scale(0.2 + rng.random()), "flip_normals": i % 3 == 1}
+        if i < 2:
+            ball["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": 9.0}}
+        scene[f"ball{i}"] = ball
+    return mi.load_dict(scene, optimize=False)
+
+
+def check(scene, ray):
+    """Compare all that is said of hits, bit for bit; returns the hits."""
+    pi = scene.ray_intersect_preliminary(ray)
+    dr.eval(pi)
+    count = dr.width(pi)
+    found = Hits(scene, HitTables.of(scene)).at(pi, ray, mi.Bool(True))
+    true = pi.compute_surface_interaction(ray, renamed.hit_flags())
+    for owner, names in (("", FIELDS), ("sh_frame", ("s", "t", "n"))):
+        for name in names:
+            both = (getattr(getattr(si, owner) if owner else si, name) for si in (found, true))
+            ours, theirs = (np.array(x + dr.zeros(type(x), count)) for x in both)
+            np.testing.assert_array_equal(ours, theirs, err_msg=f"{owner} {name}")
+    assert dr.all((found.shape == true.shape) & (found.instance == true.instance))
+    return pi
+
+
 def test_instances_are_mitsubas():
     """Expected: all that Mitsuba's own call says of 20,000 hits, on instances of two groups, other shapes and
     nothing, bit for bit."""
-    scene, ray = forest(20), rays(20000)
-    pi = scene.ray_intersect_preliminary(ray)
-    instances = Instances.of(scene)
-    assert instances is not None
-    found = Hits(scene, instances).at(pi, ray, mi.Bool(True))
-    true = pi.compute_surface_interaction(ray, renamed.hit_flags())
+    pi = check(forest(20), rays(20000))
     inside = np.array(pi.instance != dr.zeros(mi.ShapePtr))
     assert 1000 < inside.sum() < np.array(pi.is_valid()).sum() - 1000
-    for owner, names in (("", FIELDS), ("sh_frame", ("s", "t", "n"))):
-        for name in names:
-            ours, theirs = (getattr(getattr(si, owner) if owner else si, name) for si in (found, true))
-            shape = np.shape(np.array(ours + dr.zeros(type(ours), 20000)))
-            ours, theirs = (
-                np.broadcast_to(np.array(x + dr.zeros(type(x), 20000)), shape) for x in (ours, theirs)
-            )
-            np.testing.assert_array_equal(ours, theirs, err_msg=f"{owner} {name}")
-    assert dr.all((found.shape == true.shape) & (found.instance == true.instance))
 
 
-def test_kernels_do_not_grow_with_instances():
-    """Rationale: Mitsuba records n^2 functions for n instances, most of a forest's first image. Expected: as
-    long a kernel with 30 as with 10 (a few lines are about the alignment of tables)."""
+@pytest.mark.parametrize("others", [0, 1, 2])
+def test_spheres_are_mitsubas(others):
+    """Expected: the same of spheres, beside other shapes or none, and at the pole, where directions along the
+    surface are arbitrary."""
+    scene, ray = balls(14, others), rays(20000)
+    poles = np.array(
+        [shape.bbox().center() for shape in scene.shapes() if shape.shape_type() == mi.ShapeType.Sphere.value]
+    )
+    o, d = np.array(ray.o), np.array(ray.d)
+    o[:, : len(poles)] = poles.T + [[0], [0], [3]]
+    d[:, : len(poles)] = [[0], [0], [-1]]
+    pi = check(scene, mi.Ray3f(mi.Point3f(o), mi.Vector3f(d)))
+    assert 2000 < np.array(pi.is_valid()).sum() < 18000
+
+
+@pytest.mark.parametrize("made", [forest, balls, lambda n: balls(10, n)], ids=["copies", "balls", "others"])
+def test_kernels_do_not_grow(made):
+    """Rationale: Mitsuba records n^2 functions for n instances, most of a forest's first image, and one for
+    each sphere. Expected: as long a kernel with 30 as with 10 (a few lines are about how tables lie in
+    memory), also of other shapes, which share their function."""
     counts = []
     for count in (10, 30):
-        scene, ray = forest(count), rays(16)
+        scene, ray = made(count), rays(16)
         pi = scene.ray_intersect_preliminary(ray)
         dr.eval(pi, ray)
-        table = Hits(scene, Instances.of(scene))
+        table = Hits(scene, HitTables.of(scene))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             dr.eval(table.at(pi, ray, mi.Bool(True)))
@@ -84,35 +121,43 @@ def test_kernels_do_not_grow_with_instances():
     assert 100 < counts[1] < 1.01 * counts[0]
 
 
-@pytest.mark.parametrize("why", ["few", "unnamed", "alike"])
+@pytest.mark.parametrize("why", ["few", "unnamed", "alike", "few spheres", "other shapes"])
 def test_mitsubas_call_is_used_otherwise(why, monkeypatch):
-    """Expected: no table for few instances, nor where the description of an instance does not name its group
-    or groups are named alike."""
+    """Expected: no table for few instances or spheres, nor where the description of an instance does not name
+    its group, groups are named alike, or other shapes are many more."""
     scene = forest(hits.MANY - (why == "few"))
+    if why == "few spheres":
+        scene = balls(hits.MANY - 1)
+    if why == "other shapes":
+        scene = balls(hits.MANY, 4 * hits.MANY + 1)
     if why == "unnamed":
         monkeypatch.setattr(hits, "_GROUP", hits.re.compile("shapegroup of another version (.*)"))
     if why == "alike":
         for group in hits.shape_groups(scene):
             group.set_id("one")
-    assert Instances.of(scene) is None
+    assert HitTables.of(scene) is None
 
 
-def test_images_of_forests(monkeypatch):
-    """Expected: the same image by the table and by Mitsuba's call, also after an instance and a shape of a
-    group were moved."""
-    scene, integrator = forest(9), mi.load_dict({"type": "bdpt", "max_depth": 4, "light_paths": 1})
+MOVED = {forest: ("copy3.to_world", "tree.cube.to_world", "bush.knob.to_world"), balls: ("ball3.to_world",)}
+
+
+@pytest.mark.parametrize("made", [forest, balls])
+def test_images_are_the_same(made, monkeypatch):
+    """Expected: the same image by the tables and by Mitsuba's call, also after a shape was moved, be it an
+    instance or in a group."""
+    scene = made(9)
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "light_paths": 1, "connections": "one"})
 
     def image():
         return np.array(integrator.render(scene, seed=2, spp=4))
 
-    for edit in ("", "copy3.to_world", "tree.cube.to_world", "bush.knob.to_world"):
+    for edit in ("", *MOVED[made]):
         parameters = mi.traverse(scene)
         for key in [key for key in parameters.keys() if edit and key.endswith(edit)]:
             parameters[key] = parameters[key] @ mi.ScalarTransform4f().translate([0.1, 0.2, 0.1])
         parameters.update()
         found = image()
         with monkeypatch.context() as patched:
-            patched.setattr(hits, "MANY", 100)
-            patched.setattr(hits.Hits, "__init__", lambda self, *_: vars(self).update(_instances=None))
+            patched.setattr(Hits, "__init__", lambda self, *_: vars(self).update(_tables=None))
             np.testing.assert_array_equal(found, image())
         assert found.mean() > 0.01

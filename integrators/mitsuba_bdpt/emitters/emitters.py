@@ -60,7 +60,7 @@ class Emitters:
         self.groups, self.disks, self.has_places = (), None, False
         if not emitters:
             return
-        make_parameters_opaque([*emitters, *filter(None, (e.get_shape() for e in emitters))])
+        _make_opaque(emitters, facts)
         self._pointers = scene.emitters_dr()
         sampling_weight = mi.Float(weights)
         self._pmf, self._inverse = sampling_weight / dr.sum(sampling_weight), inverse_table(self._pointers)
@@ -296,3 +296,18 @@ class Emitters:
         return self._query(
             lambda group, mask: group.hit_densities(chosen, hit, mask), hittable, index, active, hittable
         )
+
+
+def _make_opaque(emitters, facts: ShapeFacts):
+    """`make_parameters_opaque` of emitters, or of their shapes unless known to be so since the last edit.
+
+    Parameters of Mitsuba's emitters on shapes are numbers.
+    """
+    fresh = []
+    for emitter in emitters:
+        shape = emitter.get_shape()
+        if shape is None:
+            fresh.append(emitter)
+        else:
+            facts.about("opaque", partial(fresh.append, shape), shape)
+    make_parameters_opaque(fresh)

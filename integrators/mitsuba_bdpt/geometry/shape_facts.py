@@ -9,7 +9,7 @@ import mitsuba as mi
 
 from ..host.introspection import all_shapes, registry_index
 from ..host.notices import State, cached
-from .hits import Instances
+from .hits import HitTables
 from .rounding import ShapeErrors
 from .to_world import check_inverse
 
@@ -17,7 +17,7 @@ Found = TypeVar("Found")
 
 
 class ShapeFacts:
-    """The `ShapeErrors` (``errors``) and `Instances` of a scene, and facts about single shapes.
+    """The `ShapeErrors` (``errors``) and `HitTables` of a scene, and facts about single shapes.
 
     Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
     own calls disagree (`check_inverse`).
@@ -26,7 +26,7 @@ class ShapeFacts:
     def __init__(self, scene: mi.Scene):
         for shape in all_shapes(scene):
             check_inverse(shape)
-        self.errors, self.instances = ShapeErrors(scene), Instances.of(scene)
+        self.errors, self.hits = ShapeErrors(scene), HitTables.of(scene)
         self._found: dict[tuple, tuple[Hashable, object]] = {}
 
     @classmethod

@@ -54,7 +54,12 @@ def registry_index(shape: mi.Shape) -> int:
 
 
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
-    """Return the shapes in the scene's shape groups, which instances do not expose."""
+    """Return the shapes in the scene's shape groups, which instances do not expose.
+
+    Empty without instances: no ray hits them.
+    """
+    if not any(map(is_instance, scene.shapes())):
+        return []
     return [shape for group in shape_groups(scene) for shape in shapes_in(group)]
 
 
@@ -154,11 +159,12 @@ def _collector(variant: str):
 
         def put(self, name, value, flags, cpptype=None):
             # Shapes of a group without ids are all called "shape": number them as ``mi.traverse`` does.
-            first, count = name, self.times.get(name, 0)
-            while name in self.found:
-                count += 1
-                name = f"{first}_{count}"
-            self.times[first] = count
+            if name in self.found:
+                first, count = name, self.times.get(name, 0)
+                while name in self.found:
+                    count += 1
+                    name = f"{first}_{count}"
+                self.times[first] = count
             self.found[name], self.types[name] = value, cpptype
 
     return Collector

@@ -32,7 +32,7 @@ class PreparedScene:
         check_plugins(scene, sensor)
         self.surfaces = bool(scene.shapes())
         facts = ShapeFacts.of(scene, sensor)
-        self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.instances)
+        self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.hits)
         check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
