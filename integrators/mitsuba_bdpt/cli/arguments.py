@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         self.options: list[str] = []
         self.commands: Mapping[str, Parser] = {}
         # An abbreviation may become ambiguous in the next version.
-        super().__init__(allow_abbrev=False, epilog=mistakes.STATUSES, **settings)
+        super().__init__(allow_abbrev=False, **settings)
 
     def add_argument(self, *names, **settings):
         """Declare an argument, like argparse."""
@@ -86,7 +86,11 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="mitsuba_bdpt", description="Bidirectional path tracing for Mitsuba 3.")
+    parser = Parser(
+        prog="mitsuba-bdpt",
+        description="Bidirectional path tracing for Mitsuba 3.",
+        epilog=mistakes.STATUSES,
+    )
     parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     parser.commands = commands.choices
@@ -97,7 +101,7 @@ def build_parser() -> argparse.ArgumentParser:
     doctor = add_command("doctor", "say what is installed and render a tiny image to prove that it works")
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
     add_render_arguments(add_command("render", "render a Mitsuba scene file to an EXR and a PNG image"))
-    text = "say which strategies a render of a scene file uses, which it skips, and what light none finds"
+    text = "say which strategies a render of a scene file uses, which it skips, and which paths none samples"
     explain = add_command("explain", text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
@@ -136,7 +140,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
     text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
     add("-a", "--append", type=Path, action="append", default=[], metavar="FOLDER", help=text)
-    text = "size of the image in pixels, in place of that of all films of the scene but those of meters"
+    text = "size of the image in pixels; overrides the size of every film except meters'"
     add("--size", type=size, metavar="WxH", help=text)
     text = "render this part of the image alone, in pixels from the upper left corner"
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)
@@ -156,11 +160,11 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"
     add("-o", "--output", type=Path, help=text)
-    text = "stop after the pass in which this time is over; without --spp, at 65536 spp at the latest"
+    text = "stop after the first pass that ends later than SECONDS; without --spp, at 65536 spp at the latest"
     add("--time", type=number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
     add("--target-error", type=number(float, 1e-12), metavar="X", help=text)
-    text = "write what is done beside the image so often, for --resume; removed in the end"
+    text = "write a checkpoint beside the image every MINUTES; deleted when the render is finished"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
     text = (
         "continue from the checkpoint of an interrupted render: auto (default with --checkpoint) if there is "
@@ -176,7 +180,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         "elsewhere"
     )
     add("--progress", choices=KINDS, default="auto", help=text)
-    text = "rewrite the PNG with the image so far, so often"
+    text = "rewrite the PNG with the image so far every SECONDS"
     add("--preview", type=number(float, 0), metavar="SECONDS", help=text)
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)

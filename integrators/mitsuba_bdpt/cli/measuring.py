@@ -87,7 +87,7 @@ def _parsed(bounds):
 _SCENE = ("scene", {"help": "a scene file, or a name in PROJECT/scenes"})
 _SCENES = {"help": "scene files, or names in PROJECT/scenes"}
 _FOLDER = ("folder", {"help": "what sweep has filled, or a name in PROJECT/results"})
-_SIDE = "TYPE KEY=VALUE …, in quotes; sampler=TYPE is the sensor's sampler"
+_CONFIGURATION = "TYPE KEY=VALUE …, in quotes; sampler=TYPE is the sensor's sampler"
 _INTEGRATORS = "TYPE KEY=VALUE …, each in quotes; default: path (with media: volpath) and bdpt"
 
 COMMANDS: dict[str, tuple] = {
@@ -119,10 +119,10 @@ COMMANDS: dict[str, tuple] = {
         ("--all", {"action": "store_true", "help": "all scenes of PROJECT/scenes"}),
     ),
     "compare": (
-        "two ways to render, alternating: time, error and efficiency of the first over the second",
+        "two configurations, rendered alternately: time, error, efficiency of the first relative to the second",
         "compare",
         options.Compare,
-        ("sides", {"nargs": 2, "type": parameters, "metavar": "SIDE", "help": _SIDE}),
+        ("sides", {"nargs": 2, "type": parameters, "metavar": "CONFIGURATION", "help": _CONFIGURATION}),
         ("--scenes", {"nargs": "+", "required": True} | _SCENES),
     ),
     "equal-time": (

@@ -152,7 +152,7 @@ class MakeReference(Options):
 
 @dataclass(frozen=True)
 class Compare(Options):
-    """Options of comparisons of two ways to render."""
+    """Options of comparisons of two configurations."""
 
     spp: tuple[int, ...] = option((64,), WHOLE, "samples per pixel; default: 64", nargs="+")
     pairs: int = option(12, WHOLE, "pairs of renders; default: %(default)s")
