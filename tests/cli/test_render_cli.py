@@ -418,7 +418,7 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
         (["-Dnonsense=1"], "nonsense"),
         (["--integrator", "no_such_plugin"], "no_such_plugin"),
         (["-Players=strategies", "-Pmax_depth=17", "--integrator=bdpt"], "smaller max_depth"),
-        (["--integrator", "bdpt", "-P", "max_depth=0.5"], "TypeError: bdpt: max_depth=0.5 must be"),
+        (["--integrator", "bdpt", "-P", "max_depth=0.5"], "error: -P max_depth=0.5 must be"),
     ],
 )
 def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message):

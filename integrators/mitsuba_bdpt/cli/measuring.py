@@ -119,7 +119,7 @@ COMMANDS: dict[str, tuple] = {
         ("--all", {"action": "store_true", "help": "all scenes of PROJECT/scenes"}),
     ),
     "compare": (
-        "two configurations, rendered alternately: time, error, efficiency of the first relative to the second",
+        "two configurations, rendered alternately: time, error, efficiency of the first over the second",
         "compare",
         options.Compare,
         ("sides", {"nargs": 2, "type": parameters, "metavar": "CONFIGURATION", "help": _CONFIGURATION}),
