@@ -577,6 +577,7 @@ def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
     assert statistics["spp"] >= 16 and statistics["spp"] % 16 == 0
     if kind == "path":
         np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
+    assert "; stopped by --time 0.3 after " in capsys.readouterr().out
     arguments = ["--integrator", kind, "--time", "60", "--spp", "24", "-o", "b.exr"]
     assert main(["render", str(scene), *arguments]) == 0
     out = capsys.readouterr().out

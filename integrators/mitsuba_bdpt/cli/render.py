@@ -397,13 +397,14 @@ def stopped_by(job: Namespace, integrator: mi.Integrator, outcome: Outcome, spp:
     if outcome.interrupted or outcome.spp >= spp:
         return ""
     done = f"{outcome.spp} spp" if is_open_ended(job) else f"{outcome.spp} of {spp} spp"
-    timeout, target = -1.0, 0.0
-    if is_ours(integrator):
-        timeout, target = integrator.settings.timeout, integrator.settings.target_error
+    parameters = integrator.settings if is_ours(integrator) else None
+    target = parameters.target_error if parameters else 0
     if 0 < target and outcome.statistics.get("error", math.inf) <= target:
         option = "target_error=" if job.target_error is None else "--target-error "
         return f"stopped by {option}{target:g} after {done}"
-    option, limit = ("timeout=", timeout) if job.time is None else ("--time ", job.time)
+    option, limit = "--time ", job.time
+    if limit is None:
+        option, limit = "timeout=", parameters.timeout if parameters else -1
     if limit < 0:
         return ""
     compiling = outcome.statistics.get("seconds", {}).get("compile", 0)
