@@ -289,8 +289,8 @@ MUTANTS = (
     Mutant(
         "throughput: light roulette is not divided by",
         "transport/walk.py",
-        "throughput = dr.select(playing, throughput / survive, throughput)",
-        "throughput = dr.select(playing & (not side.adjoint), throughput / survive, throughput)",
+        "return dr.select(playing, throughput / survive, throughput), ",
+        "return dr.select(playing & (not side.adjoint), throughput / survive, throughput), ",
         (
             "tests/images/test_known_answers.py::test_all_bounces_in_the_unit_sphere_add_up_to_one[skip=none-point]",
         ),

@@ -199,7 +199,7 @@ class Settings:
 
     @property
     def variance(self) -> bool:
-        """Whether the variance of each pixel is estimated, from independent parts of the render."""
+        """Whether the variance of each pixel is estimated, from replicates of the render."""
         return "variance" in self.layers or self.target_error > 0
 
     @property

@@ -14,6 +14,7 @@ import pytest
 import variants
 import views
 import welch as st
+from mitsuba_bdpt.emitters.disks import BoundingSphere
 from mitsuba_bdpt.merging import merging, passes, wavelength_sets
 from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.run import rendering
@@ -677,7 +678,8 @@ def test_density_of_aimed_directions():
     """
     count = 1 << 20
     rng = np.random.default_rng(3)
-    spheres = aim.Sphere(mi.Point3f(0, 0, 1), mi.Float(0.5)), aim.Sphere(mi.Point3f(2, 1, 0), mi.Float(1))
+    balls = ((0, 0, 1), 0.5), ((2, 1, 0), 1)
+    spheres = tuple(BoundingSphere(mi.Point3f(centre), mi.Float(radius)) for centre, radius in balls)
     two = aim.Aim(spheres, False)
     square = mi.Point2f(*rng.random((2, count)).tolist())
     uniform = mi.warp.square_to_uniform_sphere(square)

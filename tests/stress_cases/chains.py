@@ -184,7 +184,7 @@ class Recursion:
     def _along_light(self, second):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
-        ``second``: the density of its first direction. As in subpaths.light_walk, walk._vertex and _leave.
+        ``second``: the density of its first direction. As in subpaths.light_walk, walk._vertex and _scatter.
         """
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * second)

@@ -37,15 +37,15 @@ AIMED = 0.5
 
 @dataclass
 class BoundingSphere:
-    """Bounding sphere whose outline is a disk; both fields are opaque."""
+    """A bounding sphere; both fields are opaque."""
 
     center: mi.Point3f
     radius: mi.Float
 
     @staticmethod
-    def about(sphere) -> BoundingSphere:
-        """Enlarge Mitsuba's bounding sphere by `MARGIN`, as Mitsuba does."""
-        radius = max(float(sphere.radius) * (1 + MARGIN), 1e-30)
+    def about(sphere, margin: float = MARGIN) -> BoundingSphere:
+        """Enlarge Mitsuba's bounding sphere, as Mitsuba does."""
+        radius = max(float(sphere.radius) * (1 + margin), 1e-30)
         made = BoundingSphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
         return made
@@ -56,8 +56,18 @@ class BoundingSphere:
         return dr.squared_norm(offset - dr.dot(offset, d) * d) <= dr.square(self.radius)
 
     def pdf_a(self):
-        """Density (area) of a uniform point on the sphere's disk across any direction."""
+        """Density (area) of a uniform point on the sphere's outline, a disk, across any direction."""
         return dr.rcp(dr.pi * dr.square(self.radius))
+
+    def cone(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
+        """The cone from ``p``: axis, and 1 - cos of its half angle (2 inside the sphere)."""
+        between = self.center - p
+        dist2 = dr.squared_norm(between)
+        sin2 = dr.square(self.radius) / dist2
+        # 1 - cos of small angles would cancel.
+        width = dr.select(sin2 < 1, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2)
+        axis = dr.select(dist2 > 0, mi.Vector3f(between) * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
+        return axis, width
 
 
 @dataclass

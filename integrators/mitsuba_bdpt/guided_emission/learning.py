@@ -1,17 +1,9 @@
 """Fits `EmissionTables` to a pilot.
 
-A contribution of weighted size v lies on a path whose emission is in a cell of the tables, whichever strategy
-sampled it. q is the share, in its sum of densities, of the strategies whose light subpath chooses that
-emission (t<=1, inner). Tables multiply this density by f = a + b r, with r of the cell and a, b the `Factor`
-(0, 1 where the table alone decides). The second moment (balance heuristic) is then v^2 / (1 - q + q f):
-samples without a table give the gain of any table. With
-
-    D = 1 - q + q a + q b,   l = q b / D,   it is   v^2 / D / (1 - l + l r).
-
-The best r of mean 1 is the fixed point of r^2 <- r^2 sum of v^2 / D l / (1 - l + l r)^2. (E. Veach 1997,
-section 9.2; similar, without l: P. Grittmann et al. 2018, P. Dutre and Y. Willems 1995.)
-
-Tables of noise destroy the stratification gain: those of one half of a pilot have to gain on the other.
+docs/method/method.md, "Guided emission", derives the second moment under a table from samples without one,
+and the fixed point that minimizes it; v, q, l, D and r are as there, alpha and beta are `Factor.kept` and
+`scaled`. Tables of noise destroy the stratification gain: those of one half of a pilot have to gain on the
+other.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Transmittance of grids: delta tracking and ratio tracking.
+"""Distances in grids by delta tracking, their transmittance by ratio tracking.
 
 E. R. Woodcock et al. 1965; J. Novák, A. Selle, W. Jarosz 2014, "Residual Ratio Tracking for Estimating
 Attenuation in Participating Media". Both sample tentative collisions in a homogeneous medium of the grid's

@@ -18,7 +18,7 @@ from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import Kept
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import SHRINKING, Footprints
+from .radius import Footprints, in_pass
 from .wavelength_sets import SETS, WavelengthSets
 
 # Camera samples of a pass per photon subpath.
@@ -62,7 +62,7 @@ class Passes:
         ``samples`` of each pixel; ``done``: passes of the same image or replicate, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
-        radius = self._radius * (done + 1) ** ((SHRINKING - 1) / 2)  # in pixels
+        radius = in_pass(self._radius, done)  # in pixels
         count = photons_of_pass(samples * self._pixels, self._pixels, radius)
         sets, wavelengths = 1, None
         if start is not None:

@@ -1,4 +1,4 @@
-"""The radius of vertex merging: a function of position alone."""
+"""The radius of vertex merging: in a pass a function of position alone, smaller from pass to pass."""
 
 from __future__ import annotations
 
@@ -25,6 +25,12 @@ _OF_DIAGONAL = 1 / 512
 # Exponent alpha: the radius of pass i is that of the first times i^((alpha - 1) / 2) (C. Knaus and M.
 # Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
 SHRINKING = 2 / 3
+
+
+def in_pass(first: float, done: int) -> float:
+    """Radius after ``done`` passes, in the unit of the ``first`` pass's radius (`SHRINKING`)."""
+    return first * (done + 1) ** ((SHRINKING - 1) / 2)
+
 
 # Most change of the radius per distance, which the widths of cells allow for (`merging.cell_at`).
 _STEEPEST = 0.5

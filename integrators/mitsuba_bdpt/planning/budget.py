@@ -28,7 +28,9 @@ GUIDING_TIMES = 4
 # Assumed samples of a render of unknown length, see `expected_samples`.
 PROVISIONAL_SAMPLES = 1 << 20
 
-# A sky is even up to this ratio of largest to mean radiance (a clear sky without its sun has about ten).
+# Largest ratio of maximum to mean radiance of an environment that s = 0 samples well by itself (a clear sky
+# without its sun has about ten): light subpaths and guided samples do not pay, but in long renders. Tighter
+# bounds: `aim.EVEN_SKY` of photons, `candidates.UNIFORM` of weights.
 EVEN = 100
 
 # Films of fewer pixels run no pilot, whose variance of splats assumes an image of many pixels. They trace a

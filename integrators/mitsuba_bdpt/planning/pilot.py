@@ -1,26 +1,10 @@
 """A pilot: a few thousand bidirectional samples that estimate all variances.
 
-`choice.choose` decides per image whether light subpaths and inner connections pay, by cost times variance of
-`CANDIDATES`: path tracing alone, with light tracing, with inner connections, each with several numbers S of
-camera subpaths per light subpath and several coefficients.
-
-All variances come from the *same* samples, which use all strategies (S = 1, all inner connections, balance
-heuristic with kappa = 1): a candidate is also judged by paths that it would have missed. For a contribution f
-/ p of the pilot with weight w and shares s_i of the classes i in the sum of all densities, and a candidate
-with counts n_i and coefficients kappa_i (E. Veach 1997, section 9.2),
-
-* the candidate's own estimate of the path is (w f / p) kappa_own / (n_own sum_i kappa_i s_i);
-* its second moment is the pilot's mean of (w f / p)^2 sum_i (kappa_i^2 s_i / n_i) / (sum_i kappa_i s_i)^2.
-
-The variance is the sum of the second moments and of the products of different contributions within a camera
-sample, less the squared mean of the pixel, estimated without bias from two independent samples. The samples
-use neither roulette nor a drawn connection; unshadowed contributions give the variance of the draw.
-
-Stratified points reduce the variance of camera samples in smooth regions (up to a hundredfold under a sky),
-hardly that of rare paths, and little that of splats. Half of the samples lie in pairs of nets of one pixel,
-which measure this stratification gain (`moments.Moments.gain`).
-
-All variances are relative to the local brightness.
+docs/method/skipping.md derives the second moment of a candidate of `CANDIDATES` from samples that use all
+strategies (S = 1, all inner connections, balance heuristic with kappa = 1); symbols are as there. The
+candidate's own estimate of a path is (w f / p) kappa_own / (n_own sum_i kappa_i s_i). The samples use neither
+roulette nor a drawn connection; unshadowed contributions give the variance of the draw. Half of the samples
+lie in pairs of nets of one pixel, which measure the stratification gain (`moments.Moments.gain`).
 """
 
 from __future__ import annotations

@@ -58,6 +58,6 @@ def samples_per_pixel(sensor, spp, settings) -> int:
         of = "layers=variance" if "variance" in settings.layers else f"target_error={settings.target_error:g}"
         raise UsageError(
             f"{of} with spp={spp} is not possible; the variance needs at least {REPLICATES} "
-            "samples per pixel, one for each independent part of the render"
+            "samples per pixel, one for each replicate (independent part of the render)"
         )
     return spp

@@ -30,8 +30,8 @@ def log(statistics: dict):
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,
-            "bdpt: the render ended before four of the parts that the error follows from were whole; ask "
-            "for no more samples per pixel than timeout allows",
+            "bdpt: the error is not known, since the render ended before four of its eight replicates were "
+            "whole; ask for no more samples per pixel than timeout allows",
         )
 
 

@@ -26,7 +26,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
         t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
         store y, if on a surface whose BSDF is not delta, for inner         light_path
             connections, unless no camera subpath could reach it in time
-        d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._leave
+        d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._scatter
         roulette of the subpath; the next edge <- a ray
 
     # Its camera subpaths
@@ -49,7 +49,7 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
                         each of them,                                       connections.connect_all
                         or one, drawn by what it would add unshadowed       connections.connect_one
                 (of several light subpaths by an approximation of that)
-            d_vcm, d_vc, throughput <- the event at z                       walk._leave
+            d_vcm, d_vc, throughput <- the event at z                       walk._scatter
             roulette of the subpath; the next edge <- a ray
         add the total to the film                                           sink.end
 
@@ -64,21 +64,12 @@ In scenes with media y and z may lie in one as well; null surfaces are passed an
     a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
     store y -> of a long subpath 64 reweighted vertices                     light_path.Thinning
 
-Each strategy i of a path adds w_i f / (n_i p_i). n_i is its number of samples per camera sample: the light
-subpaths per camera subpath for t <= 1, else 1. The weights w_i are those of a `mis.Heuristic`; of the balance
-heuristic (eq. 37)
-
-    w_i = kappa_i p_i / sum_j kappa_j p_j = kappa_i / (light side + kappa_i + camera side)
-
-with kappa_j p_j / p_i summed over the strategies of fewer light vertices (light side) and of more (camera
-side), from the partial sums of y and z. kappa_i contains n_i, as 1 / S for t <= 1 (where S does not divide
-the batch's pixels, only the estimate's n_i is exact: weights need only sum to 1), and the plan's coefficient
-of the class (`inputs._coefficients`). Classes that the plan leaves out have kappa = 0 and are not recorded.
-
-Contributions of t = 1 and drawn inner connections play roulette before their shadow ray is traced
-(`contribution.roulette`). Non-finite values are dropped and counted: the walk ends a subpath
-(`walk.not_finite`), contributions are dropped before they are summed or drawn
-(`contribution.drop_non_finite`), and the sink drops colours of the film and features.
+Each strategy i of a path adds w_i f / (n_i p_i), with n_i its number of samples per camera sample: the light
+subpaths per camera subpath for t <= 1, else 1. Weights: `mis`, docs/method/method.md. kappa_i contains n_i as
+1 / S for t <= 1, and the plan's coefficient of the class (`inputs._coefficients`). Where S does not divide
+the batch's pixels, only the estimate's n_i is exact: weights need only sum to 1. Classes that the plan leaves
+out have kappa = 0 and are not recorded. docs/development/architecture.md says where roulette is played and
+non-finite values are dropped.
 
 A pilot has several light subpaths per camera sample, most without one; its estimates are those of one each.
 """

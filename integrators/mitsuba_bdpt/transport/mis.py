@@ -32,8 +32,6 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UsageError
-from ..settings import HEURISTICS
 from .bsdf import Step
 
 if TYPE_CHECKING:
@@ -95,14 +93,9 @@ def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
 
 
 class Heuristic:
-    """Combination of alternatives: ``balance`` or ``power`` (exponent 2).
-
-    Raises ``UsageError`` for any other name.
-    """
+    """Combination of alternatives by ``name``: ``balance`` or ``power`` (exponent 2), see `settings`."""
 
     def __init__(self, name: str):
-        if name not in HEURISTICS:
-            raise UsageError(f"heuristic={name!r} is not known; use one of {', '.join(HEURISTICS)}")
         self.name = name
 
     def scale(self, x: PartialSum, factor: PartialSum) -> PartialSum:

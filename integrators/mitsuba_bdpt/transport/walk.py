@@ -214,7 +214,7 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
         step = _interact(kernel, side, walk, vertex, stream)
         kernel.observer.vertex(side, walk, vertex, step)
         state = visit(vertex, state, walk)
-        walk = _leave(kernel, side, walk, vertex, step, stream)
+        walk = _scatter(kernel, side, walk, vertex, step, stream)
     return state, walk
 
 
@@ -351,11 +351,11 @@ def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
     return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
 
 
-def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
-    """Take the sampled ``step`` and trace the next edge."""
+def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
+    """Take the sampled ``step``, play roulette and trace the next edge."""
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
-    points, h, si = kernel.points, kernel.heuristic, vertex.si
+    h, si = kernel.heuristic, vertex.si
     active = _goes_on(side, walk, vertex)
     passes = None
     if vertex.volume is not None:
@@ -378,13 +378,9 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
         active &= sds.isolated
     if side.only_delta:
         active &= step.delta
-    # Roulette as in `path`; weights ignore it.
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
-    u = points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
-    # In scenes with media as in `volpath`.
-    playing = walk.edges >= kernel.rr_depth if passes is None else walk.edges > kernel.rr_depth
-    throughput = dr.select(playing, throughput / survive, throughput)
-    active &= ~playing | (u < survive)
+    throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, passes, stream)
+    active &= goes_on
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
@@ -405,6 +401,17 @@ def _leave(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream)
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
     return _traced(kernel, after, ray, passes)
+
+
+def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, passes, stream):
+    """Russian roulette of a subpath: its throughput, and whether it goes on.
+
+    With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`.
+    Weights ignore it.
+    """
+    u = kernel.points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
+    playing = walk.edges >= kernel.rr_depth if passes is None else walk.edges > kernel.rr_depth
+    return dr.select(playing, throughput / survive, throughput), ~playing | (u < survive)
 
 
 def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):

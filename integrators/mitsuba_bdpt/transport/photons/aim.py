@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ...emitters.disks import BoundingSphere
 from ...emitters.emitters import Emitters
 from ...emitters.infinite import contrast
 from ...emitters.records import Emission
@@ -23,36 +24,19 @@ from ...host.introspection import grouped_shapes, is_instance
 # Most spheres; a scene with more shapes has one around all of them.
 MOST_SPHERES = 8
 
-# Largest ratio of maximum to mean radiance of an environment that emits no photons.
+# Largest ratio of maximum to mean radiance of an environment that emits no photons: light that s = 0 does not
+# find by itself must be brighter. (`budget.EVEN` is of light subpaths, `candidates.UNIFORM` of weights.)
 EVEN_SKY = 16
 
-# Factor of the spheres' radii, for rounding.
-_MARGIN = 1.001
-
-
-@dataclass
-class Sphere:
-    """A bounding sphere; its fields are opaque."""
-
-    center: mi.Point3f
-    radius: mi.Float
-
-    def cone(self, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Float]:
-        """The cone from ``p``: axis, and 1 - cos of its half angle (2 inside the sphere)."""
-        between = self.center - p
-        dist2 = dr.squared_norm(between)
-        sin2 = dr.square(self.radius) / dist2
-        # 1 - cos of small angles would cancel.
-        width = dr.select(sin2 < 1, sin2 / (1 + dr.safe_sqrt(1 - sin2)), 2)
-        axis = dr.select(dist2 > 0, mi.Vector3f(between) * dr.rsqrt(dist2), mi.Vector3f(0, 0, 1))
-        return axis, width
+# Relative enlargement of the spheres, for rounding.
+_MARGIN = 1e-3
 
 
 @dataclass
 class Aim:
     """``spheres`` at which photons are aimed; ``no_sky``: the environment emits none."""
 
-    spheres: tuple[Sphere, ...]
+    spheres: tuple[BoundingSphere, ...]
     no_sky: bool
 
     @staticmethod
@@ -66,7 +50,7 @@ class Aim:
             boxes = [whole]
         environment = scene.environment()
         no_sky = environment is not None and contrast(environment) <= EVEN_SKY
-        return Aim(tuple(_sphere(box) for box in boxes), no_sky)
+        return Aim(tuple(BoundingSphere.about(box.bounding_sphere(), _MARGIN) for box in boxes), no_sky)
 
     def emission(self, emitters: Emitters, u_point, u_direction, shared) -> tuple[Emission, mi.Float]:
         """Sample emissions of photons; also the emitter's own density over the mixture's.
@@ -152,13 +136,6 @@ def _towards(emitters: Emitters, e: Emission, d, active: mi.Bool) -> Emission:
         pdf_second=dr.select(active, pdf_second, e.pdf_second),
         weight=dr.select(active, weight, e.weight),
     )
-
-
-def _sphere(box) -> Sphere:
-    around = box.bounding_sphere()
-    sphere = Sphere(mi.Point3f(around.center), mi.Float(around.radius * _MARGIN))
-    dr.make_opaque(sphere)
-    return sphere
 
 
 def _delta_boxes(scene: mi.Scene) -> list:
