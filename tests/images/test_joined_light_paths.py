@@ -1,6 +1,7 @@
 """Camera subpaths that are joined with several light subpaths, drawn by guesses: unbiased; when."""
 
 import json
+from functools import partial
 from types import SimpleNamespace
 
 import internals
@@ -275,6 +276,7 @@ def test_what_is_joined(change, joined):
         _pixels=given["pixels"],
         _why_not_joined=lambda: given["why"],
     )
+    asked._is_worth_joining = partial(planner.Planner._is_worth_joining, asked)
     row = planner.Planner._with_more_light_paths(asked, choice.Prediction(way, 1.0, 1.0), given["samples"])
     assert row.candidate.joined == joined
 

@@ -141,25 +141,29 @@ LAMPS = {f"lamp{i}": {"type": "point", "position": [0.1 * i, 0, 0]} for i in ran
 
 
 @pytest.mark.parametrize(
-    ("more", "size", "served"),
+    ("more", "size", "served", "joined"),
     [
-        ({}, 16, budget.UNFOCUSED),
-        ({"ball": GLASS | {"bsdf": {"type": "plastic"}}}, 16, budget.UNFOCUSED),
-        ({"ball": GLASS}, 16, 4),
-        (LAMPS, 16, 4),
-        ({}, 4, 1),
+        ({}, 16, budget.UNFOCUSED, 1),
+        ({}, 64, budget.UNFOCUSED, 4),
+        ({"ball": GLASS | {"bsdf": {"type": "plastic"}}}, 64, budget.UNFOCUSED, 4),
+        ({"ball": GLASS}, 64, 4, 1),
+        (LAMPS, 64, 4, 1),
+        ({}, 4, 1, 1),
     ],
-    ids=["diffuse", "plastic", "glass", "many lamps", "few pixels"],
+    ids=["few samples", "diffuse", "plastic", "glass", "many lamps", "few pixels"],
 )
-def test_light_subpaths_without_a_decision(more, size, served):
+def test_light_subpaths_without_a_decision(more, size, served, joined):
     """Expected: few light subpaths in a diffuse room, also beside a coat, more where glass focuses light or
     where next-event estimation chooses among many lamps, and as many as camera subpaths on a film of few
-    pixels."""
+    pixels; where they are few, camera subpaths connect with several from 2^16 samples on. The same where a
+    render of no decisions is replayed."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": size, "height": size}
-    scene, integrator = mi.load_dict(scene | more), mi.load_dict({"type": "bdpt"})
-    render = Render(scene, scene.sensors()[0], integrator.settings, 0, 1)
-    assert render.plan.camera_paths_per_light_path == served
+    scene = mi.load_dict(scene | more)
+    for replayed in ({}, {"decisions": "[]"}):
+        integrator = mi.load_dict({"type": "bdpt", **replayed})
+        plan = Render(scene, scene.sensors()[0], integrator.settings, 0, 16).plan
+        assert (plan.camera_paths_per_light_path, plan.joined) == (served, joined)
 
 
 def test_rooms_of_many_bsdfs_ask_a_pilot():

@@ -72,8 +72,11 @@ def lanes(samples: int) -> int:
     return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
-def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: int) -> Plan:
-    """The plan before any decision: ``full`` with a number of light subpaths, unless set by parameters."""
+def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: int, joined: int) -> Plan:
+    """The plan before any decision: ``full`` with a number of light subpaths, unless set by parameters.
+
+    ``joined``: light subpaths per lane, where they are few.
+    """
     if not full.light or not _is_auto(settings):
         return full
     if pixels < FEW_PIXELS:
@@ -81,7 +84,8 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
     many = prepared.emitters.count >= MANY_EMITTERS
     if many or prepared.specular or prepared.space is not None or settings.strategy_images:
         return full
-    return replace(full, camera_paths_per_light_path=UNFOCUSED)
+    joined = joined if full.connections == "one" else 1
+    return replace(full, camera_paths_per_light_path=UNFOCUSED, joined=joined)
 
 
 def is_open(full: Plan, settings: Settings) -> bool:

@@ -38,7 +38,7 @@ LATEST_REPEAT = 1 / 4
 # light subpaths better than it by this factor.
 EMISSION_GAIN = 1.15
 
-# Where the fewest light subpaths and one connection are chosen, camera subpaths connect with several light
+# Where the fewest light subpaths and one connection are used, camera subpaths connect with several light
 # subpaths, drawn by an approximation (`connections`), in renders of at least so many samples and pixels. Not
 # with transmissive BSDFs, which the approximation does not cover, and only with LLVM: lanes need four times
 # the local memory. See experiments, "Several light subpaths per lane".
@@ -116,8 +116,9 @@ class Planner:
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
         self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
         self._pixels = int(prepared.camera.region.size.prod())
-        full = plan(prepared, settings)
-        self.full = self.plan = budget.first_plan(full, prepared, settings, self._pixels)
+        self.full = plan(prepared, settings)
+        joined = JOINED[-1] if self._is_worth_joining(self._expected(())) else 1
+        self.full = self.plan = budget.first_plan(self.full, prepared, settings, self._pixels, joined)
         self.threshold, self.changes, self.decided = None, 0, Decided()
         # Moments of the newest pilot with tables of emission.
         self._with_tables: Moments | None = None
@@ -213,16 +214,19 @@ class Planner:
         """``row`` with several light subpaths per lane where that pays (`JOINED_SAMPLES`)."""
         candidate = row.candidate
         fewest = candidate.connections == "one" and candidate.light_paths == min(n for n in LIGHT_PATHS if n)
-        if (
-            not fewest
-            or samples < JOINED_SAMPLES
-            or self._pixels < JOINED_PIXELS
-            or self._prepared.traits.transmits
-            or dr.backend_v(mi.Float) != dr.JitBackend.LLVM
-            or self._why_not_joined()
-        ):
+        if not fewest or not self._is_worth_joining(samples):
             return row
         return replace(row, candidate=replace(candidate, joined=JOINED[-1]))
+
+    def _is_worth_joining(self, samples: int) -> bool:
+        """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
+        return (
+            samples >= JOINED_SAMPLES
+            and self._pixels >= JOINED_PIXELS
+            and not self._prepared.traits.transmits
+            and dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+            and not self._why_not_joined()
+        )
 
     def _why_not_joined(self) -> str:
         return why_not_joined(self._prepared, self.full.merging)
