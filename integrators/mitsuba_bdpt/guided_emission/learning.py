@@ -149,10 +149,10 @@ def _worth_a_table(statistics: np.ndarray, halves: list[np.ndarray], counts: Seq
 
 def left_out(learnt: Learnt) -> list[dict[str, str]]:
     """Why what was ``learnt`` is not used, as in ``statistics["skipped"]``."""
-    why = f"in the pilot tables leave {learnt.left:.0%} of light subpaths' part of the squared error"
-    why += (
-        f", and less than {PAYS:.0%} would pay" if learnt.tables is None else "; path tracing alone is better"
+    why = (
+        f"in the pilot, tables leave {learnt.left:.0%} of the squared error of strategies with light subpaths"
     )
+    why += f"; they are used below {PAYS:.0%}" if learnt.tables is None else "; path tracing alone is better"
     return [{"class": "guided emission", "level": "not worth its cost here", "why": why}]
 
 

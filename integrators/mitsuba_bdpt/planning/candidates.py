@@ -9,7 +9,7 @@ from ..settings import Settings
 from ..transport.plan import Plan
 from .budget import CHEAP_SAMPLES, EVEN
 from .configuration import CANDIDATES, Configuration, Decision
-from .possible import UnreachablePaths, unreachable_paths
+from .possible import UnsampledPaths, unsampled_paths
 
 # kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
 # has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
@@ -33,12 +33,12 @@ LEFT_OUT = [
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
     """Those of `CANDIDATES` that sample the light that ``full`` samples."""
 
-    def lost_without_arrival(plan: Plan) -> tuple[UnreachablePaths, ...]:
+    def lost_without_arrival(plan: Plan) -> tuple[UnsampledPaths, ...]:
         """Paths that are not sampled, when neither t = 0 nor merging counts.
 
         A small lens rarely samples such paths, and merging is not unbiased: neither replaces connections.
         """
-        return unreachable_paths(prepared, replace(plan, arrival=False, merging=False), settings)
+        return unsampled_paths(prepared, replace(plan, arrival=False, merging=False), settings)
 
     def is_possible(candidate: Configuration) -> bool:
         if candidate.connections != "none" and full.connections == "none":

@@ -7,7 +7,7 @@ from ..settings import Settings
 from ..transport.plan import Plan
 from .choice import NEAR, Prediction, why_not
 from .configuration import Configuration
-from .possible import Rest, Start, UnreachablePaths, unreachable_paths
+from .possible import Rest, Start, UnsampledPaths, unsampled_paths
 
 _STARTS = {
     Start.DELTA_EMITTER: "delta emitter - specular",
@@ -24,7 +24,7 @@ _RESTS = {
 }
 
 
-def words(lost: UnreachablePaths) -> str:
+def words(lost: UnsampledPaths) -> str:
     """Describe paths that no strategy in use can sample, from the emitter to the sensor."""
     starts = " or ".join(_STARTS[start] for start in lost.starts)
     where = " (on a surface or in a medium)" if lost.volumes else ""
@@ -89,7 +89,7 @@ def explain(
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
-    lines += [f"not sampled: {words(lost)}" for lost in unreachable_paths(prepared, p, settings)]
+    lines += [f"not sampled: {words(lost)}" for lost in unsampled_paths(prepared, p, settings)]
     if not_sampled:
         lines.append(not_sampled)
     if prepared.emitters.evaluated:

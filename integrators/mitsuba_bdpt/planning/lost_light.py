@@ -1,7 +1,7 @@
 """Estimates the share of an image's light on SDS paths that no strategy samples.
 
 Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
-reaches the sensor; no two neighbouring vertices can be connected. `possible.unreachable_paths` decides
+reaches the sensor; no two neighbouring vertices can be connected. `possible.unsampled_paths` decides
 whether such paths are possible. The estimate merges a few thousand camera subpaths with as many photons, see
 `merging.unsampled` for what it leaves out, and lamps seen in a mirror.
 """
@@ -25,7 +25,7 @@ from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.plan import Plan
-from .possible import Start, unreachable_paths
+from .possible import Start, unsampled_paths
 
 # Subpaths from either end. The noise of the estimate suffices for `WORTH_A_WORD`, not for a figure to rely
 # on; see experiments, "Vertex merging".
@@ -82,7 +82,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if components.why_absent("merging"):  # which estimates their light
         return False
-    lost = unreachable_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
+    lost = unsampled_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
 

@@ -26,7 +26,7 @@ from ..transport.photons import unsampled
 from ..transport.plan import Plan
 from .findings import Findings
 from .lost_light import NAMED, called, delta_kernel, points
-from .possible import Rest, Start, UnreachablePaths, unreachable_paths
+from .possible import Rest, Start, UnsampledPaths, unsampled_paths
 
 # Points on the sensor to which each emitter is connected.
 POINTS = 1 << 10
@@ -37,11 +37,11 @@ HITTING = 1 << 18
 
 def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
     """Warnings about such light, direct and by delta events; empty if all is sampled."""
-    lost = [paths for paths in unreachable_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
+    lost = [paths for paths in unsampled_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
     return [_warning(prepared, plan, settings, findings, paths) for paths in lost]
 
 
-def _warning(prepared, plan, settings, findings, paths: UnreachablePaths) -> str:
+def _warning(prepared, plan, settings, findings, paths: UnsampledPaths) -> str:
     """Warning about light of ``paths`` that end at the sensor; empty if none arrives."""
     direct = Start.DIRECT_DELTA_EMITTER in paths.starts
     look = partial(_arriving, prepared, plan, settings, direct)

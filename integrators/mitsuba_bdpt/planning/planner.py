@@ -23,7 +23,7 @@ from .configuration import Decision, replayed
 from .explain import words
 from .findings import Findings
 from .moments import Moments
-from .possible import plan, unreachable_paths, why_not_joined
+from .possible import plan, unsampled_paths, why_not_joined
 
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
@@ -277,7 +277,7 @@ class Planner:
                         mi.Log(mi.LogLevel.Warn, f"bdpt: by decisions, not sampled: {words(lost)}")
 
     def _lost(self, p: Plan):
-        return unreachable_paths(self._prepared, p, self._settings)
+        return unsampled_paths(self._prepared, p, self._settings)
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on.

@@ -232,7 +232,7 @@ class Rest(Enum):
 
 
 @dataclass(frozen=True)
-class UnreachablePaths:
+class UnsampledPaths:
     """Paths that no strategy in use samples: from one of ``starts`` by ``rest``.
 
     ``needs``: the strategy that would sample them, empty if none would; ``longest``, for `Rest.LONG`: the
@@ -246,32 +246,32 @@ class UnreachablePaths:
     volumes: bool = False
 
 
-def unreachable_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnreachablePaths, ...]:
+def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnsampledPaths, ...]:
     """Paths that no strategy in use samples, in a fixed order.
 
     `explain.words` describes them.
     """
     emitters, camera = prepared.emitters, prepared.camera
-    lost: list[UnreachablePaths] = []
+    lost: list[UnsampledPaths] = []
     deltas = prepared.delta and emitters.unhittable
     starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
     if not p.arrival:  # t = 0 samples all that follow
         for start in starts:
             if not p.splat:
-                lost.append(UnreachablePaths((start,), Rest.SEEN_VERTEX, "t=1"))
+                lost.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "t=1"))
             if p.connections == "none":
-                lost.append(UnreachablePaths((start,), Rest.VERTICES, "inner connections"))
+                lost.append(UnsampledPaths((start,), Rest.VERTICES, "inner connections"))
         if deltas:
-            lost.append(UnreachablePaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
+            lost.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
         if not camera.delta and starts:
-            lost.append(UnreachablePaths(starts, Rest.SENSOR, "t=0"))
+            lost.append(UnsampledPaths(starts, Rest.SENSOR, "t=0"))
         # With hide_emitters this light is hidden, not lost.
         direct = bool(emitters.unhittable_connectible) and not settings.hide_emitters
         if direct and not camera.delta and not p.endpoints and settings.max_depth:
-            lost.append(UnreachablePaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
+            lost.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
-        lost.append(UnreachablePaths(starts, Rest.LONG, longest=longest))
+        lost.append(UnsampledPaths(starts, Rest.LONG, longest=longest))
     if p.merging:  # samples all paths with a vertex for merging
         lost = [paths for paths in lost if paths.rest in (Rest.SENSOR, Rest.LONG)]
     volumes = prepared.space is not None and prepared.space.media.scatters

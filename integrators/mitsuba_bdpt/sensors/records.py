@@ -145,7 +145,7 @@ class Sensor:
     area = False
     needs_film_sample = False
     reason = ""
-    no_area = "the sensor has no area that light could hit"
+    no_area = "light cannot hit a pinhole (delta) sensor"
 
     def __init__(self, sensor: mi.Sensor):
         self.sensor = sensor
