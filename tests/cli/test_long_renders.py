@@ -1,5 +1,6 @@
 """``render`` with --checkpoint, --resume and --target-error."""
 
+import os
 import re
 import signal
 import subprocess
@@ -29,6 +30,7 @@ def folder(tmp_path, monkeypatch):
 
 # A render that kills itself after a pass, before the checkpoint that would hold it.
 KILLED = """import os, signal, sys
+import mitsuba_bdpt, short_pilots
 from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import main
 after_pass, done = checkpoints.Checkpoints.after_pass, []
@@ -51,7 +53,8 @@ def test_a_killed_render_is_resumed():
     expected, whole = rendered.image("whole.exr")
     resumable = [*ARGUMENTS, *spp, "-o", "killed.exr", "--checkpoint", "0"]
     assert whole["decisions"]
-    process = subprocess.run([sys.executable, "-c", KILLED, *resumable], timeout=PATIENCE)
+    finds = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.run([sys.executable, "-c", KILLED, *resumable], env=finds, timeout=PATIENCE)
     assert process.returncode == -signal.SIGKILL
     checkpoint = Path("killed.checkpoint.npz")
     assert list(read(checkpoint).passes) == whole["passes"][:30] and not Path("killed.exr").exists()

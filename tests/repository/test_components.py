@@ -95,7 +95,7 @@ def without(name: str, folder: Path) -> Path:
 
 def run(sources: Path, *arguments) -> str:
     """Output of Python with these arguments and the package in ``sources``."""
-    paths = os.pathsep.join(map(str, (sources, TESTS / "support")))
+    paths = os.pathsep.join(map(str, (sources, TESTS, TESTS / "support")))
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
         env=os.environ | {"PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"},
@@ -128,6 +128,8 @@ def images(parameters: dict) -> dict[str, np.ndarray]:
 
 def _render(name: str, out: str):
     """Render without the component ``name``, and ask for it; both results go to the file ``out``."""
+    import short_pilots  # noqa: F401  (imported by conftest.py elsewhere)
+
     mi.set_variant(variants.of("rgb"))
     said, known = "", KNOWN[name]
     try:

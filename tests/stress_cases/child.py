@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 PRELUDE = """
-import mitsuba_bdpt, sys
+import mitsuba_bdpt, short_pilots, sys
 import mitsuba as mi
 import drjit as dr
 import numpy as np
