@@ -348,12 +348,12 @@ class StokesOfStrategies(sink.Image):
     def add(self, kernel, c, total, start, shared):
         return super().add(kernel, replace(c, towards=-start.ray.d), total, start, shared)
 
-    def _put_strategy(self, c, position, shared):
+    def _put_strategy(self, c, position, shared, u=None):
         weighted, unweighted = (
             self._polarized(polarization.scaled(value, shared.weight), shared, c.towards)[FIRST]
             for value in (c.weighted(), c.value)
         )
-        self._film.put_strategy(position, weighted, unweighted, c, c.active)
+        self._film.put_strategy(position, weighted, unweighted, c, c.active, u)
 
 
 def test_strategies_agree_in_every_component(monkeypatch):

@@ -80,10 +80,10 @@ class Collector(sink.Image):
         # A number and rows for each place that keeps: Dr.Jit cannot count twice in one loop.
         self.kept = []
 
-    def splat(self, kernel, c, shared):
+    def splat(self, kernel, c, shared, stream):
         """Add a contribution with t <= 1."""
         self._keep(c.position, polarization.scaled(c.weighted(), shared.weight), shared, (c.s, c.t), c.active)
-        return super().splat(kernel, c, shared)
+        return super().splat(kernel, c, shared, stream)
 
     def end(self, kernel, lane, sample, total, seen):
         """Add a camera sample."""
@@ -366,7 +366,7 @@ class Recorder(Observer):
         self._note(c, c.weighted())
         return total + c.weighted()
 
-    def splat(self, traced, c, shared):
+    def splat(self, traced, c, shared, stream):
         """Add a contribution with t <= 1."""
         self._note(c, c.weighted())
         return Counters()

@@ -238,7 +238,7 @@ class Capture(Observer):
         """Inner connections are made afterwards, see `made`."""
         return total, Counters()
 
-    def splat(self, kernel_, c, shared):
+    def splat(self, kernel_, c, shared, stream):
         """Keep (1,1), t = 1 and t = 0."""
         self._keep(len(self.walked["light"].vertices) + 1, int(c.t[0]), c)
         return Counters()

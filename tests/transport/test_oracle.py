@@ -519,6 +519,7 @@ class Nothing:
 
     alpha = False
     features = stokes = None
+    rfilter = SimpleNamespace(is_box_filter=lambda: True)
 
     def colour(self, value, _):
         return mi.Color3f(value) if not mi.is_polarized else mi.Color3f(value[0, 0].x)

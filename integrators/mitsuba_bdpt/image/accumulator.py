@@ -22,6 +22,7 @@ from . import denoising
 from .colour import POLARIZED
 from .layers import film_layers, image_count, strategies, strategy_count, strategy_index
 from .replicates import Replicates, Spread
+from .taps import Taps
 
 
 class Block:
@@ -52,31 +53,55 @@ class Block:
 
         One value per channel; a final 0 may be left out.
         """
-        values = values + [mi.Float(0)] * (self.channels - len(values))
-        down = mi.Point2i(0, mi.Int32(row))
         if self._rfilter.is_box_filter():
-            self._add(mi.Point2i(dr.floor(position)) - self._offset + down, values, active)
+            self._add(mi.Point2i(dr.floor(position)) - self._offset, values, active, row)
             return
-        radius = self._rfilter.radius()
-        taps = ceil(2 * radius)
-        at = position - mi.Point2f(self._offset) - 0.5  # in pixel centres
-        first = mi.Point2i(dr.ceil(at - radius))
+        at, radius = self._in_centres(position), self._rfilter.radius()
+        first, taps = mi.Point2i(dr.ceil(at - radius)), ceil(2 * radius)
 
-        def body(tap):
-            pixel = first + mi.Point2i(tap % taps, tap // taps)
+        def tap(number):
+            pixel = first + mi.Point2i(number % taps, number // taps)
             distance = mi.Point2f(pixel) - at
-            weight = self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)
-            self._add(pixel + down, [weight * v for v in values], active)
-            return (tap + 1,)
+            return pixel, self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)
 
-        dr.while_loop((mi.Int32(0),), lambda tap: tap < taps * taps, body, label="reconstruction filter")
+        self._add_each(taps**2, tap, values, active, row)
+
+    def splat(self, position, values, active, u, row=0):
+        """Like `put` in expectation over ``u``, with fewer additions, see `taps`.
+
+        ``u``: uniform in [0, 1)^2, unused by the box filter.
+        """
+        if self._rfilter.is_box_filter():
+            self.put(position, values, active, row)
+            return
+        taps = Taps(self._rfilter, self._in_centres(position), u)
+        self._add_each(taps.count, taps.tap, values, active, row)
 
     def totals(self, stride: int, rows: int) -> mi.Float64:
         """Sums in double precision of the strips of ``rows`` rows, one every ``stride`` rows."""
         strips = mi.TensorXd(mi.Float64(self.data), (self._length // (stride * self.row), stride * self.row))
         return dr.gather(mi.Float64, dr.sum(strips, axis=0).array, dr.arange(mi.UInt32, rows * self.row))
 
-    def _add(self, pixel, values, active):
+    def _in_centres(self, position):
+        """Return a film position in the block's pixels; integers are pixel centres."""
+        return position - mi.Point2f(self._offset) - 0.5
+
+    def _add_each(self, count: int, tap, values, active, row):
+        """Add ``values`` to ``count`` pixels; ``tap(number)`` returns a pixel and its weight.
+
+        A loop, also for few pixels: unrolled, the branches of its additions are predicted less well.
+        """
+
+        def body(number):
+            pixel, weight = tap(number)
+            self._add(pixel, [weight * v for v in values], active, row)
+            return (number + 1,)
+
+        dr.while_loop((mi.Int32(0),), lambda number: number < count, body, label="reconstruction filter")
+
+    def _add(self, pixel, values, active, row):
+        pixel = pixel + mi.Point2i(0, mi.Int32(row))
+        values = values + [mi.Float(0)] * (self.channels - len(values))
         inside = active & dr.all((pixel >= 0) & (pixel < self._size))
         index = mi.UInt32(pixel.y * self._size.x + pixel.x)
         dr.scatter_reduce(dr.ReduceOp.Add, self.data, self._packet(values), index, inside, mode=self._mode)
@@ -179,17 +204,24 @@ class Accumulator:
         """
         self.camera.put(position, self._channels.sample(*values), active, strip * self._down)
 
-    def put_light(self, position, colours, polarized, active):
-        """Add a splat at a continuous film position; ``polarized``: channels of `Stokes`."""
-        self.light.put(position, [*colours, *polarized], active)
+    def put_light(self, position, colours, polarized, active, u):
+        """Add a splat at a continuous film position.
 
-    def put_strategy(self, position, weighted, unweighted, c, active):
-        """Add the contribution ``c`` to the image of its strategy."""
+        ``polarized``: channels of `Stokes`; ``u``: see `Block.splat`.
+        """
+        self.light.splat(position, [*colours, *polarized], active, u)
+
+    def put_strategy(self, position, weighted, unweighted, c, active, u=None):
+        """Add the contribution ``c`` to the image of its strategy; ``u`` of splats as in `put_light`."""
         if self.strategies is None:
             raise ValueError("an accumulator of depth 0 has no strategy images")
         values = [*(weighted[i] for i in range(3)), *(unweighted[i] for i in range(3))]
         index = strategy_count(self.depth) if c.kind == "merge" else strategy_index(c.s, c.t)
-        self.strategies.put(position, values, active, index * self._stride)
+        row = index * self._stride
+        if c.position is None:
+            self.strategies.put(position, values, active, row)
+        else:
+            self.strategies.splat(position, values, active, u, row)
 
     def evaluate(self, *others):
         """Evaluate what was recorded since the last call, and ``others``, in one kernel."""

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import polarization
+from ..sampling.points import Purpose, sequential
 from ..transport import connections
 from ..transport.contribution import Counters, one
 
@@ -49,8 +50,8 @@ class Image:
         found, counted = connections.connect_one(kernel, z, lane.path, stream)
         return total + found, counted
 
-    def splat(self, kernel, c, shared) -> Counters:
-        """Add a contribution with t <= 1.
+    def splat(self, kernel, c, shared, stream) -> Counters:
+        """Add a contribution with t <= 1; ``stream``: of its light subpath.
 
         Non-finite colours count as zero (`contribution.drop_non_finite` tests the contribution, not its
         colours).
@@ -59,9 +60,10 @@ class Image:
         value = self._film.colour(whole, shared.wavelengths)
         polarized = self._polarized(whole, shared, c.towards)
         finite = dr.all(dr.isfinite(value)) & _all_finite(polarized)
-        self._film.put_light(c.position, value, polarized, c.active & finite)
+        u = _of_filter(kernel, self._film, c, stream)
+        self._film.put_light(c.position, value, polarized, c.active & finite, u)
         if kernel.strategy_images:
-            self._put_strategy(c, c.position, shared)
+            self._put_strategy(c, c.position, shared, u)
         return Counters(non_finite=one(c.active & ~finite))
 
     def end(self, kernel, lane, sample, total, seen) -> Counters:
@@ -87,11 +89,20 @@ class Image:
         stokes = self._film.stokes
         return [] if stokes is None else stokes(value, shared.wavelengths, towards)
 
-    def _put_strategy(self, c, position, shared):
+    def _put_strategy(self, c, position, shared, u=None):
         weighted = self._film.colour(polarization.scaled(c.weighted(), shared.weight), shared.wavelengths)
         unweighted = self._film.colour(polarization.scaled(c.value, shared.weight), shared.wavelengths)
         finite = dr.all(dr.isfinite(weighted)) & dr.all(dr.isfinite(unweighted))
-        self._film.put_strategy(position, weighted, unweighted, c, c.active & finite)
+        self._film.put_strategy(position, weighted, unweighted, c, c.active & finite, u)
+
+
+def _of_filter(kernel, film, c, stream):
+    """Return the random numbers of a splat's filter, None with the box filter."""
+    if film.rfilter.is_box_filter():
+        return None
+    # One vertex's splats may share them: what the filter adds depends on nothing else.
+    x, word = sequential(kernel.points.series(stream, Purpose.FILM, c.s, mi.UInt32(1)))
+    return mi.Point2f(x, sequential(word)[0])
 
 
 def _all_finite(values):

@@ -159,7 +159,7 @@ class Pilot:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
 
-    def splat(self, kernel: Kernel, c: Contribution, shared: Shared) -> Counters:
+    def splat(self, kernel: Kernel, c: Contribution, shared: Shared, stream: Stream) -> Counters:
         """Accumulate a contribution with t <= 1."""
         size = self._size(c)
         row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + tile_of(self._region, c.position)

@@ -211,7 +211,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     def splat(c):
         """Pass a contribution with t <= 1 to the sink."""
         c = contribution.drop_non_finite(replace(c, emission=emitted))
-        return c.counted + sink.splat(kernel, c, shared)
+        return c.counted + sink.splat(kernel, c, shared, stream)
 
     if plan.endpoints:
         counters += splat(techniques.connect_endpoints(kernel, e, stream, mi.Bool(True)))

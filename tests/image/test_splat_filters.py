@@ -1,0 +1,152 @@
+"""Splats with the film's filter: some pixels are drawn (`image.taps`); the mean is that of all of them."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt.image.accumulator import Accumulator, Block
+from mitsuba_bdpt.image.layers import strategies
+from mitsuba_bdpt.image.taps import Taps
+from scipy import stats
+
+# A crop window; positions inside it, at its corners, and outside within the filter's radius.
+SIZE, OFFSET = (7, 6), (3, 2)
+POSITIONS = np.array(
+    [[6.5, 5.5], [6.02, 4.97], [6.31, 4.75], [3.1, 2.2], [9.9, 7.9], [2.2, 5.3], [11.4, 8.6], [6.0, 5.0]]
+)
+APART = SIZE[1] + 20  # rows from one position's pixels to the next one's
+NUMBERS = 256  # per axis: midpoints of equal cells
+
+FILTERS = {name: {"type": name} for name in ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")}
+FILTERS |= {
+    "narrow": {"type": "gaussian", "stddev": 0.15},
+    "between": {"type": "gaussian", "stddev": 0.6},
+    "wide": {"type": "gaussian", "stddev": 1.1},
+}
+
+
+def added(rfilter, put):
+    """What ``put(block)`` adds: (positions, height, width)."""
+    size = [SIZE[0], APART * len(POSITIONS)]
+    block = Block(size, OFFSET, 2, mi.load_dict(FILTERS[rfilter]), dr.ReduceMode.Direct, mi.ArrayXd)
+    put(block)
+    sums = np.array(block.data).reshape(len(POSITIONS), APART, SIZE[0], 2)
+    assert not sums[..., 1].any()  # the padding
+    return sums[:, : SIZE[1], :, 0]
+
+
+def exact(rfilter):
+    """A splat of 1 at each position, added to every pixel of the filter's support."""
+
+    def put(block):
+        place = dr.arange(mi.UInt32, len(POSITIONS))
+        position = dr.gather(mi.Point2f, mi.Float(POSITIONS.ravel()), place)
+        block.put(position, [mi.Float(1)], mi.Bool(True), place * APART)
+
+    return added(rfilter, put)
+
+
+def drawn(rfilter, numbers=NUMBERS, shift=0.5):
+    """The mean of splats of 1 over a grid of random numbers, at each position."""
+
+    def put(block):
+        lane = dr.arange(mi.UInt32, len(POSITIONS) * numbers**2)
+        place, cell = lane // numbers**2, lane % numbers**2
+        u = (mi.Point2f(mi.Float(cell % numbers), mi.Float(cell // numbers)) + shift) / numbers
+        position = dr.gather(mi.Point2f, mi.Float(POSITIONS.ravel()), place)
+        block.splat(position, [mi.Float(1 / numbers**2)], mi.Bool(True), u, place * APART)
+
+    return added(rfilter, put)
+
+
+@pytest.mark.parametrize("rfilter", FILTERS)
+def test_the_mean_over_all_numbers_is_the_filter(rfilter):
+    """Rationale: a drawn pixel with a wrong weight, probability, or sign, or at a border, biases all images
+    with splats. Expected: over a grid of all random numbers, the mean of a splat is the splat to every pixel
+    of the filter's support, in a crop window too. Tolerance: a pixel's share of a grid of n cells per axis is
+    exact to 1 / n per axis; times what the drawn pixels receive, at most 0.6 (lanczos).
+    """
+    expected = exact(rfilter)
+    assert np.abs(expected).max() > 0.1
+    rounding = 1e-5
+    bound = 2 / NUMBERS * 0.6 if rfilter not in ("box", "tent", "narrow") else 0
+    assert np.abs(drawn(rfilter) - expected).max() < bound + rounding
+
+
+@pytest.mark.parametrize("rfilter, most", [("tent", 4), ("gaussian", 4), ("lanczos", 7), ("wide", 24)])
+def test_a_splat_adds_to_few_pixels(rfilter, most):
+    """Rationale: additions are the cost of a splat. Expected: at most ``most`` pixels, for whatever random
+    numbers, where the support has 4, 16, 36 and up to 100."""
+    for shift in (0.01, 0.5, 0.99):
+        assert 3 <= np.count_nonzero(drawn(rfilter, 1, shift)[2]) <= most
+
+
+@pytest.mark.parametrize(
+    "rfilter, most", [("tent", 1.001), ("gaussian", 1.07), ("lanczos", 1.15), ("wide", 1.1)]
+)
+def test_what_drawing_adds_to_the_variance(rfilter, most):
+    """Rationale: one pixel drawn of all would have 2 to 16 times the variance. Expected: the second moment of
+    a splat at random positions, over that with all pixels, is at most ``most``. Statistic: the same grid of
+    positions for both, of random numbers too; the ratio is exact to some 1e-2."""
+    numbers = 16
+    loaded, lanes = mi.load_dict(FILTERS[rfilter]), dr.arange(mi.UInt32, numbers**4)
+    grid = [(mi.Float(lanes // numbers**k % numbers) + 0.5) / numbers for k in range(4)]
+    at = mi.Point2f(grid[0], grid[1])
+    taps = Taps(loaded, at, mi.Point2f(grid[2], grid[3]))
+    pixels = range(-5, 7)
+    exact = [sum(loaded.eval(k - at[axis]) ** 2 for k in pixels) for axis in (0, 1)]
+    of_taps = [np.array(taps.tap(mi.Int32(k))[1]) for k in range(taps.count)]
+    assert 0.999 < sum(np.mean(w**2) for w in of_taps) / np.mean(np.array(exact[0] * exact[1])) < most
+
+
+def scene(**film):
+    """A lamp beside a sphere in a room, seen with a lens, of which light subpaths make most."""
+    sensor = {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 2.0, "fov": 60}
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "component_format": "float32", **film}
+    to_world = mi.ScalarTransform4f().look_at([0, 0, 0.8], [0.2, 0.1, -1], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": sensor | {"film": film, "to_world": to_world},
+            "room": {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}},
+            "ball": {"type": "sphere", "radius": 0.2, "center": [0.1, 0, -0.3], "bsdf": {"type": "plastic"}},
+            "lamp": {"type": "point", "position": [0.3, 0.5, 0], "intensity": 2.0},
+        }
+    )
+
+
+def test_numbers_of_the_filter_are_uniform_and_independent(monkeypatch):
+    """Rationale: numbers that depend on where a splat falls, or on its vertex, distort the filter, and a flat
+    image does not show it. Expected: wherever in a pixel splats fall, their numbers are uniform in the
+    square. Statistic: chi-squared of 4 x 4 cells of the numbers in each of 4 x 4 cells of the pixel."""
+    found = dr.zeros(mi.UInt32, 4**4)
+    dr.make_opaque(found)
+    original = Accumulator.put_light
+
+    def put_light(self, position, colours, polarized, active, u):
+        cell = mi.UInt32(0)
+        for x in (*(position - dr.floor(position)), *u):
+            cell = 4 * cell + mi.UInt32(4 * x)
+        dr.scatter_reduce(dr.ReduceOp.Add, found, mi.UInt32(1), cell, active)
+        original(self, position, colours, polarized, active, u)
+
+    monkeypatch.setattr(Accumulator, "put_light", put_light)
+    bdpt = mi.load_dict({"type": "bdpt", "skip": "none", "max_depth": 4})
+    bdpt.render(scene(rfilter={"type": "gaussian"}), seed=4, spp=64)
+    counts = np.array(found).reshape(16, 16)
+    assert counts.sum() > 10000
+    assert stats.chisquare(counts, axis=1).pvalue.min() > 0.001 / 16
+
+
+def test_images_of_strategies_add_up():
+    """Rationale: a strategy's image that drew other pixels for its splats would only agree on average.
+    Expected: the sum of the weighted images is the image, to rounding, in a crop window with borders."""
+    film = {"rfilter": {"type": "lanczos"}, "sample_border": True, "pixel_format": "rgb"}
+    film |= {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 6, "crop_height": 8}
+    bdpt = mi.load_dict({"type": "bdpt", "skip": "none", "max_depth": 3, "layers": "strategies"})
+    layers = np.array(bdpt.render(scene(**film), seed=1, spp=8), dtype=np.float64)
+    image, parts = layers[..., :3], layers[..., 3:].reshape(8, 6, -1, 2, 3)
+    assert parts.shape[2] == len(list(strategies(3)))
+    splats = [t <= 1 for _, _, t in strategies(3)]
+    assert np.abs(parts[:, :, splats, 0].sum(2)).mean() > 0.1 * image.mean()
+    np.testing.assert_allclose(parts[:, :, :, 0].sum(2), image, atol=1e-4 * np.abs(image).max())
