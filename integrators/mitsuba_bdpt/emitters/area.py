@@ -20,7 +20,7 @@ from ..geometry.mitsubas_choices import (
 from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
-from ..host.introspection import children, named, number, own_parameters
+from ..host.introspection import LEAVES, children, named, number, own_parameters
 from ..host.notices import State
 from .group import Context, Group, HitOnlyEmitters, weight_over
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
@@ -434,6 +434,8 @@ def _reads_attributes(texture) -> bool:
     """Whether a texture reads mesh attributes, which need a face index."""
     if texture.class_name() == "MeshAttribute":
         return True
+    if texture.class_name() in LEAVES:
+        return False
     inner = (value for value in children(texture).values() if isinstance(value, mi.Texture))
     return any(_reads_attributes(value) for value in inner)
 

@@ -8,6 +8,7 @@ For instances the shape of the group is called in its own coordinates.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -25,7 +26,7 @@ from ..host.introspection import (
     shape_groups,
     shapes_in,
 )
-from .rounding import met
+from .rounding import asked_anew, met
 
 # From this number of instances or spheres on they are looked up; of spheres only where other shapes, which
 # are then called through Python, are at most `_OTHERS` times as many.
@@ -55,11 +56,12 @@ class HitTables:
     spheres: bool
 
     @staticmethod
-    def of(scene: mi.Scene) -> HitTables | None:
+    def of(scene: mi.Scene, about: Callable = asked_anew) -> HitTables | None:
         """Return the tables of a scene; None if Mitsuba's own call is to be used.
 
         That is, for few instances and spheres, for instances whose group is not known by its name, and on
-        GPUs, where hits do not have the index of the shape in its group.
+        GPUs, where hits do not have the index of the shape in its group. ``about``: caches facts, see
+        `ShapeFacts.about`.
         """
         shapes = scene.shapes()
         instances, spheres = ([s for s in shapes if is_one(s)] for is_one in (is_instance, _is_sphere))
@@ -68,8 +70,7 @@ class HitTables:
         if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or not (many_spheres or len(instances) >= MANY):
             return None
         first_of = _first_shapes(scene)
-        found = [_GROUP.search(repr(instance)) for instance in instances]
-        names = [match[1] if match else None for match in found]
+        names = [about("group", partial(_group_of, instance), instance) for instance in instances]
         if not first_of.keys() >= set(names):
             return None
         targets = {registry_index(shape): place for place, shape in enumerate(_targets(scene))}
@@ -77,7 +78,7 @@ class HitTables:
         places = targets | {index: first_of[name] for index, name in zip(rows, names, strict=False)}
         sides = {registry_index(s): -1.0 if s.has_flipped_normals() else 1.0 for s in spheres}
         indices = range(max(*places, *rows) + 1)
-        frames = np.array([[matrix_of(one)[:3], inverse_of(one)[:3]] for one in [*instances, *spheres]])
+        frames = np.array([about("frame", partial(_frame_of, one), one) for one in [*instances, *spheres]])
         made = HitTables(
             first=mi.UInt32([places.get(index, 0) for index in indices]),
             row=mi.UInt32([rows.get(index, 0) for index in indices]),
@@ -187,6 +188,16 @@ def _finished(si: mi.SurfaceInteraction3f, pi, ray, active) -> mi.SurfaceInterac
     si.wi = dr.select(active, si.to_local(-ray.d), -ray.d)
     si.duv_dx = si.duv_dy = mi.Vector2f(0)
     return si
+
+
+def _group_of(instance: mi.Shape) -> str | None:
+    """Name of the group of an ``instance``; None if unknown."""
+    found = _GROUP.search(repr(instance))
+    return found[1] if found else None
+
+
+def _frame_of(shape: mi.Shape) -> np.ndarray:
+    return np.array([matrix_of(shape)[:3], inverse_of(shape)[:3]])
 
 
 def _is_sphere(shape: mi.Shape) -> bool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -12,6 +15,8 @@ from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
 from .boxes import scene_box
 from .quadrics import ROUND, outward_sign
+
+Found = TypeVar("Found")
 
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
 OFFSET_ULPS = 32
@@ -62,6 +67,11 @@ class Errors:
     reach: mi.Float | float
 
 
+def asked_anew(kind: str, find: Callable[[], Found], *shapes) -> Found:
+    """Stand-in for `ShapeFacts.about` without a cache."""
+    return find()
+
+
 class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer.
 
@@ -69,7 +79,8 @@ class ShapeErrors:
     is so small that shadow rays test what they hit, see `SMALL`.
     """
 
-    def __init__(self, scene: mi.Scene):
+    def __init__(self, scene: mi.Scene, about: Callable = asked_anew):
+        """``about``: caches facts, see `ShapeFacts.about`."""
         shapes = scene.shapes()
         extent = 2 * scene_box(scene).bounding_sphere().radius
         with np.errstate(all="ignore"):  # non-finite values are checked elsewhere
@@ -77,7 +88,7 @@ class ShapeErrors:
             within = (_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene))
             grouped = max(within, key=abs, default=0.0)
             rows = [Errors(*_curvatures(s, grouped, extent), 0.0) for s in shapes]
-            all_reaches = [reaches(s) for s in shapes]
+            all_reaches = [about("reaches", partial(reaches, s), s) for s in shapes]
         self.any = any(row.ends for row in rows)
         # Not `>`: the extent may be NaN.
         self.small = any(row.ends and not abs(row.ends) * extent <= SMALL for row in rows)

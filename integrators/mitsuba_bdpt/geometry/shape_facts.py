@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import TypeVar
 
 import mitsuba as mi
 
 from ..host.introspection import all_shapes, registry_index
-from ..host.notices import State, cached
+from ..host.notices import State, cached, notes
 from .hits import HitTables
 from .rounding import ShapeErrors
 from .to_world import check_inverse
@@ -19,27 +20,35 @@ Found = TypeVar("Found")
 class ShapeFacts:
     """The `ShapeErrors` (``errors``) and `HitTables` of a scene, and facts about single shapes.
 
-    Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
-    own calls disagree (`check_inverse`).
+    ``marks``: fingerprints of the shapes by registry index; ``before``: facts of an earlier state of the
+    scene, of which those about shapes with equal marks are kept. Holds no object of Mitsuba: it may outlive
+    the scene. Raises ``UsageError`` for shapes for which Mitsuba's own calls disagree (`check_inverse`).
     """
 
-    def __init__(self, scene: mi.Scene):
-        for shape in all_shapes(scene):
-            check_inverse(shape)
-        self.errors, self.hits = ShapeErrors(scene), HitTables.of(scene)
+    def __init__(
+        self, scene: mi.Scene, marks: dict[int, Hashable] | None = None, before: ShapeFacts | None = None
+    ):
+        self._marks = marks or {}
         self._found: dict[tuple, tuple[Hashable, object]] = {}
+        if before is not None:
+            same = {None, *(index for index, mark in self._marks.items() if before._marks.get(index) == mark)}
+            self._found = {key: found for key, found in before._found.items() if same.issuperset(key[1:])}
+        for shape in all_shapes(scene):
+            self.about("inverse", partial(check_inverse, shape), shape)
+        self.errors, self.hits = ShapeErrors(scene, self.about), HitTables.of(scene, self.about)
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
-        """Return the cached facts, or new ones if a parameter of a shape was edited.
+        """Return the cached facts; after an edit, new ones about the shapes that were edited.
 
-        The key has everything that facts depend on, including the shapes' registry indices by which they are
-        looked up: the cache may belong to another scene, see `notices.notes`.
+        Marks have everything that facts depend on; registry indices are part of the key, since facts are
+        looked up by them: the cache may belong to another scene, see `notices.notes`.
         """
-        shapes = all_shapes(scene)
-        own = [(registry_index(s), s.class_name(), s.has_flipped_normals(), repr(s.bbox())) for s in shapes]
-        key = State.of(shapes, deep=False), tuple(own)
-        return cached(scene, sensor, "shapes", key, lambda: cls(scene), most=1)[0]
+        marks = {registry_index(shape): _mark(shape) for shape in all_shapes(scene)}
+        before = next(iter(notes(scene, sensor).get("shapes", {}).values()), None)
+        return cached(
+            scene, sensor, "shapes", tuple(marks.items()), lambda: cls(scene, marks, before), most=1
+        )[0]
 
     def about(
         self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None, state: Hashable = None
@@ -54,3 +63,9 @@ class ShapeFacts:
         if known is None or known[0] != state:
             known = self._found[key] = state, find()
         return known[1]  # type: ignore[return-value]
+
+
+def _mark(shape: mi.Shape) -> Hashable:
+    """Fingerprint of all that facts about a shape depend on."""
+    state = State.of([shape], deep=False)
+    return state, shape.class_name(), shape.has_flipped_normals(), repr(shape.bbox())

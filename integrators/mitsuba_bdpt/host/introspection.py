@@ -13,6 +13,9 @@ import numpy as np
 from .._version import __version__
 from . import renamed
 
+# Classes of textures, one or more for each BSDF, that hold no other object: not asked for `children`.
+LEAVES = frozenset({"SRGBReflectanceSpectrum", "UniformSpectrum"})
+
 
 def number(x) -> float:
     return float(dr.slice(x) if dr.is_array_v(x) else x)

@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..host.introspection import children, named, number, own_parameters
+from ..host.introspection import LEAVES, children, named, number, own_parameters
 
 # Suffixes of the names of BSDF textures that scale scattered light.
 _SCALES = ("reflectance", "transmittance", "base_color")
@@ -79,9 +79,10 @@ def _file_of(texture) -> str:
 
 def _largest(texture, most: int) -> float:
     """Largest value of a texture, 0 if unknown; ``most``: values read of a bitmap."""
-    inner = [_largest(value, most) for value in children(texture).values() if isinstance(value, mi.Texture)]
-    if inner:
-        return max(inner)
+    if texture.class_name() not in LEAVES:
+        held = (value for value in children(texture).values() if isinstance(value, mi.Texture))
+        if inner := [_largest(value, most) for value in held]:
+            return max(inner)
     try:
         return number(texture.max())
     except RuntimeError:  # not implemented, for bitmaps among others

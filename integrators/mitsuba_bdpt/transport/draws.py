@@ -16,7 +16,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..host.introspection import children
+from ..host.introspection import LEAVES, children
 from .spectra import is_zero
 
 # Plugins whose sample() returns pdf(). Others, third-party ones included, may return that of the picked lobe.
@@ -215,5 +215,7 @@ def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
 
 def structure(plugin: mi.Object) -> tuple[Any, ...]:
     """Class of ``plugin`` and the structures of its BSDFs and textures, by name."""
+    if plugin.class_name() in LEAVES:
+        return (plugin.class_name(),)
     held = {name: value for name, value in children(plugin).items() if isinstance(value, mi.Object)}
     return plugin.class_name(), *((name, structure(held[name])) for name in sorted(held))
