@@ -1,12 +1,11 @@
 """What every test needs: the package imported first, then Mitsuba with a variant."""
 
-from functools import partial  # noqa: I001
-
-import mitsuba_bdpt.workers  # (it chooses the LLVM library; it must precede mitsuba)
+import mitsuba_bdpt.workers  # noqa: I001 (it chooses the LLVM library; it must precede mitsuba)
 import mitsuba as mi
 import leftovers
 import pytest
 import short_pilots  # noqa: F401
+import unshuffled  # noqa: F401
 import variants
 from costs import (  # noqa: F401  (hooks of pytest)
     pytest_addoption,
@@ -21,11 +20,6 @@ from patience import PATIENCE
 
 VARIANT = variants.of("rgb")
 mi.set_variant(VARIANT)
-
-# Where Mitsuba merges equal objects (its default), shapes are in another order in every run, and so random
-# numbers go to other emitters. Tests of merged shapes say optimize=True.
-for name in ("load_dict", "load_file", "load_string"):
-    setattr(mi, name, partial(getattr(mi, name), optimize=False))
 
 
 @pytest.fixture(autouse=True)
