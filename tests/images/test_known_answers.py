@@ -472,6 +472,7 @@ def glass_lamp(**film):
         ("gaussian", True),
         ("mitchell", False),
         ("mitchell", True),
+        ("lanczos", True),
         pytest.param("box", False, marks=pytest.mark.slow),
     ],
 )
