@@ -840,7 +840,11 @@ def test_a_failing_write_leaves_the_former_image(scene, tmp_path):
 def test_bad_values_are_usage_errors(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         build_parser().parse_args(["render", "scene.xml", *arguments])
-    assert caught.value.code == 2 and "which must" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert caught.value.code == 2 and "which must" in error and error.count("\n") == 1
+    assert error.startswith("mitsuba-bdpt render: error: ") and error.endswith(
+        "see mitsuba-bdpt render --help\n"
+    )
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ class Parser(argparse.ArgumentParser):
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
-        """End the process with a usage error."""
+        """End the process with a usage error, in one line."""
         wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
         value = re.search(r"argument (--\S+): invalid choice: '(.*?)'", message)
         question = ""
@@ -72,7 +72,8 @@ class Parser(argparse.ArgumentParser):
             question = self._question(wrong[1] or wrong[2], command=bool(wrong[1]))
         elif value:
             question = removed.remedy(f"{value[1]} {value[2]}")
-        super().error(f"{message}; {question}".rstrip("; "))
+        question = question.rstrip() or f"see {self.prog} --help"
+        self.exit(mistakes.USAGE, f"{self.prog}: error: {message}; {question}\n")
 
     def _question(self, name: str, command: bool) -> str:
         """Suggest a ``command``, or an option, for an unknown ``name``."""
