@@ -65,7 +65,7 @@ def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     off = np.abs(image - twin).max() / np.abs(twin).max()
     counted = found == count if count is not None else found > 0
     ok = bool(np.isfinite(image).all()) and off <= ROUNDING and counted
-    ok &= len(warnings) == 1 and f"{found} values" in warnings[0]
+    ok &= len(warnings) == 1 and f": {found} of the image" in warnings[0]
     ok &= of_twin["non_finite"] == 0 and not quiet and same
     exactly = f", exactly {count} expected" if count is not None else ""
     piloted, asked = spp >= PILOTED, bool(statistics["decisions"]) and statistics["seconds"]["pilot"] > 0
