@@ -109,7 +109,7 @@ def _kept_by_dr_jit() -> int:
 
 
 # Parameters, the film's size and samples per pixel of renders in a row: plain ones; and twenty in turn, of
-# which the first asks a pilot. (One with the variance has nine passes.)
+# which the first asks a pilot. (One with the variance has eight passes.)
 PLAIN = (({}, SIZE, 1),)
 IN_TURN = (
     ({}, 48, 64),
