@@ -528,7 +528,7 @@ def test_why_there_is_no_pilot():
     assert "no pilot: nothing to choose with layers=strategies" in bdpt(
         layers="strategies", max_depth=3
     ).explain(cornell(), spp=4)
-    assert "no pilot: no light subpaths are possible" in bdpt(max_depth=1).explain(cornell(), spp=4)
+    assert "no pilot: no light subpaths are possible" in bdpt(max_depth=0).explain(cornell(), spp=4)
     assert "no pilot" not in bdpt().explain(cornell(), spp=1024)
 
 
