@@ -260,19 +260,25 @@ def test_short_renders_are_not_joined():
         ({"samples": (1 << 16) - 1}, 1),
         ({"pixels": (1 << 10) - 1}, 1),
         ({"transmits": True}, 1),
+        ({"many": True}, 1),
+        ({"many": True, "samples": (1 << 16) + 40 * (1 << 11)}, 4),
         ({"why": "in scenes with media"}, 1),
     ],
     ids=str,
 )
 def test_what_is_joined(change, joined):
     """Expected: four light subpaths where the fewest are chosen with one connection, in a long render of many
-    pixels, and where guesses know the BSDFs.
+    pixels, longer with many BSDFs (40), each of which guesses ask, and where guesses know the BSDFs.
     """
     given = {"light_paths": 1 / 16, "connections": "one", "samples": 1 << 16, "pixels": 1 << 10}
-    given |= {"transmits": False, "why": ""} | change
+    given |= {"transmits": False, "why": "", "many": False} | change
     way = Configuration(given["light_paths"], given["connections"], 1.0, 1.0)
     asked = SimpleNamespace(
-        _prepared=SimpleNamespace(traits=SimpleNamespace(transmits=given["transmits"])),
+        _prepared=SimpleNamespace(
+            traits=SimpleNamespace(
+                transmits=given["transmits"], asked=SimpleNamespace(many=given["many"], count=40)
+            )
+        ),
         _pixels=given["pixels"],
         _why_not_joined=lambda: given["why"],
     )

@@ -220,8 +220,9 @@ class Planner:
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
+        asked = self._prepared.traits.asked  # the approximation asks every BSDF five times more
         return (
-            samples >= JOINED_SAMPLES
+            samples >= JOINED_SAMPLES + (budget.SAMPLES_PER_BSDF * asked.count if asked.many else 0)
             and self._pixels >= JOINED_PIXELS
             and not self._prepared.traits.transmits
             and dr.backend_v(mi.Float) == dr.JitBackend.LLVM

@@ -9,7 +9,7 @@ from .. import components
 from ..emitters.emitters import Emitters
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, check_not_animated, children, is_instance, media_of
+from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of
 from ..sensors.checks import check_sensor, views
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
@@ -36,13 +36,15 @@ class PreparedScene:
         check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
-        _prepare_bitmaps(found)
+        family = draws.family(found)
+        _prepare_bitmaps(family)
         flags, delta = {b.flags() for b in found}, int(mi.BSDFFlags.Delta)
         smooth, null = (int(f) for f in (mi.BSDFFlags.Smooth, mi.BSDFFlags.Null))
         self.smooth = any(f & smooth for f in flags)
         self.specular = any(f & delta & ~null and not f & smooth for f in flags)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
-        self.traits = bsdf.Traits.of(found, sum(map(is_instance, scene.shapes())))  # a BSDF each
+        instances = sum(map(is_instance, scene.shapes()))  # each has a BSDF
+        self.traits = bsdf.Traits.of(found, instances, [b for b, _ in family])
         self.space = self.light_media = None
         if media := media_of(scene, [sensor]):
             self.space, self.light_media = components.media.prepare(
@@ -58,15 +60,14 @@ class PreparedScene:
         return DEFAULT_STORED if self.space is None else MAX_STORED
 
 
-def _prepare_bitmaps(found):
-    """Evaluate the bitmaps of BSDFs once.
+def _prepare_bitmaps(family):
+    """Evaluate the bitmaps of BSDFs (a `draws.family`) once.
 
     Mitsuba prepares their data at the first evaluation, which runs what was recorded so far: it would split
     the first pass into two kernels.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
-    owners = draws.nested({id(b): b for b in found}.values())
-    held = (v for owner in owners for v in children(owner).values() if isinstance(v, mi.Texture))
+    held = (v for _, children in family for v in children.values() if isinstance(v, mi.Texture))
     for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
         for evaluate in (texture.eval, texture.eval_1, texture.eval_3):
             try:

@@ -9,7 +9,7 @@ bump and normal maps, interpolated normals and hair; Mitsuba's importance mode w
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -89,13 +89,13 @@ class Traits:
         return self.asked(si.bsdf(), ask, si, active)
 
     @staticmethod
-    def of(bsdfs: Iterable[mi.BSDF], unhit: int = 0) -> Traits:
+    def of(bsdfs: Iterable[mi.BSDF], unhit: int = 0, family: Sequence[mi.BSDF] = ()) -> Traits:
         """Traits of the BSDFs that rays can hit; ``unhit``: number of the scene's others, see `Asked`.
 
-        BSDFs nested in ``bsdfs`` do not count as ``unhit``.
+        BSDFs nested in ``bsdfs`` do not count as ``unhit``. ``family``: `nested` of them, if known.
         """
         hit = {id(bsdf): bsdf for bsdf in bsdfs}
-        inner = {id(bsdf): bsdf for bsdf in nested(hit.values())}
+        inner = {id(bsdf): bsdf for bsdf in family or nested(hit.values())}
         flags = [int(bsdf.flags()) for bsdf in hit.values()]
         through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
         parts = any(draws.by_parts(b) for b in hit.values())

@@ -205,12 +205,19 @@ def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
     return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in bsdfs)
 
 
+def family(bsdfs: Iterable[mi.BSDF]) -> list[tuple[mi.BSDF, dict]]:
+    """``bsdfs`` and all nested in them (twosided, mask, blend, maps), each once, with their children."""
+    found, left = {}, list(bsdfs)
+    for bsdf in left:  # grows in the loop
+        if id(bsdf) not in found:
+            found[id(bsdf)] = bsdf, children(bsdf)
+            left += [value for value in found[id(bsdf)][1].values() if isinstance(value, mi.BSDF)]
+    return list(found.values())
+
+
 def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
-    """``bsdfs`` and all BSDFs nested in them (twosided, mask, blend, maps)."""
-    found = list(bsdfs)
-    for bsdf in found:  # grows in the loop
-        found += [value for value in children(bsdf).values() if isinstance(value, mi.BSDF)]
-    return found
+    """The BSDFs of the `family` of ``bsdfs``."""
+    return [bsdf for bsdf, _ in family(bsdfs)]
 
 
 def structure(plugin: mi.Object) -> tuple[Any, ...]:

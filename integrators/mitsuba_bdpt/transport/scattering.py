@@ -30,17 +30,18 @@ def _of(target: Target | None, mask: mi.Bool) -> Target | None:
     return target and Target(target.wo, target.active & mask, target.cos_ratio)
 
 
-def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
-    """Evaluate a camera vertex towards the local ``wo``, with both densities."""
+def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, reverse: bool = True) -> Evaluation:
+    """Evaluate a camera vertex towards the local ``wo``, with both densities (``reverse``) or one."""
+    traits = kernel.traits if reverse else kernel.traits.from_one_side()
     if vertex.volume is None:
-        return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, kernel.traits)
+        return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, traits)
     return _chosen(
         kernel,
         vertex,
         vertex.edge.medium,
         wo,
         active,
-        lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, kernel.traits),
+        lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, traits),
     )
 
 

@@ -14,6 +14,7 @@ drawn contribution by its probability and is unbiased for any approximation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -143,21 +144,18 @@ def _shape(cos2: mi.Float, width2: mi.Float) -> mi.Float:
 
 def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lobes:
     """Fit to evaluations towards the normal and, if glossy, in the mirror direction."""
+    evaluate = partial(scattering.evaluate, kernel, vertex, reverse=False)
     wi = vertex.si.wi
     up = mi.Vector3f(0, 0, dr.sign(wi.z))
     throughput = mi.unpolarized_spectrum(vertex.throughput)
     lobes = Lobes.plain()
     if alone:
-        lobes.diffuse = (
-            spectra.brightest(throughput * _intensity(scattering.evaluate(kernel, vertex, up, active)))
-            * dr.pi
-        )
+        lobes.diffuse = spectra.brightest(throughput * _intensity(evaluate(up, active))) * dr.pi
     if not kernel.traits.glossy:
         return lobes
 
     def fit(lobes: Lobes) -> Lobes:
-        f = scattering.evaluate(kernel, vertex, up, glossy)
-        mirror = scattering.evaluate(kernel, vertex, mi.Vector3f(-wi.x, -wi.y, wi.z), glossy)
+        f, mirror = evaluate(up, glossy), evaluate(mi.Vector3f(-wi.x, -wi.y, wi.z), glossy)
         pdf_w = dr.maximum(mirror.pdf_fwd_w, _LEAST_PDF)
         width2 = dr.clip(1 / (4 * dr.pi * pdf_w * dr.maximum(dr.abs(wi.z), _LEAST_Z)), _NARROW, 1)
         shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
