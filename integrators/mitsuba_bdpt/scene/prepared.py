@@ -9,7 +9,7 @@ from .. import components
 from ..emitters.emitters import Emitters
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of
+from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of, own_parameters
 from ..sensors.checks import check_sensor, views
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
@@ -68,7 +68,10 @@ def _prepare_bitmaps(family):
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     held = (v for _, children in family for v in children.values() if isinstance(v, mi.Texture))
-    for texture in {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values():
+    textures = {id(t): t for t in held if t.class_name().startswith("BitmapTexture")}.values()
+    # What an edit has computed is evaluated once: its numbers would compile each kernel that reads it anew.
+    dr.eval([own_parameters(texture)["data"] for texture in textures])
+    for texture in textures:
         for evaluate in (texture.eval, texture.eval_1, texture.eval_3):
             try:
                 evaluate(si)
