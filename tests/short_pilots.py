@@ -5,6 +5,6 @@ Tests and stress cases of longer renders would cost more.
 
 from mitsuba_bdpt.planning import budget
 
-LEAST_SAMPLES, PILOTED = budget.LEAST_SAMPLES, 1 << 14
+FOCUSED_SAMPLES, LEAST_SAMPLES, PILOTED = budget.FOCUSED_SAMPLES, budget.LEAST_SAMPLES, 1 << 14
 
-budget.LEAST_SAMPLES = PILOTED
+budget.FOCUSED_SAMPLES = budget.LEAST_SAMPLES = PILOTED

@@ -11,11 +11,12 @@ from ..transport.bsdf import Traits
 from ..transport.plan import Plan
 
 # The pilot's share of a render's samples, bounds of the pilot's samples, and bounds of the render's samples:
-# from `LEAST_SAMPLES` on the pilot's gain pays for it in the first render of a scene; from `CHEAP_SAMPLES` on
-# recording the pilot takes about 2 % of the render. See experiments, "Short renders".
+# from `LEAST_SAMPLES` on the pilot's gain pays for it in the first render of a scene, from `FOCUSED_SAMPLES`
+# on where light is focused (`focuses`); from `CHEAP_SAMPLES` on recording the pilot takes about 2 % of the
+# render. See experiments, "Short renders".
 PILOT_SHARE = 1 / 1024
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
-LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 18, 1 << 24
+FOCUSED_SAMPLES, LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 16, 1 << 18, 1 << 24
 
 # Compilation per kind of BSDF and recording per BSDF of a pilot's kernel in a scene of many BSDFs
 # (`bsdf.MANY`), in samples of a render without a pilot. Longer renders run a pilot.
@@ -37,8 +38,8 @@ EVEN = 100
 # light subpath per camera subpath, since camera subpaths that share one are correlated.
 FEW_PIXELS = 64
 
-# Camera subpaths per light subpath without a decision, in scenes without glass, mirrors and media and with
-# fewer emitters than `MANY_EMITTERS`; in others `possible.plan` has four. See experiments, "Short renders".
+# Camera subpaths per light subpath without a decision, in scenes that do not focus light and have fewer
+# emitters than `MANY_EMITTERS`; in others `possible.plan` has four. See experiments, "Short renders".
 UNFOCUSED, MANY_EMITTERS = 16, 16
 
 
@@ -51,9 +52,15 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
     return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
 
 
-def least_samples(traits: Traits) -> int:
-    """Least number of samples of a render that runs a pilot; ``traits`` of the BSDFs."""
-    return max(LEAST_SAMPLES, samples_of_kernel(traits))
+def focuses(prepared: PreparedScene) -> bool:
+    """Whether light may be focused: by glass, by mirrors, or into beams in media."""
+    return prepared.specular or prepared.space is not None
+
+
+def least_samples(prepared: PreparedScene) -> int:
+    """Least number of samples of a render that runs a pilot."""
+    least = FOCUSED_SAMPLES if focuses(prepared) else LEAST_SAMPLES
+    return max(least, samples_of_kernel(prepared.traits))
 
 
 def samples_of_kernel(traits: Traits) -> int:
@@ -62,9 +69,9 @@ def samples_of_kernel(traits: Traits) -> int:
     return SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count if asked.many else 0
 
 
-def predicts_guiding(traits: Traits, samples: int) -> bool:
+def predicts_guiding(prepared: PreparedScene, samples: int) -> bool:
     """Whether a pilot predicts the gain of photon-guided BSDF sampling."""
-    return not traits.asked.many or samples >= GUIDING_TIMES * least_samples(traits)
+    return not prepared.traits.asked.many or samples >= GUIDING_TIMES * least_samples(prepared)
 
 
 def lanes(samples: int) -> int:
@@ -82,7 +89,7 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
     if pixels < FEW_PIXELS:
         return replace(full, camera_paths_per_light_path=1)
     many = prepared.emitters.count >= MANY_EMITTERS
-    if many or prepared.specular or prepared.space is not None or settings.strategy_images:
+    if many or focuses(prepared) or settings.strategy_images:
         return full
     joined = joined if full.connections == "one" else 1
     return replace(full, camera_paths_per_light_path=UNFOCUSED, joined=joined)

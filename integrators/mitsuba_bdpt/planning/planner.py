@@ -253,7 +253,7 @@ class Planner:
         self.decided = replace(self.decided, pilots=pilots)
         stands_for = samples / count
         plan = replace(self.full, emission=tables)
-        guiding = self.full.merging or budget.predicts_guiding(self._prepared.traits, samples)
+        guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
 
         def trace() -> Moments:
             seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
@@ -333,9 +333,8 @@ class Planner:
             return f"the film has fewer than {budget.FEW_PIXELS} pixels", None
         samples = self._expected(passes)
         whole = sum(passes) * self._pixels + samples
-        least, of_kernel = (
-            count(self._prepared.traits) for count in (budget.least_samples, budget.samples_of_kernel)
-        )
+        least = budget.least_samples(self._prepared)
+        of_kernel = budget.samples_of_kernel(self._prepared.traits)
         if decision := without_pilot(self._prepared, self.full, self._settings, whole, of_kernel):
             return "the scene alone decides in a render as short as this", decision
         if samples < least:
