@@ -49,7 +49,8 @@ def _scales(chains) -> list[tuple[str, tuple]]:
     """
     chains, found, seen = list(chains), [], set()
     for chain in chains:  # grows on the way
-        for name, value in children(chain[0]).items():
+        is_shape = isinstance(chain[0], mi.Shape)  # its parameters need not be traversed
+        for name, value in ({"bsdf": chain[0].bsdf()} if is_shape else children(chain[0])).items():
             if isinstance(value, mi.BSDF) and id(value) not in seen:
                 seen.add(id(value))
                 chains.append((value, *chain))
