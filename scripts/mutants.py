@@ -563,8 +563,8 @@ MUTANTS = (
     Mutant(
         "pilot: one runs after each edit of a small render",
         "planning/budget.py",
-        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 18,",
-        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 14,",
+        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 16, 1 << 18,",
+        "LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 16, 1 << 14,",
         ("tests/run/test_first_image.py::test_an_edit_of_a_small_render_asks_no_pilot",),
     ),
     Mutant(
@@ -577,8 +577,8 @@ MUTANTS = (
     Mutant(
         "light subpaths: few without a decision, also where glass focuses light",
         "planning/budget.py",
-        "if many or prepared.specular or",
-        "if many or",
+        "return prepared.specular or prepared.space is not None",
+        "return prepared.space is not None",
         ("tests/run/test_first_image.py::test_light_subpaths_without_a_decision",),
     ),
     Mutant(
@@ -1533,8 +1533,8 @@ MUTANTS = (
     Mutant(
         "scene files: inverses that are none are taken for right",
         "geometry/shape_facts.py",
-        "            check_inverse(shape)",
-        "            pass",
+        "partial(check_inverse, shape)",
+        "lambda: None",
         ("tests/test_properties.py::test_endpoints_that_are_refused[instance turned about a long axis]",),
     ),
     Mutant(
