@@ -181,7 +181,7 @@ def test_unit_of_a_response_does_not_matter():
     flat = {"type": "uniform", "value": 0.5}
     images, ended = [], []
     for film in (spectral_film(), spectral_film(loud), rgb_film()):
-        bdpt = integrator(max_depth=6)
+        bdpt = integrator(max_depth=6, spp_per_pass=2)  # roulette begins with the second pass
         images += list(renders(lamp_in_a_sphere(film, flat), bdpt, [1], 16))
         counts = bdpt.statistics["connections"]
         ended.append(counts["rouletted"] / (counts["evaluated"] + bdpt.statistics["rays"]["shadow_t1"]))
