@@ -7,8 +7,8 @@
 
 A row is a kind of object (lamps, materials, ...; or pixels, samples, edits, film filters) and a size: how
 many there are, or which. It has a process of its own with an empty kernel cache, which has rendered something
-before. There `path`, `bdpt` and path tracing alone (``light_paths=0``) each render a scene of their own for
-the first time, then all in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is
+before. There `path`, `bdpt` and path tracing alone (``light_paths=0``) render the scene for the first time, one
+after the other, then in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is
 said. Columns: processor seconds of the first image and, median, of a warm render, as ratios over `path`; what
 an object adds to the difference between `bdpt` and `path`; peak memory of the first render. A kind ends where
 a row takes longer than `PATIENCE`; the table says so.
@@ -368,8 +368,9 @@ def here(kind: Kind, size: int | str) -> dict:
     found, renders = {}, {}
     for integrator in integrators.values():
         dr.eval(mi.render(small, integrator=integrator, spp=1))
+    scene = mi.load_dict(kind.scene(size))  # one for all: virtual calls visit the shapes of all scenes
     for name, integrator in integrators.items():
-        renders[name] = partial(taken, kind, size, mi.load_dict(kind.scene(size)), integrator)
+        renders[name] = partial(taken, kind, size, scene, integrator)
         before = forget_peak()
         first = renders[name](0)
         found[name] = {
