@@ -8,10 +8,10 @@
 A row is a kind of object (lamps, materials, ...; or pixels, samples, edits, film filters) and a size: how
 many there are, or which. It has a process of its own with an empty kernel cache, which has rendered something
 before. There `path`, `bdpt` and path tracing alone (``light_paths=0``) render the scene one after the other,
-then in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is said. Columns: processor
-seconds of the first image and, median, of a warm render, as ratios over `path`; what an object adds to the
-difference between `bdpt` and `path`; peak memory of the first render. A kind ends where a row takes longer than
-`PATIENCE`; the table says so.
+then in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is said. Columns:
+processor seconds of the first image and, median, of a warm render, as ratios over `path`; what an object adds
+to the difference between `bdpt` and `path`; peak memory of the first render. A kind ends where a row takes
+longer than `PATIENCE`; the table says so.
 """
 
 from __future__ import annotations

@@ -237,7 +237,7 @@ def test_t_0_is_explained():
     scene, _ = metered_sphere("point")
     assert "used: t=0" in integrator().explain(scene)
     parallel = {key: value for key, value in camera().items() if key != "fov"} | {"type": "orthographic"}
-    for sensor, why in ((camera(), "no area"), (parallel, "one direction")):
+    for sensor, why in ((camera(), "pinhole"), (parallel, "one direction")):
         scene, _ = sphere_lit_by("point", sensor)
         (line,) = (x for x in integrator().explain(scene).splitlines() if ": t=0:" in x)
         assert line.startswith("skipped (impossible): t=0") and why in line
