@@ -1531,6 +1531,36 @@ MUTANTS = (
         ("tests/emitters/test_scales.py::test_lamps_of_any_size[at a point]",),
     ),
     Mutant(
+        "objects: flipped spheres are hit on the wrong side",
+        "geometry/hits.py",
+        "dr.select(side < 0, -n, n)",
+        "n",
+        ("tests/geometry/test_hits.py::test_spheres_are_mitsubas[1]",),
+    ),
+    Mutant(
+        "objects: shapes of one kind share no function",
+        "geometry/hits.py",
+        "si.shape = dr.select(active, shape, dr.zeros(mi.ShapePtr))",
+        "si.shape = dr.select(active, dr.select(on_sphere, pi.shape, si.shape), dr.zeros(mi.ShapePtr))",
+        ("tests/geometry/test_hits.py::test_kernels_do_not_grow[others]",),
+    ),
+    Mutant(
+        "objects: facts about an edited shape are kept",
+        "geometry/shape_facts.py",
+        "if before._marks.get(index) == mark",
+        "if index in before._marks",
+        ("tests/geometry/test_shape_facts.py::test_edited_shapes_are_asked_again[ball.to_world]",),
+    ),
+    Mutant(
+        "objects: an edited radiance is not checked again",
+        "emitters/area.py",
+        "State.of([emitter])",
+        "None",
+        (
+            "tests/geometry/test_shape_facts.py::test_textured_lamps_are_checked_once[lamp0.emitter.radiance.to_uv]",
+        ),
+    ),
+    Mutant(
         "scene files: inverses that are none are taken for right",
         "geometry/shape_facts.py",
         "partial(check_inverse, shape)",

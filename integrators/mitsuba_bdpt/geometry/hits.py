@@ -135,14 +135,13 @@ class Hits:
             si = _placed(si, inside, to_world)
         if tables.spheres:
             si = dr.select(on_sphere, _on_sphere(pi, ray, to_world, to_object, side), si)
+        # Not the functions' results: shapes that return themselves would not share a function.
         si.shape = dr.select(active, shape, dr.zeros(mi.ShapePtr))
         return _finished(si, pi, ray, active)
 
 
 def _ask(shape: mi.Shape, pi, ray, active) -> mi.SurfaceInteraction3f:
-    si = shape.compute_surface_interaction(ray, pi, renamed.hit_flags(), active)
-    si.shape = dr.zeros(mi.ShapePtr)  # else no two shapes would share a function
-    return si
+    return shape.compute_surface_interaction(ray, pi, renamed.hit_flags(), active)
 
 
 def _placed(si: mi.SurfaceInteraction3f, inside: mi.Bool, to_world: mi.Transform4f):
