@@ -508,6 +508,8 @@ class Flat:
 class Directly:
     """`bsdf.Asked` without virtual calls: stand-ins answer themselves."""
 
+    shared = False
+
     def __call__(self, plugin, question, *args):
         return question(plugin, *args)
 

@@ -130,7 +130,7 @@ class Hits:
                 own = dr.gather(mi.UInt32, tables.targets, number, inside)
                 shape = dr.select(inside, dr.reinterpret_array(mi.ShapePtr, own), shape)
             questions = [partial(_ask, shape) for shape in self._targets]
-            si = dr.switch(number, questions, pi, local, active & ~on_sphere)
+            si = dr.switch(number, questions, pi, local, active & ~on_sphere, label="Shape")
         if tables.instances:
             si = _placed(si, inside, to_world)
         if tables.spheres:

@@ -140,6 +140,8 @@ class Asked:
         self.bsdfs = list(by_id.values())
         self.many = len(by_id) >= MANY
         self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
+        # Samples and evaluations are separate calls, whose functions all places share: less to compile.
+        self.shared = self.many and not self.by_mitsuba
         numbers = [0] * (max(by_id, default=0) + 1)
         for number, index in enumerate(by_id):
             numbers[index] = number
@@ -292,6 +294,10 @@ def sample_adjoint(
 
     def questions(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=True)
+        if traits.asked.shared and not traits.only_delta:
+            smooth = sampled & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
+            found = _evaluated_adjoint(bsdf, si, drawn.bs.wo, smooth, traits)
+            drawn = replace(drawn, value=_evaluation(*found).value)
         weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
         return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
 
@@ -330,9 +336,9 @@ class _Drawn:
 
     ``weight`` and densities (delta: ``pdf_fwd_w`` is the probability of the event, ``pdf_rev_w`` unset);
     ``back``, if `_asks_back`: weight of the delta event sampled from its other end, 0 if it does not lead
-    back; ``value``, of light subpaths with more than delta lobes: of the direction from its other end (NaN
-    as in `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled
-    by parts.
+    back; ``value``, of light subpaths with more than delta lobes, unless `Asked.shared`: of the direction
+    from its other end (NaN as in `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in
+    scenes with BSDFs sampled by parts.
     """
 
     bs: mi.BSDFSample3f
@@ -370,13 +376,13 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         density = found.density if draws.by_parts(self) else pdf_fwd_w
-        value, pdf_rev_w, reverse = None, mi.Float(0), with_wi(si, bs.wo)
-        if adjoint and not traits.only_delta:
-            value, pdf = _value_and_pdf(self, reverse, si.wi, smooth, traits)
+        value, pdf_rev_w = None, mi.Float(0)
+        if adjoint and not traits.only_delta and not traits.asked.shared:
+            value, pdf = _value_and_pdf(self, with_wi(si, bs.wo), si.wi, smooth, traits)
             value = _evaluation(value, pdf_fwd_w, pdf).value
             pdf_rev_w = pdf if traits.reverse else pdf_rev_w
         elif traits.reverse:
-            pdf_rev_w = self.pdf(ctx, reverse, si.wi, smooth)
+            pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
         asks = _asks_back(traits, adjoint)
         back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
         answers = bs, weight, pdf_fwd_w, pdf_rev_w, back, value
