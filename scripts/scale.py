@@ -250,6 +250,7 @@ class Kind:
     """What there is more and more of: ``what`` in words, ``sizes`` (numbers, or names), the scene of a size.
 
     ``spp``: samples per pixel of a size. ``before``: called with scene, size and seed before each render.
+    ``has_slope``: what one more of them takes is a figure.
     """
 
     what: str
@@ -257,6 +258,7 @@ class Kind:
     scene: Callable[..., dict]
     spp: Callable[..., int] = field(default=lambda size: 16)
     before: Callable[[mi.Scene, str, int], None] | None = None
+    has_slope: bool = True
 
 
 KINDS = {
@@ -272,11 +274,16 @@ KINDS = {
         (1, 16, 256, 1024, 4096),
         film,
         lambda width: max(1, 2**20 // width**2),
+        has_slope=False,
     ),
     "samples": Kind("samples of one pixel", (1, 100, 10**4, 10**6, 10**7), lambda n: film(1), lambda n: n),
     "meter": Kind("samples of an irradiance meter", (10**4, 10**6), meter, lambda n: n),
     "previews": Kind(
-        "samples per pixel, `cornell_box`, 64^2", (1, 8, 64), lambda n: cornell(64), lambda n: n
+        "samples per pixel, `cornell_box`, 64^2",
+        (1, 8, 64),
+        lambda n: cornell(64),
+        lambda n: n,
+        has_slope=False,
     ),
     "edits": Kind("an edit before each render", tuple(EDITS), edited, before=edit),
     "filters": Kind(
@@ -437,13 +444,14 @@ HEAD = (
 def cells(rows: list[dict], row: dict) -> list[str]:
     """A line of a table: columns `HEAD` after the first, which is kind and size."""
     path = row["path"]
-    counted = row is not rows[0] and isinstance(row["size"], int)
+    counted = row is not rows[0] and isinstance(row["size"], int) and KINDS[row["kind"]].has_slope
+    warm = 1e3 * path["warm"]
     slopes = [f"{slope(rows, row, method):.3g}" if counted else "–" for method in ("bdpt", "alone")]
     return [
         f"{row['size']:,}" if isinstance(row["size"], int) else row["size"],
         f"{path['first']:.2g}",
         *(ratio(over_path(row, "first", method)) for method in ("bdpt", "alone")),
-        f"{1e3 * path['warm']:.3g}",
+        f"{warm:.3g}" if warm < 1000 else f"{warm:,.0f}",
         *(ratio(over_path(row, "warm", method)) for method in ("bdpt", "alone")),
         *slopes,
         *(f"{row[method]['memory'] / 2**30:.2f}" for method in ("path", "bdpt")),
