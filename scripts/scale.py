@@ -93,7 +93,7 @@ def lamp(radiance: object = 10.0, **shape) -> dict:
 
 
 def grid(count: int) -> list[tuple[float, float, float]]:
-    """Places x, z for so many objects on the ground, and the radius that a sphere has room for."""
+    """Positions (x, z) of ``count`` objects on the ground, each with the radius of a sphere that fits."""
     side = int(np.ceil(np.sqrt(count)))
     cell = 10 / side
     return [((i % side + 0.5) * cell - 5, (i // side + 0.5) * cell - 5, 0.4 * cell) for i in range(count)]
@@ -160,7 +160,7 @@ def textured_lamps(count: int) -> dict:
 
 
 def waves(triangles: int, height: float) -> mi.Mesh:
-    """A mesh with vertex normals of about so many triangles, 4 x 4 units, which faces down."""
+    """A mesh of about ``triangles`` triangles with vertex normals, 4 x 4 units, which faces down."""
     side = max(1, round((triangles / 2) ** 0.5))
     x, z = np.meshgrid(*2 * [np.linspace(-2, 2, side + 1)])
     y = height + 0.2 * np.sin(2 * x) * np.cos(2 * z)
@@ -177,7 +177,7 @@ def waves(triangles: int, height: float) -> mi.Mesh:
 
 
 def lamp_mesh(triangles: int) -> dict:
-    """A lamp of so many triangles, from a file in the working directory."""
+    """A lamp of about ``triangles`` triangles; writes its mesh into the working directory."""
     waves(triangles, 4.0).write_ply("lamp.ply")
     return ground(lamp=lamp(type="ply", filename="lamp.ply", face_normals=False))
 

@@ -583,7 +583,7 @@ def test_spheres_are_small_in_scenes_without_bounds(extent):
     assert quadrics.is_small(quadrics.Sphere([0, 0, 0], 1e-3, 1.0, False), extent)
 
 
-@pytest.mark.skipif(variants.BACKEND == "cuda", reason="all coordinates count there")
+@pytest.mark.skipif(variants.BACKEND == "cuda", reason="with CUDA all coordinates of flat shapes count")
 def test_reach_of_triangles():
     """Rationale: each triangle has its own; one vertex at infinity or of NaN, or one that does not exist,
     spoils its triangles, not the offset of rays on the others. Expected: the largest coordinate of an edge
@@ -605,7 +605,7 @@ def test_reach_of_triangles():
     assert reach([90, 0, 0], [97, 0, 0], [90, 3, 0], [80, 8, 0]) == [0, 0]
 
 
-@pytest.mark.skipif(variants.BACKEND == "cuda", reason="the first answer is that of Embree")
+@pytest.mark.skipif(variants.BACKEND == "cuda", reason="states what Embree answers; CUDA variants use OptiX")
 def test_reach_with_optix(monkeypatch):
     """Rationale: OptiX blocked 9 % of the rays that leave a floor of 2,000 units a unit below the camera.
     Expected: coordinates within the surface count as well."""

@@ -69,7 +69,7 @@ class HitTables:
         many_spheres = len(spheres) >= max(MANY, others / _OTHERS)
         if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or not (many_spheres or len(instances) >= MANY):
             return None
-        first_of = _first_shapes(scene)
+        first_of = _first_shapes(scene, others) if instances else {}
         names = [about("group", partial(_group_of, instance), instance) for instance in instances]
         if not first_of.keys() >= set(names):
             return None
@@ -209,10 +209,12 @@ def _targets(scene: mi.Scene) -> list[mi.Shape]:
     return [*own, *grouped_shapes(scene)]
 
 
-def _first_shapes(scene: mi.Scene) -> dict[str, int]:
-    """Place in `_targets` of the first shape of each group, by the group's name; {} if two have one name."""
-    groups = shape_groups(scene)
-    place, found = len(_targets(scene)) - len(grouped_shapes(scene)), {}
+def _first_shapes(scene: mi.Scene, place: int) -> dict[str, int]:
+    """Place in `_targets` of the first shape of each group, by the group's name; {} if two have one name.
+
+    ``place``: that of the first of all.
+    """
+    groups, found = shape_groups(scene), {}
     for group in groups:
         found[group.id()] = place
         place += len(shapes_in(group))
