@@ -44,9 +44,8 @@ class Block:
         self.clear()
 
     def clear(self):
-        """Set all sums to zero."""
+        """Set all sums to zero, without memory before something is added."""
         self.data = dr.zeros(dr.value_t(self._packet), self._length)
-        dr.make_opaque(self.data)
 
     def put(self, position, values, active, row=0):
         """Add ``values`` at a continuous film position, ``row`` rows below.
@@ -185,7 +184,8 @@ class Accumulator:
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
         rows = image_count(self.depth, settings.merge_images) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
-        self._done: tuple[list, tuple[int, ...]] = ([], ())  # sums and passes
+        # Sums and passes; the sums of several passes are in double precision.
+        self._done: tuple[list, tuple[int, ...]] = ([], ())
         self._share = self._covered()
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
@@ -238,12 +238,12 @@ class Accumulator:
     def close_pass(self, spp: int):
         """Add the sums of a pass of ``spp`` samples per pixel to the total."""
         blocks = self._blocks()
-        sums = [mi.Float64(b.data) for b in blocks]
+        sums = [b.data for b in blocks]
         if self._strips > 1:
             sums[0] = self.camera.totals(self._stride, self.size[1])
         before, passes = self._done
         if before:
-            sums = [a + b for a, b in zip(before, sums, strict=True)]
+            sums = [mi.Float64(a) + mi.Float64(b) for a, b in zip(before, sums, strict=True)]
         dr.eval(sums)
         self._done = (sums, (*passes, spp))  # one assignment: Ctrl-C may come between any two steps
         for b in blocks:
@@ -277,25 +277,37 @@ class Accumulator:
     def close_replicate(self):
         """Add what was accumulated since the last call as one independent replicate."""
         sums, passes = self._done
-        self.replicates.add([np.array(s) for s in sums[:2]], sum(passes), self._image)
+        doubles = [np.array(s, dtype=np.float64) for s in sums[:2]]
+        self.replicates.add(doubles, sum(passes), self._image)
 
     def error(self) -> float:
         """Return the estimated relMSE of the image, see `Replicates.error`."""
         return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
 
-    def _image(self, camera, light, spp: int):
+    def _image(self, camera: np.ndarray, light: np.ndarray, spp: int) -> np.ndarray:
         """Return the image (height, width, colours) of sums over ``spp`` samples."""
-        pixels = self._pixels(camera, light)
-        return pixels.colours / pixels.weight + pixels.light / self._splat_weight(spp)[..., None]
+        pixels, w = self._pixels(mi.Float64(camera), mi.Float64(light)), self._splat_weight(spp)
+        return self._on_host(
+            [c / pixels.weight + y / w for c, y in zip(pixels.colours, pixels.light, strict=True)]
+        )
+
+    def _on_host(self, channels: list[mi.Float64]) -> np.ndarray:
+        """Return an image of ``channels`` in NumPy, (height, width, channels)."""
+        values = dr.ravel(mi.ArrayXd(channels), order="F")
+        return np.array(values).reshape(self.size[1], self.size[0], len(channels))
 
     def _pixels(self, camera, light) -> _Pixels:
-        """Reshape the sums of an image to (height, width, channels)."""
-        (w, h), c = self.size, self._channels
-        parts = np.cumsum([c.colours, c.alpha, 1, c.features, c.stokes])
-        *of_camera, polarized, _ = np.split(camera.reshape(h, w, -1), parts, axis=-1)
-        parts = np.cumsum([c.colours, c.stokes])
-        splats, of_splats, _ = np.split(light.reshape(h, w, -1), parts, axis=-1)
-        return _Pixels(*of_camera, light=splats, polarized=(polarized, of_splats))
+        """Return the channels of sums in `_NAMES`' order."""
+
+        def parts(sums, width: int, *counts: int) -> list[list[mi.Float64]]:
+            numbers = iter(range(width))
+            return [[mi.Float64(sums[next(numbers) :: width]) for _ in range(count)] for count in counts]
+
+        c = self._channels
+        *of_camera, polarized = parts(camera, c.camera, c.colours, c.alpha, 1, c.features, c.stokes)
+        colours, alpha, [weight], features = of_camera
+        splats, of_splats = parts(light, c.light, c.colours, c.stokes)
+        return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats))
 
     def mean(self):
         """Return the mean of the image so far, the scale of roulette.
@@ -304,18 +316,23 @@ class Accumulator:
         """
         channels, blocks = self._channels, zip(self._done[0][:2], (self.camera, self.light), strict=True)
         camera, light = (
-            [dr.sum(sums[i :: block.channels]) for i in range(channels.colours)] for sums, block in blocks
+            [dr.sum(mi.Float64(sums[i :: block.channels])) for i in range(channels.colours)]
+            for sums, block in blocks
         )
-        weight = dr.sum(self._done[0][0][channels.weight :: self.camera.channels])
-        splat_weight = float(self._splat_weight(sum(self.passes)).sum())
+        weight = dr.sum(mi.Float64(self._done[0][0][channels.weight :: self.camera.channels]))
+        x, y = self._share
+        splat_weight = float(sum(self.passes) * y.sum() * x.sum())
         weight, splat_weight = dr.maximum(weight, 1e-30), dr.opaque(mi.Float64, max(splat_weight, 1e-30))
         colours = zip(camera, light, self.colour.unit, strict=True)
         return reduce(dr.maximum, [(c / weight + y / splat_weight) / unit for c, y, unit in colours])
 
-    def _splat_weight(self, spp: int):
-        """Return W', shape (height, width)."""
-        x, y = self._share
-        return spp * y[:, None] * x[None, :]
+    def _splat_weight(self, spp: int) -> mi.Float64:
+        """Return W' of each pixel."""
+        pixel = dr.arange(mi.UInt32, self.size[0] * self.size[1])
+        row = pixel // dr.opaque(mi.UInt32, self.size[0])
+        x, y = (mi.Float64(share) for share in self._share)
+        y = dr.gather(mi.Float64, spp * y, row)
+        return y * dr.gather(mi.Float64, x, pixel - row * dr.opaque(mi.UInt32, self.size[0]))
 
     def _covered(self) -> list[np.ndarray]:
         """Return each pixel's integral of the 1D filter over the camera samples' region, by axis."""
@@ -338,56 +355,78 @@ class Accumulator:
         sums, passes = self._done
         if not passes:
             return
-        spp = sum(passes)
-        pixels = self._pixels(*(np.array(s) for s in sums[:2]))
-        to_film = pixels.weight / self._splat_weight(spp)[..., None]
-        colours = np.concatenate([pixels.colours + pixels.light * to_film, pixels.alpha], axis=-1)
+        pixels = self._pixels(*sums[:2])
+        to_film = pixels.weight / self._splat_weight(sum(passes))
+        colours = _added(pixels.colours, pixels.light, to_film)
         layers = []
         if self.stokes is not None:
-            of_camera, of_light = pixels.polarized
-            layers += [colours[..., : self._channels.colours], of_camera + of_light * to_film]
+            layers += colours + _added(*pixels.polarized, to_film)
         if self.features is not None and self.features.guides:
-            layers += self._denoised(pixels, colours)
+            layers += pixels.features[: len(self.features.names)] + self._denoised(pixels, colours)
         else:
-            layers.append(pixels.features)
+            layers += pixels.features
         if self.variance:
-            layers.append(self.replicates.variance(spp, pixels.colours.shape) * pixels.weight)
-        if self.depth:
-            layers += self._strategy_layers(sums[2], to_film)
-        parts = self.colour.stored(colours, pixels.weight, layers)
-        values = np.concatenate(parts, axis=-1).astype(np.float32)
-        block = mi.ImageBlock(mi.TensorXf(values), self.offset, border=False)
+            layers += self._variance(sum(passes), pixels.weight)
+        if self.strategies is not None:
+            layers += self._strategy_layers(self.strategies, sums[2], to_film)
+        stored = self.colour.stored(colours + pixels.alpha, pixels.weight, layers)
+        values = dr.ravel(mi.ArrayXf(stored), order="F")
+        dr.eval(values)
+        shape = self.size[1], self.size[0], len(stored)
         self.film.clear()
-        self.film.put_block(block)
+        self.film.put_block(mi.ImageBlock(mi.TensorXf(values, shape), self.offset, border=False))
 
-    def _denoised(self, pixels: _Pixels, colours) -> list:
-        """Return the film's features and the denoised ``colours``."""
-        shown, guides = np.split(pixels.features, [len(self.features.names)], axis=-1)
+    def _denoised(self, pixels: _Pixels, colours: list[mi.Float64]) -> list[mi.Float64]:
+        """Return the denoised ``colours``, weighted by the filter as these are."""
         # A filter with negative lobes may leave a weight of 0.
-        weight = np.where(pixels.weight == 0, 1, pixels.weight)
-        image, guides = colours[..., : self._channels.colours] / weight, guides / weight
+        weight = dr.select(pixels.weight == 0, 1, pixels.weight)
+        image, guides = (
+            self._on_host([value / weight for value in values])
+            for values in (colours, pixels.features[len(self.features.names) :])
+        )
         found = denoising.denoised(image, guides[..., denoising.ALBEDO], guides[..., denoising.NORMAL])
-        return [shown, found * pixels.weight]
+        return [value * pixels.weight for value in _channels(found)]
 
-    def _strategy_layers(self, sums, to_film) -> list:
-        """Return the strategy images in film order; ``to_film``: factor of splats."""
-        w, h = self.size
-        tall = np.array(sums).reshape(-1, self._stride, w, 6)[:, :h]
+    def _variance(self, spp: int, weight: mi.Float64) -> list[mi.Float64]:
+        """Return the variance of each colour, weighted by the filter's ``weight``."""
+        shape = self.size[1], self.size[0], self._channels.colours
+        return [value * weight for value in _channels(self.replicates.variance(spp, shape))]
+
+    def _strategy_layers(self, block: Block, sums: mi.Float64, to_film: mi.Float64) -> list[mi.Float64]:
+        """Return the channels of the strategy images in film order; ``to_film``: factor of splats."""
+        row, width = block.row, block.channels
+        first = width * dr.arange(mi.UInt32, self.size[0] * self.size[1])
         splats = [t <= 1 for _, _, t in strategies(self.depth)]
-        splats += [False] * (len(tall) - len(splats))  # merges
-        return [image * (to_film if splat else 1) for image, splat in zip(tall, splats, strict=True)]
+        splats += [False] * (len(sums) // (self._stride * row) - len(splats))  # merges
+        found = []
+        for number, splat in enumerate(splats):
+            start = first + dr.opaque(mi.UInt32, number * self._stride * row)
+            image = [dr.gather(mi.Float64, sums, start + i) for i in range(width)]
+            found += [value * to_film for value in image] if splat else image
+        return found
+
+
+def _added(camera: list[mi.Float64], light: list[mi.Float64], to_film: mi.Float64) -> list[mi.Float64]:
+    """Return the sums of camera samples and of splats, with the film's weight."""
+    return [c + y * to_film for c, y in zip(camera, light, strict=True)]
+
+
+def _channels(image: np.ndarray) -> list[mi.Float64]:
+    """Return the channels of an image in NumPy, (height, width, channels)."""
+    values, count = mi.Float64(image.ravel()), image.shape[-1]
+    return [mi.Float64(values[i::count]) for i in range(count)]
 
 
 @dataclass
 class _Pixels:
-    """Sums of an image, each of shape (height, width, channels).
+    """Sums of an image: channels, each an array over pixels in double precision.
 
     ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats.
     """
 
-    colours: np.ndarray
-    alpha: np.ndarray
-    weight: np.ndarray
-    features: np.ndarray
-    light: np.ndarray
-    polarized: tuple[np.ndarray, np.ndarray]
+    colours: list[mi.Float64]
+    alpha: list[mi.Float64]
+    weight: mi.Float64
+    features: list[mi.Float64]
+    light: list[mi.Float64]
+    polarized: tuple[list[mi.Float64], list[mi.Float64]]

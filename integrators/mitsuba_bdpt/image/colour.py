@@ -65,8 +65,8 @@ class Rgb:
         self._film.prepare(layers)
 
     def stored(self, colours, weight, layers) -> list:
-        """Return the parts of the film's storage in order; alpha counts as a colour."""
-        return [colours, weight, *layers]
+        """Return the channels of the film's storage in order; alpha counts as a colour."""
+        return [*colours, weight, *layers]
 
 
 class Bands:
@@ -96,8 +96,8 @@ class Bands:
         self.unit = tuple(float(dr.slice(dr.mean(band))) or inf for band in response)
 
     def stored(self, colours, weight, layers) -> list:
-        """Return the parts of the film's storage in order; the weight is last."""
-        return [colours, *layers, weight]
+        """Return the channels of the film's storage in order; the weight is last."""
+        return [*colours, *layers, weight]
 
 
 STOKES_NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")
