@@ -38,6 +38,17 @@ def test_the_page_of_the_parameters_is_made_from_them():
     assert found.strip() == settings.table().strip()
 
 
+MADE = ("docs/reports/", "CHANGELOG.md")
+"""Pages made by scripts, and the one that grows by version."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_are_short(page):
+    """Expected: fewer than 2,500 words, so that a page is read in a quarter of an hour; not of `MADE`."""
+    words = re.findall(r"[A-Za-z0-9][^\s|]*", page.read_text())
+    assert str(page.relative_to(ROOT)).startswith(MADE) or len(words) < 2500
+
+
 def test_the_readme_is_short():
     """Expected: below 100 lines, and six parameters in its table; the rest is in docs/."""
     text = (ROOT / "README.md").read_text()
