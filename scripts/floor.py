@@ -60,10 +60,10 @@ def main(arguments=None) -> int:
     options = parser.parse_args(arguments)
     if bool(options.scene) == bool(options.record):
         parser.error("give scenes, or --record FILE")
+    mi.set_variant("llvm_ad_rgb")
     if options.record:
         record(options.record, options.rounds)
         return 0
-    mi.set_variant("llvm_ad_rgb")
     for name in options.scene:
         ratios = floor.measure(PROJECT.scene(name), options.rounds, of_path=options.path)
         middle = statistics.median(ratios)

@@ -10,8 +10,8 @@ many there are, or which. It has a process of its own with an empty kernel cache
 before. There `path`, `bdpt` and path tracing alone (``light_paths=0``) render the scene one after the other,
 then in turns; 64^2 pixels, 16 samples per pixel, ``max_depth`` 6 where nothing else is said. Columns:
 processor seconds of the first image and, median, of a warm render, as ratios over `path`; what an object adds
-to the difference between `bdpt` and `path`; peak memory of the first render. A kind ends where a row takes
-longer than `PATIENCE`; the table says so.
+to the difference between `bdpt` and `path`; peak memory of the first render; of films of one pixel, time
+times the variance over the seeds. A kind ends where a row takes longer than `PATIENCE`; the table says so.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ PATIENCE = 60.0
 """Seconds of a row after which a kind has no larger one."""
 WARM_SECONDS, ROUNDS = 4.0, (3, 15)
 """Of the warm renders of a row: how long they may take, and the least and the most rounds."""
+ROUNDS_OF_NOISE, SECONDS_OF_NOISE = 10, 20.0
+"""Of the warm renders of one pixel: the least rounds that show its noise, and how long they may take."""
 
 
 def view(width: int = 64, rfilter: str = "box") -> dict:
@@ -250,7 +252,7 @@ class Kind:
     """What there is more and more of: ``what`` in words, ``sizes`` (numbers, or names), the scene of a size.
 
     ``spp``: samples per pixel of a size. ``before``: called with scene, size and seed before each render.
-    ``has_slope``: what one more of them takes is a figure.
+    ``has_slope``: what one more of them takes is a figure. ``one_pixel``: and so is the noise of the image.
     """
 
     what: str
@@ -259,6 +261,7 @@ class Kind:
     spp: Callable[..., int] = field(default=lambda size: 16)
     before: Callable[[mi.Scene, str, int], None] | None = None
     has_slope: bool = True
+    one_pixel: bool = False
 
 
 KINDS = {
@@ -276,8 +279,10 @@ KINDS = {
         lambda width: max(1, 2**20 // width**2),
         has_slope=False,
     ),
-    "samples": Kind("samples of one pixel", (1, 100, 10**4, 10**6, 10**7), lambda n: film(1), lambda n: n),
-    "meter": Kind("samples of an irradiance meter", (10**4, 10**6), meter, lambda n: n),
+    "samples": Kind(
+        "samples of one pixel", (1, 100, 10**4, 10**6, 10**7), lambda n: film(1), lambda n: n, one_pixel=True
+    ),
+    "meter": Kind("samples of an irradiance meter", (10**4, 10**6), meter, lambda n: n, one_pixel=True),
     "previews": Kind(
         "samples per pixel, `cornell_box`, 64^2",
         (1, 8, 64),
@@ -309,6 +314,12 @@ class Goal:
 def over_path(row: dict, figure: str, method: str) -> float:
     """A time (``first``, ``warm``) of a method over that of `path`."""
     return row[method][figure] / row["path"][figure]
+
+
+def effort(row: dict, method: str) -> float | None:
+    """Time times variance of a film of one pixel, over those of `path`; None if it was not measured."""
+    both = [row[name]["warm"] * row[name].get("variance", 0) for name in (method, "path")]
+    return both[0] / both[1] if all(both) else None
 
 
 def slope(rows: list[dict], row: dict, method: str) -> float:
@@ -349,14 +360,16 @@ GOALS = (
 
 
 def taken(kind: Kind, size: int | str, scene: mi.Scene, integrator: mi.Integrator, seed: int) -> dict:
-    """Processor and wall seconds of an edit, if the kind has one, and a render."""
+    """Processor and wall seconds of an edit, if the kind has one, and a render; the image's mean."""
     dr.sync_thread()
     started, cpu_started = time.perf_counter(), time.process_time()
     if kind.before:
         kind.before(scene, str(size), seed)
-    dr.eval(mi.render(scene, integrator=integrator, spp=kind.spp(size), seed=seed))
+    image = mi.render(scene, integrator=integrator, spp=kind.spp(size), seed=seed)
+    dr.eval(image)
     dr.sync_thread()
-    return {"cpu": time.process_time() - cpu_started, "wall": time.perf_counter() - started}
+    taken = {"cpu": time.process_time() - cpu_started, "wall": time.perf_counter() - started}
+    return taken | {"mean": float(np.mean(image))}
 
 
 def forget_peak() -> int:
@@ -387,13 +400,17 @@ def here(kind: Kind, size: int | str) -> dict:
         }
     warm: dict[str, list[dict]] = {name: [] for name in METHODS}
     started, seed = time.perf_counter(), 0
-    while seed < ROUNDS[0] or (seed < ROUNDS[1] and time.perf_counter() - started < WARM_SECONDS):
+    most = SECONDS_OF_NOISE if kind.one_pixel else WARM_SECONDS
+    while seed < ROUNDS[0] or (seed < ROUNDS[1] and time.perf_counter() - started < most):
         seed += 1
         for name in list(METHODS)[:: 1 if seed % 2 else -1]:
             warm[name].append(renders[name](seed))
     for name, times in warm.items():
         found[name]["warm"] = statistics.median(one["cpu"] for one in times)
         found[name]["warm_wall"] = statistics.median(one["wall"] for one in times)
+        if kind.one_pixel and len(times) >= ROUNDS_OF_NOISE:
+            means = [one["mean"] for one in times]
+            found[name]["variance"] = statistics.variance(means) / statistics.mean(means) ** 2
     return found
 
 
@@ -438,6 +455,8 @@ HEAD = (
     "path tracing alone",
     "memory, GiB: `path`",
     "`bdpt`",
+    "one pixel, time × variance: `bdpt`",
+    "path tracing alone",
 )
 
 
@@ -447,6 +466,7 @@ def cells(rows: list[dict], row: dict) -> list[str]:
     counted = row is not rows[0] and isinstance(row["size"], int) and KINDS[row["kind"]].has_slope
     warm = 1e3 * path["warm"]
     slopes = [f"{slope(rows, row, method):.3g}" if counted else "–" for method in ("bdpt", "alone")]
+    efforts = [effort(row, method) for method in ("bdpt", "alone")]
     return [
         f"{row['size']:,}" if isinstance(row["size"], int) else row["size"],
         f"{path['first']:.2g}",
@@ -455,6 +475,7 @@ def cells(rows: list[dict], row: dict) -> list[str]:
         *(ratio(over_path(row, "warm", method)) for method in ("bdpt", "alone")),
         *slopes,
         *(f"{row[method]['memory'] / 2**30:.2f}" for method in ("path", "bdpt")),
+        *("–" if one is None else ratio(one) for one in efforts),
     ]
 
 

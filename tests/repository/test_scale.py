@@ -62,6 +62,19 @@ def test_figures_are_ratios_over_path():
     assert "| lamps, 1,000, warm render | 1.5 | not measured |" in text
 
 
+def test_what_a_pixel_takes_to_an_error():
+    """Expected: three times the time at a twelfth of the variance take a fourth to the same error; of rows
+    without a variance nothing is said."""
+    shown = row("samples", 100, 1, 3)
+    assert scale.effort(shown, "bdpt") is None and scale.cells([shown], shown)[-2:] == ["–", "–"]
+    for method, variance in (("path", 1e-6), ("bdpt", 1e-6 / 12), ("alone", 1e-6)):
+        shown[method] = shown[method] | {"variance": variance}
+    assert scale.effort(shown, "bdpt") == pytest.approx(1 / 4)
+    assert scale.cells([shown], shown)[-2:] == ["0.25x", "1x"] and len(scale.cells([shown], shown)) == len(
+        scale.HEAD
+    )
+
+
 def test_goals_are_of_rows_that_are_measured():
     """Expected: kind, size, method and figure of each goal exist; no slope of a first row."""
     for goal in scale.GOALS:

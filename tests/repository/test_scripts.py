@@ -7,6 +7,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import floor
 import matplotlib.image
 import mitsuba as mi
 import mutants
@@ -193,6 +194,15 @@ def test_a_comparison_with_what_has_no_error_is_refused():
     line = compare.line("furnace_white", [lambda spp, seed: Timed(image, 1.0, 1.0)] * 2, exact, 4, 2)
     assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
     assert "exactly that of the reference" in line[2]
+
+
+def test_the_floor_is_recorded_in_a_variant(monkeypatch):
+    """Rationale: the versions in the record name the LLVM of the variant, and without one the last command of
+    `make benchmark` failed after an hour. Expected: the variant is set first."""
+    steps = []
+    monkeypatch.setattr(mi, "set_variant", lambda name: steps.append("variant"))
+    monkeypatch.setattr(floor, "record", lambda file, rounds: steps.append("record"))
+    assert floor.main(["--record", "probes.json"]) == 0 and steps == ["variant", "record"]
 
 
 COMMANDS = sorted(path.name for path in SCRIPTS.glob("*.py") if "__main__" in path.read_text())
