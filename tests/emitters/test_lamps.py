@@ -11,7 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.emitters import area, textured
+from mitsuba_bdpt.emitters import area, surfaces, textured
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import mitsubas_choices, quadrics, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
@@ -394,6 +394,37 @@ def test_nothing_is_sampled_where_nothing_is_repeated(monkeypatch):
     screen = {"type": "rectangle", "emitter": {"type": "area", "radiance": peaked(2)}}
     Emitters(gap(**lamps, screen=screen))
     assert len(seen) == 1
+
+
+def test_the_comparison_does_not_grow_with_other_lamps(monkeypatch):
+    """Rationale: where each comparison records calls of all lamps, fifty lamps with pictures among a thousand
+    take seconds. Expected: beside 33 other lamps it calls as many as beside one, and two lamps with pictures
+    share a kernel."""
+    called, switch = [], textured.switch
+
+    def counted(owners, *arguments):
+        called.append(sum(owner is not None for owner in owners))
+        return switch(owners, *arguments)
+
+    for module in (textured, surfaces):
+        monkeypatch.setattr(module, "switch", counted)
+    picture = {"type": "sphere", "radius": 0.2, "emitter": {"type": "area", "radiance": peaked(2)}}
+    plain = {"type": "disk", "emitter": {"type": "area", "radiance": 2.0}}
+
+    def compared(others: int, pictures: int = 1):
+        lamps = {f"plain{i}": plain | {"to_world": T().translate([0, i, 9])} for i in range(others)}
+        lamps |= {f"picture{i}": picture | {"to_world": T().translate([i, 0, 5])} for i in range(pictures)}
+        scene = gap(**lamps)
+        called.clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            Emitters(scene)
+            found = dr.kernel_history((dr.KernelType.JIT,))
+        return list(called), [k["hash"] for k in found if k["size"] == mitsubas_choices.CHECKED]
+
+    assert compared(33)[0] == compared(1)[0] != []
+    kernels = compared(1, pictures=2)[1]
+    assert len(kernels) == 2 and len(set(kernels)) == 1
 
 
 @pytest.mark.parametrize("placed", PLACED)

@@ -130,7 +130,8 @@ class AreaEmitters(Group):
     def tables(cls, emitter) -> int:
         return 1
 
-    def __init__(self, emitters, context: Context):
+    def __init__(self, emitters, context: Context, checks: bool = True):
+        """See `Group`; ``checks`` the densities of points where Mitsuba's choices are replicated."""
         self._emitters = emitters
         spheres = spheres_of(emitters, context)
         pairs = list(zip(emitters, spheres, strict=True))
@@ -153,15 +154,9 @@ class AreaEmitters(Group):
         )
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
-        for index, (emitter, _) in enumerate(pairs):
-            if how[index] in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or found[index].inner_radius > 0:
-                self._check_densities(emitter, index, how[index], context)
-
-    def _check_densities(self, emitter, index: int, how: _Sampled, context: Context):
-        """`check_densities`, repeated after an edit of the shape or of the radiance."""
-        check = partial(check_densities, self, emitter, index, how is not _Sampled.BY_MAP)
-        state = how, context.by_shapes, State.of([emitter])
-        context.facts.about("densities", check, emitter.get_shape(), state=state)
+        for emitter, sampled, sphere in zip(emitters, how, found, strict=True) if checks else ():
+            if sampled in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or sphere.inner_radius > 0:
+                _check_densities(emitter, sampled, context)
 
     # -- densities of points ----------------------------------------------------------------
 
@@ -407,6 +402,19 @@ def _radiance_over_density(emitter, ds, pdf_w, si, active):
 
 
 # -- which area lights there are --------------------------------------------------------------
+
+
+def _check_densities(emitter, how: _Sampled, context: Context):
+    """`check_densities`, repeated after an edit of the shape or of the radiance."""
+
+    def check():
+        # Not in the group of all emitters, each of which would be part of the kernel. Twice: a switch, whose
+        # kernel lamps share.
+        group = AreaEmitters([emitter, emitter], context, checks=False)
+        check_densities(group, emitter, 0, how is not _Sampled.BY_MAP)
+
+    state = how, context.by_shapes, State.of([emitter])
+    context.facts.about("densities", check, emitter.get_shape(), state=state)
 
 
 def _samples_points(emitter) -> bool:
