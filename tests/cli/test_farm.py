@@ -328,7 +328,7 @@ def test_a_film_that_takes_more_memory_than_is_asked_for_is_refused_before_the_r
     for command in ("render", "explain"):
         assert main([command, str(SCENE), "--size", "4096x4096", "--spp", "1", "--memory", "2"]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
-        assert "4096 x 4096 pixels takes about 4.5 GiB of memory; there are 2 GiB (the limit set by" in error
+        assert "4096 x 4096 pixels takes about 3 GiB of memory; there are 2 GiB (the limit set by" in error
     assert main([*SMALL, "--spp", "1", "-o", "a.exr"]) == 0, "the next command has no such limit"
 
 

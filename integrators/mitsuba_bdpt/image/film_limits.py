@@ -18,15 +18,16 @@ STRATEGY_MEMORY = 2 << 30
 # Bytes per number in the sums of a pass (single, double), and in the total (double, held twice while adding).
 SINGLE, DOUBLE, ALL = 4, 8, 2 * 8
 
-# Bytes per number of the film while it is developed: two in double, three in single precision.
-OF_IMAGE = 2 * DOUBLE + 3 * SINGLE
-
-# Images in double precision for the variance: two in each half, and six while it is computed.
-OF_VARIANCE = 2 * 2 + 6
+# Images in double precision for the variance: two in each half, and eleven while it is computed, those of
+# sums and their differences included.
+OF_VARIANCE = 2 * 2 + 11
 
 
 def check_film(film, channels: Channels, variance: bool):
-    """Raise `UsageError` if the film exceeds the memory or Dr.Jit's array size."""
+    """Raise `UsageError` if the film exceeds the memory or Dr.Jit's array size.
+
+    The memory is that of a render of several passes; one of a single pass takes less than half.
+    """
     width, height = (int(x) for x in film.crop_size())
     numbers = width * height * max(channels.camera, channels.light)
     per_pixel = channels.camera * (SINGLE + ALL) + channels.light * (DOUBLE + ALL)
@@ -34,7 +35,7 @@ def check_film(film, channels: Channels, variance: bool):
     if variance:  # and the sums at the last replicate
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + channels.light + OF_VARIANCE * channels.colours)
-    needed, there = width * height * (per_pixel + OF_IMAGE * of_film), memory.available()
+    needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
     # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")
     if needed > there.bytes and not on_gpu:
