@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from functools import partial
+from functools import cache, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -154,9 +154,13 @@ class AreaEmitters(Group):
         )
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
-        for emitter, sampled, sphere in zip(emitters, how, found, strict=True) if checks else ():
-            if sampled in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or sphere.inner_radius > 0:
-                _check_densities(emitter, sampled, context)
+        asked = [
+            (emitter, sampled)
+            for emitter, sampled, sphere in zip(emitters, how, found, strict=True)
+            if sampled in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or sphere.inner_radius > 0
+        ]
+        if checks and asked:
+            _check_densities(asked, context)
 
     # -- densities of points ----------------------------------------------------------------
 
@@ -404,17 +408,22 @@ def _radiance_over_density(emitter, ds, pdf_w, si, active):
 # -- which area lights there are --------------------------------------------------------------
 
 
-def _check_densities(emitter, how: _Sampled, context: Context):
-    """`check_densities`, repeated after an edit of the shape or of the radiance."""
+def _check_densities(asked: list, context: Context):
+    """`check_densities` of emitters, with their `_Sampled`; repeated after an edit of shape or radiance."""
 
-    def check():
-        # Not in the group of all emitters, each of which would be part of the kernel. Twice: a switch, whose
+    @cache
+    def group() -> AreaEmitters:
+        # Not that of all emitters, each of which would be part of the kernel. At least two: a switch, whose
         # kernel lamps share.
-        group = AreaEmitters([emitter, emitter], context, checks=False)
-        check_densities(group, emitter, 0, how is not _Sampled.BY_MAP)
+        return AreaEmitters([emitter for emitter, _ in asked + asked[:1]], context, checks=False)
 
-    state = how, context.by_shapes, State.of([emitter])
-    context.facts.about("densities", check, emitter.get_shape(), state=state)
+    def check(index: int):
+        emitter, how = asked[index]
+        check_densities(group(), emitter, index, how is not _Sampled.BY_MAP)
+
+    for index, (emitter, how) in enumerate(asked):
+        state = how, context.by_shapes, State.of([emitter])
+        context.facts.about("densities", partial(check, index), emitter.get_shape(), state=state)
 
 
 def _samples_points(emitter) -> bool:
