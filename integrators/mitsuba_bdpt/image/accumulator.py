@@ -277,16 +277,15 @@ class Accumulator:
     def close_replicate(self):
         """Add what was accumulated since the last call as one independent replicate."""
         sums, passes = self._done
-        doubles = [np.array(s, dtype=np.float64) for s in sums[:2]]
-        self.replicates.add(doubles, sum(passes), self._image)
+        self.replicates.add([mi.Float64(s) for s in sums[:2]], sum(passes), self._image)
 
     def error(self) -> float:
         """Return the estimated relMSE of the image, see `Replicates.error`."""
         return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
 
-    def _image(self, camera: np.ndarray, light: np.ndarray, spp: int) -> np.ndarray:
+    def _image(self, camera: mi.Float64, light: mi.Float64, spp: int) -> np.ndarray:
         """Return the image (height, width, colours) of sums over ``spp`` samples."""
-        pixels, w = self._pixels(mi.Float64(camera), mi.Float64(light)), self._splat_weight(spp)
+        pixels, w = self._pixels(camera, light), self._splat_weight(spp)
         return self._on_host(
             [c / pixels.weight + y / w for c, y in zip(pixels.colours, pixels.light, strict=True)]
         )

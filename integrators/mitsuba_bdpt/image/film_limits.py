@@ -18,9 +18,9 @@ STRATEGY_MEMORY = 2 << 30
 # Bytes per number in the sums of a pass (single, double), and in the total (double, held twice while adding).
 SINGLE, DOUBLE, ALL = 4, 8, 2 * 8
 
-# Images in double precision for the variance: two in each half, and eleven while it is computed, those of
-# sums and their differences included.
-OF_VARIANCE = 2 * 2 + 11
+# Images in double precision for the variance: two in each half, and eight while it is computed, those of
+# differences of sums included.
+OF_VARIANCE = 2 * 2 + 8
 
 
 def check_film(film, channels: Channels, variance: bool):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
+import mitsuba as mi
 import numpy as np
 
 
@@ -61,7 +62,7 @@ class Replicates:
 
     def __init__(self):
         self.halves: tuple[Spread, Spread] = (Spread(), Spread())
-        self._sums: list[np.ndarray] | None = None
+        self._sums: list[mi.Float64] | None = None
 
     @property
     def count(self) -> int:
@@ -95,7 +96,7 @@ class Replicates:
         """Restore ``halves`` and what `store` returned."""
         self.halves = halves
         if self.count:
-            self._sums = [arrays[name] for name in sorted(arrays) if name.startswith(_LAST)]
+            self._sums = [mi.Float64(arrays[name]) for name in sorted(arrays) if name.startswith(_LAST)]
 
     def variance(self, spp: int, shape=()):
         """Return the variance of the mean of ``spp`` samples per pixel.
