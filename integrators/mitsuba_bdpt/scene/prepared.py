@@ -10,11 +10,16 @@ from ..emitters.emitters import Emitters
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of, own_parameters
+from ..host.notices import State, cached
 from ..sensors.checks import check_sensor, views
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
+from ..transport.near_specular import near_specular
 from .plugin_claims import check_plugins
+
+# Most cached facts about lobes of BSDFs that follow from samples.
+_LOBES = 1024
 
 
 class PreparedScene:
@@ -22,6 +27,7 @@ class PreparedScene:
 
     ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``smooth``, ``delta``, ``refracts``:
     some BSDF has such a lobe; ``specular``: some BSDF, as of glass or mirrors, has delta lobes alone;
+    ``near_specular``: BSDFs of shapes with lobes that are not delta, but nearly so, see `near_specular`;
     ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``, in which light subpaths
     start, are None in scenes without media.
     """
@@ -43,6 +49,7 @@ class PreparedScene:
         self.smooth = any(f & smooth for f in flags)
         self.specular = any(f & delta & ~null and not f & smooth for f in flags)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
+        self.near_specular = _near_specular(scene, sensor, found, family)
         instances = sum(map(is_instance, scene.shapes()))  # each has a BSDF
         self.traits = bsdf.Traits.of(found, instances, [b for b, _ in family])
         self.space = self.light_media = None
@@ -58,6 +65,17 @@ class PreparedScene:
         if settings.internals.stored_vertices is not None:
             return settings.internals.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
+
+
+def _near_specular(scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family) -> list[mi.BSDF]:
+    """Those of the BSDFs ``found`` with a near-specular lobe; ``family``: `draws.family` of them."""
+
+    def known(owner: mi.BSDF, name: str, find):
+        key = bsdf.registry_id(owner), name, State.of([owner])
+        return cached(scene, sensor, "near-specular lobes", key, find, most=_LOBES)[0]
+
+    sharp = {id(owner) for owner in near_specular(family, known)}
+    return list({id(owner): owner for owner in found if id(owner) in sharp}.values())
 
 
 def _prepare_bitmaps(family):

@@ -136,7 +136,7 @@ class Asked:
     """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
-        by_id = {_registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
+        by_id = {registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
         self.bsdfs = list(by_id.values())
         self.many = len(by_id) >= MANY
         self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
@@ -175,7 +175,8 @@ class Asked:
         return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
 
 
-def _registry_id(bsdf) -> int:
+def registry_id(bsdf: mi.BSDF) -> int:
+    """Index of a BSDF in Dr.Jit's registry."""
     return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
 
 

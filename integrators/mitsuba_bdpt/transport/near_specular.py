@@ -1,0 +1,202 @@
+"""Which BSDFs have near-specular lobes: not delta, but so narrow that connections rarely sample them.
+
+A connection over a distance d finds a lobe of density P (solid angle) with a probability proportional to
+d^2 / P. This test of a scene needs no kernel: the density of a lobe follows from the parameters of Mitsuba's
+BSDFs. Only BSDFs of other classes are sampled, once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..geometry.directions import random_directions
+from ..geometry.mitsubas_choices import spread_points
+from ..host.introspection import named, number, own_parameters
+
+# Least density (1 / sr, at the axis of the lobe at normal incidence) of a near-specular lobe: that of alpha
+# .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
+NARROW = 20.0
+
+# Points at which textures are evaluated, and samples of a BSDF of another class.
+_TEXTURE_POINTS, _SAMPLES = 4096, 4096
+
+# Least cosine of incidence of these samples: at grazing incidence all glossy lobes are narrow.
+_LEAST_COS = 0.5
+
+# ``cached(bsdf, name, find)``: the result of ``find()``, called ``name``, of the BSDF's parameters alone.
+Cached = Callable[[Any, str, Callable[[], float]], float]
+
+# Least or, with the sign -1, the negative largest value of a BSDF's parameter by name.
+Bound = Callable[..., float]
+
+
+def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> list[mi.BSDF]:
+    """The BSDFs of a `draws.family` with a near-specular lobe, of their own or of nested BSDFs."""
+    family = list(family)
+    found = {id(bsdf) for bsdf, held in family if density(bsdf, held, cached) >= NARROW}
+    before = set()
+    while found != before:  # from nested BSDFs to those around them
+        before = found
+        found = found | {id(b) for b, held in family if any(id(value) in found for value in held.values())}
+    return [bsdf for bsdf, _ in family if id(bsdf) in found]
+
+
+def names(shapes: Iterable[mi.Shape], bsdfs: Iterable[mi.BSDF]) -> list[str]:
+    """Names, for messages, of the ``shapes`` with one of ``bsdfs``: the shape's id, or the BSDF's."""
+    meant, found = {id(bsdf) for bsdf in bsdfs}, []
+    for shape in shapes:
+        bsdf = shape.bsdf()
+        if bsdf is not None and id(bsdf) in meant:
+            # Mitsuba makes up ids of shapes without one.
+            unnamed = not shape.id() or shape.id().startswith("_unnamed_")
+            found.append(named(bsdf if unnamed else shape))
+    return list(dict.fromkeys(found))
+
+
+def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:
+    """Approximate largest density (solid angle) of the BSDF's own glossy lobes, 0 if it has none.
+
+    ``held``: its `children`. Attributes of meshes count as 0, that is, as sharp.
+    """
+    if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) or bsdf.class_name() in _AROUND_OTHERS:
+        return 0.0
+    peak = _PEAKS.get(bsdf.class_name())
+    if peak is None:
+        return cached(bsdf, "density", partial(_sampled, bsdf))
+
+    def bound(name: str, sign: int = 1) -> float:
+        if isinstance(held[name], mi.Texture):
+            return _bound(held[name], sign, partial(cached, bsdf, f"{name} {sign}"))
+        return sign * float(number(own_parameters(bsdf)[name]))
+
+    return peak(bsdf, held, bound)
+
+
+# -- Mitsuba's BSDFs --------------------------------------------------------------------------
+
+# Least alpha of microfacets in Mitsuba.
+_SMOOTHEST = 1e-4
+
+
+def _microfacets(alpha: float) -> float:
+    """Density of half vectors along the normal, of GGX and Beckmann; ``alpha``^2 = alpha_u alpha_v."""
+    return 1 / (math.pi * max(alpha, _SMOOTHEST) ** 2)
+
+
+def _refracted(alpha: float, eta: float) -> float:
+    """Density of refraction along the normal, in the narrower of both directions."""
+    return _microfacets(alpha) * (max(eta, 1.0) / max(abs(eta - 1), 1e-6)) ** 2
+
+
+def _alpha(held: dict, least: Bound) -> float:
+    names = ("alpha", "alpha") if "alpha" in held else ("alpha_u", "alpha_v")
+    return math.sqrt(max(least(names[0]), 0) * max(least(names[1]), 0))
+
+
+def _rough(bsdf, held: dict, least: Bound) -> float:
+    return _microfacets(_alpha(held, least)) / 4
+
+
+def _rough_dielectric(bsdf, held: dict, least: Bound) -> float:
+    return _refracted(_alpha(held, least), least("eta"))
+
+
+def _principled(bsdf, held: dict, least: Bound) -> float:
+    alpha = max(least("roughness"), 0) ** 2
+    found = _microfacets(max(alpha, 1e-3)) / 4
+    if mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
+        eta = least("eta") if "eta" in held else _eta(least("specular"))
+        found = max(found, _refracted(max(alpha, 1e-3), eta))
+    if coat := -least("clearcoat", -1):
+        found = max(found, coat * _clearcoat(-least("clearcoat_gloss", -1)))
+    return found
+
+
+def _eta(specular: float) -> float:
+    """Relative index of refraction by ``specular`` of `principled`."""
+    return 2 / (1 - math.sqrt(0.08 * min(max(specular, 0), 1))) - 1
+
+
+def _clearcoat(gloss: float) -> float:
+    """Largest density of the clearcoat's lobe (GTR1), which is sampled at a quarter of the others' rate."""
+    a = 0.1 + (0.001 - 0.1) * min(max(gloss, 0), 1)
+    return (a**2 - 1) / (2 * math.pi * math.log(a) * a**2) / 4 / 4
+
+
+def _thin(bsdf, held: dict, least: Bound) -> float:
+    """Of `principledthin`, which is specular only with ``spec_trans``; it refracts by a narrower lobe."""
+    if not least("spec_trans", -1):
+        return 0.0
+    narrower = min(max(0.65 * least("eta") - 0.35, 0), 1)
+    return _microfacets(max((narrower * max(least("roughness"), 0)) ** 2, 1e-3)) / 4
+
+
+_PEAKS = {
+    "RoughConductor": _rough,
+    "RoughPlastic": _rough,
+    "RoughDielectric": _rough_dielectric,
+    "Principled": _principled,
+    "PrincipledThin": _thin,
+}
+
+# BSDFs whose lobes are those of nested ones.
+_AROUND_OTHERS = frozenset({"TwoSidedBRDF", "MaskBSDF", "BlendBSDF", "BumpMap", "NormalMap"})
+
+
+# -- textures and other BSDFs -----------------------------------------------------------------
+
+
+def _bound(texture: mi.Texture, sign: int, cached: Callable) -> float:
+    """Least value of ``sign`` times a ``texture`` that is read as one number per point.
+
+    ``cached(find)``: the result of ``find()``.
+    """
+    kind = texture.class_name()
+    if kind == "UniformSpectrum":
+        return sign * float(number(own_parameters(texture)["value"]))
+    data = own_parameters(texture).get("data") if kind.startswith("BitmapTexture") else None
+    # Spectral variants store coefficients of colours. Of several channels the luminance is read.
+    if data is not None and not dr.is_integral_v(data) and not (mi.is_spectral and data.shape[-1] == 3):
+        values = dr.detach(data.array)
+        return float(number(dr.min(values) if sign > 0 else -dr.max(values)))
+    return cached(partial(_evaluated, texture, sign))
+
+
+def _evaluated(texture: mi.Texture, sign: int) -> float:
+    """`_bound` of values at points all over the unit square of texture coordinates."""
+    found = np.array(texture.eval_1(_interaction(_TEXTURE_POINTS), mi.Bool(True)), dtype=np.float64)
+    return float(np.nanmin(sign * found, initial=math.inf))
+
+
+def _sampled(bsdf: mi.BSDF) -> float:
+    """Largest density of samples of a BSDF, at points all over its textures, from both sides."""
+    si, ctx = _interaction(_SAMPLES), mi.BSDFContext()
+    u = np.random.default_rng(1).random((3, _SAMPLES), dtype=np.float32)
+    bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(u[1], u[2]), mi.Bool(True))
+    glossy = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    glossy &= dr.max(mi.unpolarized_spectrum(weight)) > 0
+    pdf = np.array(dr.select(glossy, bsdf.pdf(ctx, si, bs.wo, glossy), 0), dtype=np.float64)
+    return float(np.nanmax(pdf, initial=0))
+
+
+def _interaction(count: int) -> mi.SurfaceInteraction3f:
+    """Points of a plane with all texture coordinates in the unit square, seen from both sides."""
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.uv = spread_points(count)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.dp_du, si.dp_dv = mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
+    d = random_directions(np.random.default_rng(0), count)
+    cos = dr.copysign(_LEAST_COS + (1 - _LEAST_COS) * dr.abs(d.z), d.z)
+    sin = dr.safe_sqrt(1 - dr.square(cos)) * dr.rsqrt(dr.maximum(1 - dr.square(d.z), 1e-9))
+    si.wi = mi.Vector3f(d.x * sin, d.y * sin, cos)
+    if mi.is_spectral:
+        step = (mi.MI_CIE_MAX - mi.MI_CIE_MIN) / 4
+        si.wavelengths = mi.UnpolarizedSpectrum(*(mi.MI_CIE_MIN + (i + 0.5) * step for i in range(4)))
+    return si
