@@ -1,12 +1,25 @@
 # %% [markdown]
 # # Tutorial
 #
-# This page is a notebook, [tutorial.ipynb](tutorial.ipynb), which runs in Jupyter and needs no other file (not tried in Colab):
+# This page is a notebook, [tutorial.ipynb](tutorial.ipynb). It needs no other file:
 #
-#     pip install mitsuba-bdpt matplotlib jupyterlab
-#     jupyter lab tutorial.ipynb
+# * in Jupyter: put the wheel of `make package` into the notebook's folder; `pip install jupyterlab`, `jupyter lab tutorial.ipynb`.
+# * in Colab: [open it there](https://colab.research.google.com/github/mitsuba-bdpt/mitsuba-bdpt/blob/main/docs/user/tutorial.ipynb),
+#   upload the wheel (*Files*, on the left), and run the cells from the top, on any type of runtime. (Tried in an
+#   environment as Colab's, not in Colab itself.)
 #
-# `mitsuba-bdpt` is not on the package index yet: until it is, replace it by the path of a checkout.
+# The first cell installs the wheel; without one it installs from the repository, since the package is not on the index yet.
+
+# %%
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+if importlib.util.find_spec("mitsuba_bdpt") is None:  # nothing to do where it is installed
+    wheels = sorted(map(str, Path().glob("mitsuba_bdpt-*.whl")))
+    source = wheels[-1] if wheels else "git+https://github.com/mitsuba-bdpt/mitsuba-bdpt"
+    subprocess.run([sys.executable, "-m", "pip", "install", "--quiet", source, "matplotlib"], check=True)
 
 # %%
 import json

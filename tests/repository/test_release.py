@@ -5,17 +5,40 @@ import tomllib
 from pathlib import Path
 
 import mitsuba_bdpt
+import yaml
 from mitsuba_bdpt.cli import measuring
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_version_has_one_home():
-    """Expected: CITATION.cff and the newest release in CHANGELOG.md name the package's version. What
-    is to come, under "Unreleased", has none."""
-    citation = re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
-    newest = re.search(r"^## (?!Unreleased$)(\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
-    assert citation[1] == newest[1] == mitsuba_bdpt.__version__
+    """Expected: CITATION.cff and the newest release in CHANGELOG.md name the package's version, and the same
+    day. What is to come, under "Unreleased", has neither."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    newest = re.search(r"^## (?!Unreleased$)(\S+)\n\n(\d{4}-\d\d-\d\d)\. ", changes, re.MULTILINE)
+    assert citation["version"] == newest[1] == mitsuba_bdpt.__version__
+    assert str(citation["date-released"]) == newest[2]
+
+
+def test_the_repository_has_one_address():
+    """Rationale: many files name the address. Expected: each address of this repository on GitHub or in Colab
+    begins with that of pyproject.toml, and a file that it names on the branch main exists."""
+    home = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Homepage"]
+    files = [*ROOT.glob("*.*"), *ROOT.glob("docs/user/*"), *ROOT.glob(".github/*/*")]
+    text = "\n".join(
+        path.read_text() for path in files if path.suffix in (".md", ".py", ".cff", ".yml", ".toml")
+    )
+    github = re.findall(
+        r"https://(?:github\.com|colab\.research\.google\.com/github)/([\w./-]*mitsuba-bdpt[\w./-]*)", text
+    )
+    assert len(github) >= 5
+    for address in github:
+        owner, name, *rest = address.rstrip(".").split("/")
+        assert home.endswith(f"/{owner}/{name}"), address
+        assert rest[:2] not in (["blob", "main"], ["tree", "main"]) or (ROOT / "/".join(rest[2:])).exists(), (
+            address
+        )
 
 
 def test_each_package_is_required_once():

@@ -1,13 +1,17 @@
 """The tutorial runs as a notebook, and what it asserts holds."""
 
+import importlib.util
 import re
+import subprocess
 import sys
 import textwrap
 import time
+import tomllib
 from pathlib import Path
 
 import jupytext
 import nbformat
+import pytest
 from jupyter_client.manager import start_new_kernel
 from nbclient import NotebookClient
 from patience import PATIENCE
@@ -41,8 +45,7 @@ def test_the_notebook_runs(tmp_path):
     cell runs in an empty folder (at a small size) and its assertions hold; it shows what a whole run shows.
     """
     notebook = jupytext.read(SCRIPT)
-    first = notebook.cells[1]
-    assert "SIZE = 128 " in first.source
+    (first,) = [cell for cell in notebook.cells if "SIZE = 128 " in cell.source]
     first.source = first.source.replace("SIZE = 128 ", "SIZE = 16 ")
     hidden = "import sys; sys.modules['ipywidgets'] = None"
     notebook.cells.insert(0, nbformat.v4.new_code_cell(hidden))
@@ -51,6 +54,25 @@ def test_the_notebook_runs(tmp_path):
     ).execute()
     check_outputs(notebook)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("installed", [False, True])
+@pytest.mark.parametrize("wheels", [["mitsuba_bdpt-0.2.0-py3-none-any.whl", "other-1-py3-none-any.whl"], []])
+def test_the_first_cell_installs_the_package(tmp_path, monkeypatch, wheels, installed):
+    """Rationale: Colab opens the notebook where the package is not installed. Expected: pip installs the
+    wheel beside the notebook, without one the repository of pyproject.toml; nothing where it is installed.
+    """
+    called = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(subprocess, "run", lambda command, check: called.append(command[-2:]))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name if installed else None)
+    for name in wheels:
+        (tmp_path / name).touch()
+    cell = next(cell for cell in jupytext.read(SCRIPT).cells if cell.cell_type == "code")
+    exec(cell.source, {})
+    project = tomllib.loads((SCRIPT.parents[2] / "pyproject.toml").read_text())["project"]
+    source = wheels[0] if wheels else "git+" + project["urls"]["Homepage"]
+    assert called == ([] if installed else [[source, "matplotlib"]])
 
 
 def test_the_notebook_is_that_of_the_script():
