@@ -1,6 +1,7 @@
 """The scenes: they load, their parameters act, and their lamps, walls and meshes are right."""
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import make_meshes
 import make_textures
@@ -24,6 +25,7 @@ SPOT = (0.0707, -0.4294, 0.9003)
 LAMPS = {
     "cornell_box": [(0, -1, 0)],
     "glass_caustics": [(0, -1, 0)],
+    "rough_glass_caustics": [(0, -1, 0)],
     "uplight_room": [(0, 1, 0)],
     "ajar_door": [(0, -1, 0)],
     "furnished_door": [(0, -1, 0)],
@@ -31,6 +33,7 @@ LAMPS = {
     "veach_bidir": [SPOT, (0, 1, 0)],
     "pool": [(0.401, -0.469, -0.787)],
     "ring_caustic": [(0.802, -0.422, 0.422)],
+    "polished_metal": [(-0.770, -0.492, 0.406)],
     "smallvcm_cornell_lamp": [(0, 0, -1)],
     "fog_caustic": [(-0.567, -0.815, 0.142)],
     "cloudy_ball": [(0.514, -0.771, 0.386)],
@@ -51,6 +54,7 @@ CLOSED_ROOMS = [
     "lamp_in_glass_seen",
     "furnished_lamps",
     "furnished_door",
+    "frosted_bulb",
 ]
 # Extinction, per unit of length, of the medium around the sensor and of those in bodies seen from outside.
 FOGS = {
@@ -185,6 +189,26 @@ def test_what_only_merging_finds(name, share):
     ways = [mi.load_dict(ours | {"merging": merging}) for merging in (False, True)]
     mean = [np.mean(mi.render(scene, integrator=way, spp=64, seed=1)) for way in ways]
     assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
+
+
+@pytest.mark.parametrize("name", ["rough_glass_caustics", "pane", "frosted_bulb", "polished_metal"])
+def test_near_specular_scenes_have_no_deltas(name):
+    """Expected: some BSDF has a glossy lobe, and no BSDF a delta lobe, so that every path can be connected in
+    principle."""
+    flags = [int(shape.bsdf().flags()) for shape in load(name).shapes()]
+    assert any(mi.has_flag(value, mi.BSDFFlags.Glossy) for value in flags)
+    assert not any(mi.has_flag(value, mi.BSDFFlags.Delta) for value in flags)
+
+
+def test_rough_glass_caustics_is_glass_caustics_but_for_two_materials():
+    """Expected: without ``alpha`` and the BSDFs of the balls both files have the same elements."""
+
+    def rest(name):
+        root = ElementTree.parse(ROOT / "scenes" / f"{name}.xml").getroot()
+        kept = [e for e in root if e.get("id") not in ("glass", "mirror") and e.get("name") != "alpha"]
+        return [ElementTree.canonicalize(ElementTree.tostring(e), strip_text=True) for e in kept]
+
+    assert rest("rough_glass_caustics") == rest("glass_caustics")
 
 
 def test_projector_shines_through_its_ball_only():

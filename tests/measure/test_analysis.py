@@ -178,6 +178,7 @@ def results():
     rows += noisy("bdpt skip=none", 16, seconds=3.0) + noisy("ptracer", 16, 0.5)
     rows += noisy("bdpt skip=impossible", 16, seconds=1.5)
     rows += noisy("bdpt guiding=photons", 16, rel_mse_trimmed=0.05, spread_trimmed=0.06)
+    rows += noisy("bdpt merging", 16, rel_mse=0.002)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
     values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
@@ -188,6 +189,7 @@ def results():
 
 
 def test_the_stronger_path_decides(results):
+    assert results.rivals == ["path", "path multijitter"]  # not `bdpt` with other parameters
     assert results.against_path("box").median == pytest.approx(0.8)
     assert results.fair_efficiency("box", "path").median == pytest.approx(2)
     with pytest.raises(Refused, match="9.8 % of the energy is missing"):
@@ -281,6 +283,7 @@ def test_goals_stand_beside_what_is_measured(results):
         {"what": "alone", "at_least": "1x", "measure": "alone", "scene": "box"},
         {"what": "none", "at_least": "2x", "measure": "against none"},
         {"what": "aimed", "at_least": "2x", "measure": "not aimed", "scene": "box"},
+        {"what": "merged", "at_least": "9x", "measure": "merging raw", "scene": "box"},
         {"what": "cold", "at_least": "4x", "measure": "coldstart"},
         {"what": "memory", "at_least": "1 GiB", "measure": "memory"},
         {"what": "floor", "at_least": "1x", "measure": "floor"},
@@ -309,6 +312,7 @@ def test_goals_stand_beside_what_is_measured(results):
         cells(report.goals_table(with_fog, goals), "none")[2]
         == "6x, 3 of 3 scenes; without media: 3x, 2 of 2 scenes"
     )
+    assert cells(text, "merged") == ["9x", "–", "20x (20–20) over path, 8x (8–8) over path multijitter"]
     assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5); by the spread over seeds 3x (3–3)"]
     with pytest.raises(Refused, match="not measured"):
         results.efficiency("box", "path", "spread_trimmed")

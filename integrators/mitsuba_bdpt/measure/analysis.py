@@ -40,6 +40,7 @@ IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
 ALONE = "bdpt light_paths=0"
 UNAIMED = "bdpt guiding=photons"
+MERGING = "bdpt merging"
 LIGHT_TRACER = "ptracer"
 
 # Samples per pixel of the first integrator at which efficiencies are compared, if available.
@@ -334,7 +335,7 @@ class Results:
         Mitsuba's path tracers first, then others.
         """
         tracers = *RIVALS, *MEDIA_RIVALS
-        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, UNAIMED, LIGHT_TRACER}
+        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, UNAIMED, MERGING, LIGHT_TRACER}
         others = self.methods[1:]
         return [name for name in tracers if name in others] + [name for name in others if name not in known]
 

@@ -18,6 +18,7 @@ from .analysis import (
     INDEPENDENT,
     LIGHT_TRACER,
     MEDIA_RIVALS,
+    MERGING,
     NONE,
     RIVALS,
     UNAIMED,
@@ -35,6 +36,7 @@ STYLES = {
     INDEPENDENT: ("#009E73", "^", ":"),
     ALONE: ("#F0E442", "P", "-."),
     UNAIMED: ("#999999", "X", "--"),
+    MERGING: ("#009E73", "D", "-"),
     RIVALS[0]: ("#D55E00", "s", "-"),
     RIVALS[1]: ("#E69F00", "D", "--"),
     # Only in scenes with media.

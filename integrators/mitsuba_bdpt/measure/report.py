@@ -30,6 +30,7 @@ from .analysis import (
     INDEPENDENT,
     LIGHT_TRACER,
     MEDIA_RIVALS,
+    MERGING,
     NONE,
     RIVALS,
     UNAIMED,
@@ -366,6 +367,16 @@ def _unaimed(results: Results, scene: str) -> str:
     return f"{error}; by the spread over seeds {noise}"
 
 
+def _merged(results: Results, scene: str) -> str:
+    """Raw efficiency of `merging` over each of `Results.standard`, biased or not."""
+
+    def over(rival: str) -> Summary:
+        ours, theirs = (results.of(scene, name, results.deciding) for name in (MERGING, rival))
+        return efficiency(ours, theirs, "rel_mse")
+
+    return ", ".join(f"{said(over, rival)} over {rival}" for rival in results.standard_in(scene) or RIVALS)
+
+
 def _alone(results: Results, scene: str) -> str:
     return ", ".join(
         f"{said(efficiency, *(results.of(scene, way, budget) for way in (ALONE, RIVALS[1])))} at {budget} spp"
@@ -408,6 +419,7 @@ OF_A_SCENE: dict[str, Callable[[Results, str], object]] = {
     "near one": _near_one,
     "alone": _alone,
     "not aimed": _unaimed,
+    "merging raw": _merged,
     "cost": _cost,
     "pilot": _pilot,
 }
