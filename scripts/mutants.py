@@ -540,6 +540,20 @@ MUTANTS = (
         ("tests/planning/test_pilot.py::test_predicted_variance[cornell-n0c0]",),
     ),
     Mutant(
+        "pilot: connections are drawn as if fog let their light pass or not",
+        "planning/pilot.py",
+        'found.pop("drawn", seen)',
+        '(found.pop("drawn", None), seen)[1]',
+        ("tests/planning/test_pilot.py::test_predicted_variance[fog-n1c1, one]",),
+    ),
+    Mutant(
+        "pilot: a variance below 0 is believed",
+        "planning/choice.py",
+        "np.maximum(moments.variance(stratified)[:, [candidate.number for candidate in candidates]], 0)",
+        "moments.variance(stratified)[:, [candidate.number for candidate in candidates]]",
+        ("tests/planning/test_pilot.py::test_no_group_has_less_than_no_variance",),
+    ),
+    Mutant(
         "pilot: rays of light subpaths by camera samples",
         "planning/pilot.py",
         "count / (self._lanes if name in _OF_LIGHT else len(rows))",

@@ -162,7 +162,7 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
     candidate = replace(lit.candidate, guided=GUIDED)
     each = cost(candidate, moments.rays, alternatives.samples)
     others = _by_group(moments, [table[0].candidate, lit.candidate], alternatives.stratified)
-    best, variance = np.maximum(others, LEAST_VARIANCE).T  # estimates of small variances may be negative
+    best, variance = np.maximum(others, LEAST_VARIANCE).T
     unguided, guided = moments.sds.T
     # Not the ratio of means: a few vertices may hold all of the variance.
     gains = table[0].cost * (best + unguided) / (each * (variance + guided))
@@ -182,8 +182,11 @@ def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
 
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
-    """Variance of each candidate by group of the pilot, shape (`GROUPS`, candidates)."""
-    return moments.variance(stratified)[:, [candidate.number for candidate in candidates]]
+    """Variance of each candidate by group of the pilot, shape (`GROUPS`, candidates).
+
+    At least 0: an estimate may be negative, and one such group would make a candidate the best.
+    """
+    return np.maximum(moments.variance(stratified)[:, [candidate.number for candidate in candidates]], 0)
 
 
 def confidence(moments: Moments, alternatives: Alternatives) -> float:

@@ -142,15 +142,21 @@ class Pilot:
             found = {"visible": own, **squares}
             new = {n: [dr.select(seen.active, x, 0) for x in v] for n, v in found.items()}
             new = {"unshadowed": unshadowed} | new
-            return {name: _sums(total[name], more) for name, more in new.items()}
+            if kernel.space is not None:
+                new["drawn"] = [_drawn(a, b) for a, b in zip(new["visible"], unshadowed, strict=True)]
+            return {name: _sums(sums, new[name]) for name, sums in total.items()}
 
-        found = {name: _none(SAMPLE.parts["draw"]) for name in ("unshadowed", "visible")}
+        names = ("unshadowed", "visible") if kernel.space is None else ("unshadowed", "visible", "drawn")
+        found = {name: _none(SAMPLE.parts["draw"]) for name in names}
         found |= {name: total[name] for name in ("moment", "light")}
         found, counted = connections.connect_all(kernel, z, lane.path, stream, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # A connection drawn in proportion to its unshadowed size represents all: its second moment is the sum
-        # of all sizes times that of the visible ones; that of all connections is the square of the latter.
-        draw = [d + a * (b - a) for d, b, a in zip(total["draw"], unshadowed, seen, strict=True)]
+        # of all sizes times that of seen^2 / size, without media the sum of the visible ones; that of all
+        # connections is the square of what is seen.
+        drawn = found.pop("drawn", seen)
+        rows = zip(total["draw"], unshadowed, drawn, seen, strict=True)
+        draw = [d + b * q - a * a for d, b, q, a in rows]
         rays = counted.shadow_inner
         connected = total["connected"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as the state of a loop requires.
@@ -346,6 +352,11 @@ def _mean_colour(c: Contribution) -> mi.Float64:
     """Mean over the colours in double precision; additive, unlike the maximum."""
     colours = [mi.Float64(dr.abs(colour)) for colour in mi.unpolarized_spectrum(c.value)]
     return sum(colours) / len(colours) * mi.Float64(c.weight)
+
+
+def _drawn(seen: mi.Float64, size: mi.Float64) -> mi.Float64:
+    """seen^2 / size; 0 where both are 0."""
+    return dr.select(size > 0, dr.square(seen) / size, 0)
 
 
 def _none(n: int) -> Row:
