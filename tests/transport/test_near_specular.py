@@ -236,11 +236,11 @@ def test_edits_are_seen():
     parameters = mi.traverse(scene)
     texture = np.array(parameters["rust.bsdf.roughness.data"])
     edits = {
-        "ball.bsdf.alpha.value": (0.3, 0.01, "'ball'"),
-        "coat.bsdf.brdf_0.alpha": (0.3, 0.01, "'coat'"),
-        "rust.bsdf.roughness.data": (texture, np.where(texture < 0.55, 0.05, texture), "'rust'"),
-        "noise.bsdf.roughness.color1.value": (0.7, 0.1, "'noise'"),
-        "own.bsdf.largest": (2.0, 900.0, "'own'"),
+        "ball.bsdf.alpha.value": (0.3, 0.01, "ball"),
+        "coat.bsdf.brdf_0.alpha": (0.3, 0.01, "coat"),
+        "rust.bsdf.roughness.data": (texture, np.where(texture < 0.55, 0.05, texture), "rust"),
+        "noise.bsdf.roughness.color1.value": (0.7, 0.1, "noise"),
+        "own.bsdf.largest": (2.0, 900.0, "own"),
     }
     assert found(scene) == []
     for key, (before, after, name) in edits.items():

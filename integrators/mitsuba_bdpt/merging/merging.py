@@ -162,13 +162,14 @@ class Sample:
     """A photon drawn for a camera vertex.
 
     ``f``: the BSDF (an `Evaluation`) towards it; ``value``: estimate of all merges of the vertex, without
-    weight.
+    weight; ``number``: estimate of the number of photons near it.
     """
 
     photon: Photon
     f: Any
     value: mi.Spectrum
     active: mi.Bool
+    number: mi.Float
 
 
 def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
@@ -185,7 +186,7 @@ def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, waveleng
     # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * dr.abs(dr.dot(z.si.n, photon.d))))
     value = z.throughput * f.value * estimate
-    return Sample(photon, f, value, active & ~spectra.is_zero(value))
+    return Sample(photon, f, value, active & ~spectra.is_zero(value), total / size_of(photon.flux))
 
 
 def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:

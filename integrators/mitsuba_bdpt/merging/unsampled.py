@@ -2,8 +2,9 @@
 
 An SDS path (no edge is connectible, see `sds`) from an emitter that no ray can hit is not sampled. Here
 camera subpaths merge with photons at a path's only non-delta vertex, which samples it in one way: the weight
-is 1. Not included: paths with several non-delta vertices, on surfaces or in media, of which no two are
-neighbours; with light_paths=0 also those with neighbours.
+is 1. In scenes with near-specular lobes they follow these too, see `undersampled`. Not included: paths with
+several non-delta vertices, on surfaces or in media, of which no two are neighbours; with light_paths=0 also
+those with neighbours.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from .merging import Merging
 from .merging import sample as draw
 from .passes import sort
 from .radius import Footprints
+from .undersampled import Undersampled
 from .wavelength_sets import SETS, WavelengthSets
 
 # Merging radius in distances between camera samples on the film: discs overlap, and remain small relative to
@@ -42,7 +44,7 @@ class Unsampled:
 
     ``by_emitter``: a spectrum for each emitter. Of each sample ``seen``: mask, it has a vertex for merging;
     ``size``: the sum of its spectrum; ``through``: index of its first shape. ``broken``: mask by emitter,
-    a photon subpath ended by a non-finite value.
+    a photon subpath ended by a non-finite value. ``kinds``: sums of sizes, see `undersampled.KINDS`, or None.
     """
 
     by_emitter: mi.Float64
@@ -50,12 +52,22 @@ class Unsampled:
     size: mi.Float
     through: mi.UInt32
     broken: mi.Bool
+    kinds: mi.Float64 | None = None
 
 
-def estimate(kernel: Kernel, batch: Batch, count: int, photon_points: Points, points: Points) -> Unsampled:
-    """Merge the camera subpaths of a pilot's ``batch`` with ``count`` photon subpaths.
+def estimate(
+    kernel: Kernel,
+    batch: Batch,
+    count: int,
+    photon_points: Points,
+    points: Points,
+    aim: Aim,
+    samples: float | None = None,
+) -> Unsampled:
+    """Merge the camera subpaths of a pilot's ``batch`` with ``count`` photon subpaths, which ``aim`` begins.
 
-    ``kernel``: follows delta lobes only.
+    ``kernel``: samples delta lobes only. With ``samples`` per pixel of the render it samples all lobes, and
+    undersampled light is included.
     """
     footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
     of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() / count)
@@ -63,14 +75,20 @@ def estimate(kernel: Kernel, batch: Batch, count: int, photon_points: Points, po
     sets, wavelengths = 1, None
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
-    aim, met = Aim.of(kernel.scene, kernel.emitters), dr.opaque(mi.Float, count / sets)
+    met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
-    traced = photon_pass.trace(kernel, merging, aim, photon_points, count, Kept.UNSAMPLED)
+    undersampled = None if samples is None else Undersampled.of(samples)
+    kept = Kept.UNSAMPLED if samples is None else Kept.UNDERSAMPLED
+    traced = photon_pass.trace(kernel, merging, aim, photon_points, count, kept)
     merging.photons = sort(merging, traced.photons, traced.count)
-    return _merged(kernel, merging, batch, points, traced.broken)
+    found = _merged(kernel, merging, batch, points, undersampled)
+    return Unsampled(*found, traced.broken, None if undersampled is None else undersampled.kinds)
 
 
-def _merged(kernel: Kernel, merging: Merging, batch: Batch, points: Points, broken: mi.Bool) -> Unsampled:
+def _merged(
+    kernel: Kernel, merging: Merging, batch: Batch, points: Points, undersampled: Undersampled | None
+) -> tuple:
+    """`Unsampled` up to ``through``."""
     kernel = kernel.bound(points, 1.0, Observer())
     kernel.sds = merging
     lane = dr.arange(mi.UInt32, batch.size)
@@ -81,24 +99,31 @@ def _merged(kernel: Kernel, merging: Merging, batch: Batch, points: Points, brok
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     walk = replace(walk, sds=None, partial=replace(walk.partial, d_vm=0))
     side = subpaths.camera_side(kernel, sample, shared, walk)
-    side = replace(side, connect=None, only_delta=True, sds=None)
+    delta = undersampled is None
+    side = replace(side, connect=None, only_delta=delta, only_specular=not delta, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, len(kernel.scene.emitters()) * channels)
 
     def merge(z, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)
-        value = mi.unpolarized_spectrum(found.value) + found.photon.older  # 0, or NaN
-        value = dr.select(found.active, value, 0)
+        if undersampled is None:
+            active, flaw = found.active, found.photon.older  # 0, or NaN
+        else:
+            active, flaw = undersampled.missing(kernel, merging, z, found), 0 * found.photon.older
+        value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i
             # Other modes leave out NaN.
             mode = dr.ReduceMode.Direct
-            dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.Float64(value[i]), index, found.active, mode)
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.Float64(value[i]), index, active, mode)
         return size + dr.sum(value)
 
     def visit(z, state, walk):
         seen, size, through = state
-        there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+        if undersampled is None:
+            there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+        else:
+            there = undersampled.looks(kernel, z)
         size = dr.if_stmt((z, size), there, merge, lambda z, size: size, label="unsampled light")
         first = z.hit & (z.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, z.si.shape), through)
@@ -106,5 +131,5 @@ def _merged(kernel: Kernel, merging: Merging, batch: Batch, points: Points, brok
 
     state = mi.Bool(False), mi.Float(0), mi.UInt32(0)
     state, _ = random_walk(kernel, side, walk, sample.stream, visit, state)
-    dr.eval(sums, state)
-    return Unsampled(sums, *state, broken)
+    dr.eval(sums, state, () if undersampled is None else undersampled.kinds)
+    return sums, *state

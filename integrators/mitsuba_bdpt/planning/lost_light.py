@@ -1,21 +1,24 @@
-"""Estimates the share of an image's light on SDS paths that no strategy samples.
+"""Estimates the share of an image's light on SDS paths that no strategy samples, or hardly ever.
 
 Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
 reaches the sensor; no two neighbouring vertices can be connected. `possible.unsampled_paths` decides
-whether such paths are possible. The estimate merges a few thousand camera subpaths with as many photons, see
-`merging.unsampled` for what it leaves out, and lamps seen in a mirror.
+whether such paths are possible. Through near-specular lobes in place of delta lobes a few samples find such
+light: it is *undersampled* if a render expects too few of them, see `merging.undersampled`. The estimate
+merges a few thousand camera subpaths with as many photons, see `merging.unsampled` for what it leaves out,
+and lamps seen in a mirror.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .. import components
+from ..host.introspection import all_shapes
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
@@ -24,8 +27,10 @@ from ..settings import Settings
 from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
+from ..transport.near_specular import names
+from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
-from .possible import Start, unsampled_paths
+from .possible import SHORTEST, Start, unsampled_paths
 
 # Subpaths from either end. The noise of the estimate suffices for `WORTH_A_WORD`, not for a figure to rely
 # on; see experiments, "Vertex merging".
@@ -33,6 +38,13 @@ SUBPATHS = 1 << 13
 
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
+
+# Share from which on a warning is given of light of which a few samples are expected: of less there are more,
+# and noise is no loss.
+RARE_WORTH_A_WORD = 0.125
+
+# Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
+PREVIEW = 64
 
 # Most lamps named in a message.
 NAMED = 3
@@ -50,13 +62,20 @@ _PLUGINS = {
 
 @dataclass(frozen=True)
 class LostLight:
-    """Unsampled light: mean over the film by emitter index.
+    """Unsampled and undersampled light: mean over the film by emitter index.
 
-    ``through``: ids of the shapes through which most of it is seen, the brightest first.
+    ``through``: ids of the shapes through which most of it is seen, the brightest first. In scenes with
+    near-specular lobes ``never``: share of it of which no sample is expected; ``absent``: share of it of
+    which a render has outliers at most; ``few``: light of which more samples are expected, but few, over it;
+    ``sharp``: ids of the objects with such lobes, those of ``through`` first.
     """
 
     colours: dict[int, np.ndarray]
     through: tuple[str, ...] = ()
+    never: float = 1.0
+    absent: float = 1.0
+    few: float = 0.0
+    sharp: tuple[str, ...] = ()
 
     @property
     def radiance(self) -> dict[int, float]:
@@ -71,6 +90,10 @@ class LostLight:
         """Mean over the colours, the measure of images in pilots."""
         return float(sum(colour.mean() for colour in self.colours.values()))
 
+    def is_worth_a_word(self, share: float) -> bool:
+        """Whether to warn of a ``share`` of the image's light."""
+        return self.absent * share >= WORTH_A_WORD or share >= RARE_WORTH_A_WORD
+
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
@@ -82,12 +105,28 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if components.why_absent("merging"):  # which estimates their light
         return False
+    if is_undersampling_possible(prepared, settings):
+        return True
     lost = unsampled_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
 
-def estimate(prepared: PreparedScene, plan: Plan, settings: Settings) -> LostLight:
-    """Estimate the unsampled light.
+def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
+    """Whether light of delta emitters may be undersampled."""
+    return bool(prepared.near_specular and prepared.emitters.unhittable) and settings.max_depth >= SHORTEST
+
+
+def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:
+    """All that the estimate for a render of ``samples`` per pixel depends on besides the scene."""
+    known = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters
+    if not is_undersampling_possible(prepared, settings):
+        return known
+    strategies = plan.arrival, plan.endpoints, plan.connections, plan.joined, plan.camera_paths_per_light_path
+    return *known, *strategies, plan.emission is None, max(samples, PREVIEW)
+
+
+def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW) -> LostLight:
+    """Estimate the light that a render of ``samples`` per pixel lacks.
 
     Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
     value.
@@ -96,8 +135,12 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings) -> LostLig
     chosen = min(SUBPATHS, pixels)
     batch = Batch(0, chosen, 0, SUBPATHS // chosen, spread=pixels)
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
-        kernel = delta_kernel(prepared, plan, settings)
-        found = components.merging.estimate(kernel, batch, SUBPATHS, points("sobol"), points("independent"))
+        undersampled = is_undersampling_possible(prepared, settings)
+        kernel = (counting_kernel if undersampled else delta_kernel)(prepared, plan, settings)
+        aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular)
+        drawn = points("sobol"), points("independent")
+        of = max(samples, PREVIEW) if undersampled else None
+        found = components.merging.estimate(kernel, batch, SUBPATHS, *drawn, aim, of)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
     total = np.array(found.by_emitter).reshape(len(prepared.scene.emitters()), -1) / batch.size
     if mi.is_spectral:
@@ -109,13 +152,30 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings) -> LostLig
         _warn_of_not_finite(prepared, np.flatnonzero(~finite))
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
-    return LostLight(colours, _ids(np.array(found.through), np.array(found.size)))
+    through = _ids(np.array(found.through), np.array(found.size))
+    if found.kinds is None or not colours:
+        return LostLight(colours, through)
+    never, absent, rare, few = np.array(found.kinds)
+    size = max(never + absent + rare, np.finfo(np.float32).tiny)
+    sharp = names(all_shapes(prepared.scene), prepared.near_specular)
+    sharp = tuple(sorted(sharp, key=lambda name: name not in through)[:NAMED])
+    parts = (float(part / size) for part in (never, never + absent, few))
+    return LostLight(colours, through, *parts, sharp)
 
 
 def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
     """A kernel whose subpaths follow delta lobes only; weights are not computed."""
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
     kernel.reverse, kernel.traits = False, prepared.traits.of_delta_lobes()
+    kernel.last_light = kernel.last_arrival = kernel.max_depth
+    return kernel
+
+
+def counting_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
+    """A kernel whose partial sums are those of numbers of samples: coefficients that are counts."""
+    counts = replace(plan, kappa_light=1.0, kappa_direct=1.0)
+    kernel = Kernel(prepared, counts, settings, mis.Heuristic("balance"))
+    kernel.reverse, kernel.traits = True, prepared.traits
     kernel.last_light = kernel.last_arrival = kernel.max_depth
     return kernel
 
@@ -148,47 +208,65 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
 def shares(lost: LostLight, mean: float) -> dict[int, float]:
     """Shares of the image's light by emitter index.
 
-    ``mean`` of the image's brightest colour.
+    ``mean`` of the image's brightest colour, which includes light that is not absent.
     """
-    whole = mean + sum(lost.radiance.values())
+    size = sum(lost.radiance.values())
+    whole = max(mean + lost.absent * size, size)
     return {i: radiance / whole for i, radiance in lost.radiance.items()}
 
 
 def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
-    """`shares` before the first pass, from the ``mean`` intensity of a pilot.
+    """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light.
 
-    Empty if their sum is below twice `WORTH_A_WORD`: a pilot's estimate may be twice too large.
+    Empty if half of them is not worth a word: a pilot's estimate may be twice too large.
     """
-    share = lost.intensity / (mean + lost.intensity)
-    if not share >= 2 * WORTH_A_WORD:
+    share = lost.intensity / (mean + (1 + lost.few) * lost.intensity)
+    if not lost.is_worth_a_word(share / 2):
         return {}
     whole = sum(lost.radiance.values())
     return {i: share * radiance / whole for i, radiance in lost.radiance.items()}
 
 
-def in_words(prepared: PreparedScene, plan: Plan, shares: dict[int, float], through: Iterable[str]) -> str:
-    """Warning about unsampled light with its remedy; empty below `WORTH_A_WORD`.
+def in_words(
+    prepared: PreparedScene, plan: Plan, shares: dict[int, float], lost: LostLight, samples: int
+) -> str:
+    """Warning about unsampled light with its remedy; empty where it is not worth a word.
 
-    ``shares`` of the image's light by emitter index; ``through``: see `LostLight`.
+    ``shares`` of the image's light by emitter index, in a render of ``samples`` per pixel.
     """
-    lost = sum(shares.values())
-    if not lost >= WORTH_A_WORD:
+    all_of_it = sum(shares.values())
+    if not lost.is_worth_a_word(all_of_it):
         return ""
     emitters = prepared.scene.emitters()
     order = sorted(shares, key=shares.get, reverse=True)
-    lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * lost][:NAMED]
+    lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * all_of_it][:NAMED]
     what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
+    share = "nearly all" if all_of_it > 0.99 else f"about {100 * all_of_it:.0f} %"
+    if lost.never < 0.5:
+        remedy = _remedy(prepared, lamps)
+        if not plan.splat and prepared.camera.connectible:
+            remedy = f"leave light_paths and decisions to the integrator, {remedy}"
+        rest = _undersampled(what, lost, samples, remedy)
+        return f"bdpt: undersampled, {share} of the image's light: {rest}"
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
-        what += f" on what is seen through {' and '.join(map(repr, through)) or 'them'}"
+        what += f" on what is seen through {' and '.join(map(repr, lost.through)) or 'them'}"
     elif not prepared.camera.connectible:
         why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
         why = "the render does without light tracing (t=1)"
         remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
-    share = "nearly all" if lost > 0.99 else f"about {100 * lost:.0f} %"
     return f"bdpt: not sampled, {share} of the image's light: {what} ({why}); {remedy}"
+
+
+def _undersampled(what: str, lost: LostLight, samples: int, remedy: str) -> str:
+    """The rest of the warning about light of which a few samples are expected."""
+    objects = " and ".join(map(repr, lost.sharp))
+    off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
+    why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
+    rougher = f"or make {objects or 'these surfaces'} rougher"
+    return f"{what} through or {off} connections rarely sample ({why}); {remedy}, {rougher}"
 
 
 def called(emitter: mi.Emitter) -> str:

@@ -358,7 +358,7 @@ class Render:
         if lost is None:
             return {}
         shares = lost_light.shares(lost, number(self.accumulator.mean()))
-        text = lost_light.in_words(self.prepared, self.plan, shares, lost.through)
+        text = lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
         messages.warn_of_lost_light(self.prepared, self.plan, text)
         return shares
 
@@ -370,8 +370,9 @@ class Render:
         prepared, plan, settings = self.prepared, self.plan, self.settings
         if not lost_light.is_possible(prepared, plan, settings):
             return None
-        look = partial(lost_light.estimate, prepared, plan, settings)
-        key = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters
+        samples = self._samples()
+        look = partial(lost_light.estimate, prepared, plan, settings, samples)
+        key = lost_light.key(prepared, plan, settings, samples)
         lost, _ = self.findings.find("lost light", key, look)
         return lost if lost.colours else None
 
@@ -385,7 +386,11 @@ class Render:
         if lost is None:
             return ""
         shares = lost_light.predicted_shares(lost, made[-1].mean)
-        return lost_light.in_words(self.prepared, self.plan, shares, lost.through)
+        return lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+
+    def _samples(self) -> int:
+        """Samples per pixel of the whole render, or of a snapshot."""
+        return max(self.spp, sum(self.passes))
 
 
 def raise_interrupt(error: BaseException):

@@ -21,6 +21,7 @@ from . import bsdf, mis, scattering, spectra
 from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
+from .near_specular import is_narrow
 from .sds import SdsStrategy, State
 
 
@@ -164,7 +165,8 @@ class Side:
     light travels with the walk; ``coefficient``: kappa of the class of the newest alternative at vertex 1
     (next-event estimation on the light side, t = 1 on the camera side); ``alpha``: the film needs to know
     whether a non-null event happened; ``parallel``: the first edge has one direction, with density one across
-    it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false. Functions:
+    it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false; ``only_specular``: it
+    ends at an event that is neither delta nor near-specular. Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
     * ``connect``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
@@ -183,6 +185,7 @@ class Side:
     connect: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_delta: bool = False
+    only_specular: bool = False
     sds: SdsStrategy | None = None
 
 
@@ -378,6 +381,9 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
         active &= sds.isolated
     if side.only_delta:
         active &= step.delta
+    if side.only_specular:
+        specular = step.delta | is_narrow(step.pdf_fwd_w, step.pdf_rev_w)
+        active &= specular if vertex.volume is None else specular & ~vertex.volume
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, passes, stream)
     active &= goes_on
@@ -433,6 +439,12 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     if side.sds is not None and not mis.is_absent(walk.partial.d_vm):
         merge = side.sds.merge(kernel, vertex, isolated)
     return State(isolated, only_delta, guided), merge
+
+
+def has_lobe(kernel: Kernel, vertex: Vertex) -> mi.Bool:
+    """Mask: a ``vertex`` on a surface whose event is not always delta; the path may have a further edge."""
+    possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth)
+    return possible if vertex.volume is None else possible & ~vertex.volume
 
 
 def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:

@@ -1,4 +1,4 @@
-"""First directions of photon subpaths: half of them are aimed at delta surfaces.
+"""First directions of photon subpaths: half of them are aimed at specular surfaces.
 
 Most SDS paths begin with delta events, but an emitter's own density samples few directions towards a small
 shape of glass. Half of the first directions are uniform in cones about bounding spheres of the shapes with
@@ -9,6 +9,7 @@ samples their light well. Light subpaths are not aimed: only merges use `Aim.den
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import drjit as dr
@@ -40,9 +41,9 @@ class Aim:
     no_sky: bool
 
     @staticmethod
-    def of(scene: mi.Scene, emitters: Emitters) -> Aim:
-        """The aim of a ``scene`` and its ``emitters``."""
-        boxes = [] if not emitters.connectible_nearby else _delta_boxes(scene)
+    def of(scene: mi.Scene, emitters: Emitters, near_specular: Sequence[mi.BSDF] = ()) -> Aim:
+        """The aim of a ``scene`` and its ``emitters``; also at shapes with one of these BSDFs."""
+        boxes = [] if not emitters.connectible_nearby else _specular_boxes(scene, near_specular)
         if len(boxes) > MOST_SPHERES:
             whole = mi.ScalarBoundingBox3f()
             for box in boxes:
@@ -138,13 +139,15 @@ def _towards(emitters: Emitters, e: Emission, d, active: mi.Bool) -> Emission:
     )
 
 
-def _delta_boxes(scene: mi.Scene) -> list:
-    """Bounding boxes of shapes with delta lobes; of all instances if a group has some."""
-    grouped = any(_is_delta(shape) for shape in grouped_shapes(scene))
-    found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else _is_delta(s)))
+def _specular_boxes(scene: mi.Scene, near_specular: Sequence[mi.BSDF]) -> list:
+    """Boxes of shapes with delta lobes or one of these BSDFs; of all instances if a group has some."""
+    near = {id(bsdf) for bsdf in near_specular}
+
+    def chosen(shape: mi.Shape) -> bool:
+        found = shape.bsdf()
+        delta = int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)
+        return found is not None and (bool(found.flags() & delta) or id(found) in near)
+
+    grouped = any(chosen(shape) for shape in grouped_shapes(scene))
+    found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else chosen(s)))
     return [box for box in found if box is not None]
-
-
-def _is_delta(shape: mi.Shape) -> bool:
-    found = shape.bsdf()
-    return found is not None and bool(found.flags() & (int(mi.BSDFFlags.Delta) & ~int(mi.BSDFFlags.Null)))

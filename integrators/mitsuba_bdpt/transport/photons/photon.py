@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import drjit as dr
 import mitsuba as mi
@@ -34,8 +34,8 @@ class Photon:
     lane: mi.UInt32
     emitter: mi.UInt32
 
-    @staticmethod
-    def types() -> tuple[Any, ...]:
+    @classmethod
+    def types(cls) -> tuple[Any, ...]:
         """Types of the fields in the current variant, in order.
 
         Dr.Jit would keep the types of the first variant in use.
@@ -45,14 +45,30 @@ class Photon:
             *(mi.Float, mi.Float, mi.Float, mi.UInt32, mi.UInt32, mi.UInt32),
         )
 
-    @staticmethod
-    def zeros(count: int) -> Photon:
+    @classmethod
+    def zeros(cls, count: int) -> Self:
         """Memory for ``count`` photons."""
-        return Photon(*(dr.zeros(kind, count) for kind in Photon.types()))
+        return cls(*(dr.zeros(kind, count) for kind in cls.types()))
 
-    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
+    def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Self:
         """The photons at ``index``."""
-        return Photon(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
+        return type(self)(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
+
+
+@dataclass
+class ConnectedPhoton(Photon):
+    """A photon whose path may also be sampled by connections; ``older`` is its ``d_vc``.
+
+    ``connection``: its ``d_vcm`` times the coefficient of the connection of the last edge. All partial sums
+    are those of a light subpath, whose first direction is not aimed.
+    """
+
+    connection: mi.Float
+
+    @classmethod
+    def types(cls) -> tuple[Any, ...]:
+        """Types of the fields in the current variant, in order."""
+        return (*Photon.types(), mi.Float)
 
 
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):

@@ -13,9 +13,9 @@ from .. import spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..sds import SdsStrategy
-from ..walk import is_sds_vertex, random_walk
+from ..walk import has_lobe, is_sds_vertex, newest_coefficient, random_walk
 from .aim import Aim
-from .photon import Photon
+from .photon import ConnectedPhoton, Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
@@ -37,13 +37,19 @@ class Kept(Enum):
     MERGED = "all diffuse vertices of SDS paths"
     GUIDED = "the first non-delta vertex, if s = 0 can sample the path through it"
     UNSAMPLED = "the first non-delta vertex, if no strategy can sample the path through it"
+    UNDERSAMPLED = "all vertices with a non-delta lobe behind delta and near-specular events"
+
+    @property
+    def of_delta_emitters(self) -> bool:
+        """Whether only subpaths of emitters that no ray can hit are traced."""
+        return self in (Kept.UNSAMPLED, Kept.UNDERSAMPLED)
 
 
 @dataclass
 class Traced:
     """``count`` ``photons`` in the order of threads, and counters.
 
-    ``broken``, of `Kept.UNSAMPLED`: mask by emitter, a subpath ended by a non-finite value.
+    ``broken``, if `Kept.of_delta_emitters`: mask by emitter, a subpath ended by a non-finite value.
     """
 
     photons: Photon
@@ -69,7 +75,8 @@ def trace(
     kernel.sds, kernel.last_light = sds, kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        traced = _traced(kernel, aim, count, kept, Photon.zeros(capacity))
+        out = (ConnectedPhoton if kept is Kept.UNDERSAMPLED else Photon).zeros(capacity)
+        traced = _traced(kernel, aim, count, kept, out)
         if traced.count <= capacity:
             return traced
         capacity = traced.count  # again, with more memory
@@ -88,28 +95,35 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
         shared,
     )
-    merges, finite = kept is Kept.MERGED, mi.Bool(True)
-    if kept is Kept.UNSAMPLED:  # traced, to see where their light arrives
+    merges, finite, undersampled = kept is Kept.MERGED, mi.Bool(True), kept is Kept.UNDERSAMPLED
+    if kept.of_delta_emitters:  # traced, to see where their light arrives
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     sds = kernel.sds if merges else None
-    walk = subpaths.light_walk(kernel, e, stream, shared, sds)
-    if kept is Kept.UNSAMPLED:  # s = 0 samples the others
+    start = replace(e, pdf_second=e.pdf_second * aimed) if undersampled else e
+    walk = subpaths.light_walk(kernel, start, stream, shared, sds)
+    if kept.of_delta_emitters:  # s = 0 samples the others
         walk = replace(walk, active=walk.active & e.delta)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
-    side = replace(side, connect=None, isolated=merges, only_delta=not merges)
+    side = replace(side, connect=None, isolated=merges, only_delta=not merges and not undersampled)
+    side = replace(side, only_specular=undersampled)
 
     def visit(y, counters, walk):
-        older = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm)
-        keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+        older, more = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm), ()
+        keep = has_lobe(kernel, y) if undersampled else is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         if kept is Kept.GUIDED:
             keep &= older > 0
         if kept is Kept.UNSAMPLED:
             older = dr.select(finite, mi.Float(0), dr.nan)
+        if undersampled:
+            older, h = dr.select(finite, mi.Float(older), dr.nan), kernel.heuristic
+            newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
+            more = (h.present(h.scale(y.partial.d_vcm, newest)),)
         distance = dr.norm(y.si.p - y.previous)
-        found = Photon(y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index)
+        fields = y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index
+        found = type(out)(*fields, *more)
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         dr.scatter(out, found, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
@@ -119,7 +133,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
     counts = counters.summed()
     broken = mi.Bool(False)
-    if kept is Kept.UNSAMPLED:
+    if kept.of_delta_emitters:
         broken = dr.zeros(mi.Bool, len(kernel.scene.emitters()))
         astray = walk.broken | (e.delta & ~dr.isfinite(dr.sum(e.d)))
         dr.scatter(broken, mi.Bool(True), e.index, astray)

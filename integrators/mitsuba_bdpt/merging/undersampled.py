@@ -1,0 +1,78 @@
+"""Which light a render of few samples hardly ever finds, in scenes with near-specular lobes.
+
+Connections sample paths through such lobes, but rarely. Photons and camera subpaths follow delta and
+near-specular events, and are merged at a path's only other vertex; the partial sums of the weights then tell
+how many samples of the path a render expects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from ..transport.inputs import Kernel
+from ..transport.near_specular import is_narrow
+from ..transport.walk import Vertex, has_lobe, newest_coefficient
+from .merging import Merging, Sample
+
+# Expected samples per pixel below which light is undersampled: most pixels have none of it, the others at
+# least ten times too much.
+FEWEST = 0.1
+
+# Expected samples per pixel below which it is absent: its few samples are outliers of a render.
+ABSENT = 1 / 256
+
+# Bounds of kinds of light by expected samples per pixel: none, absent, undersampled, few (which a pilot takes
+# for outliers).
+KINDS = (0.0, ABSENT, FEWEST, 1.0)
+
+
+@dataclass
+class Undersampled:
+    """Which merges count as missing in a render of ``samples`` per pixel.
+
+    ``kinds``: sums of sizes by kind, see `KINDS`.
+    """
+
+    samples: mi.Float
+    kinds: mi.Float64
+
+    @staticmethod
+    def of(samples: float) -> Undersampled:
+        """Empty sums for a render of ``samples`` per pixel."""
+        return Undersampled(dr.opaque(mi.Float, samples), dr.zeros(mi.Float64, len(KINDS)))
+
+    def looks(self, kernel: Kernel, z: Vertex) -> mi.Bool:
+        """Mask: the camera vertex ``z`` looks for photons."""
+        return has_lobe(kernel, z)
+
+    def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Bool:
+        """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
+
+        Only where the vertex is not near-specular itself: the path is merged there alone.
+        """
+        expected = self.expected(kernel, merging, z, found)
+        active = found.active & ~is_narrow(found.f.pdf_fwd_w, found.f.pdf_rev_w)
+        kind = mi.UInt32(0)
+        for bound in KINDS[:-1]:
+            kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
+        size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
+        dr.scatter_add(self.kinds, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
+        return active & ~(expected >= FEWEST)  # NaN counts
+
+    def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
+        """Expected number of samples per pixel of the merged path and its neighbours.
+
+        A connection of an edge at ``z`` succeeds if the other subpath arrives in the footprint at ``z`` of
+        the lobe at the edge's other end. Footprints of all strategies, times their samples per camera sample,
+        add up in the recursion of the weights (`mis`); times the density of photons at ``z`` (one over area)
+        they are the expected number per camera sample.
+        """
+        h, photon, f = kernel.heuristic, found.photon, found.f
+        newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+        camera = h.combine(h.scale(z.partial.d_vcm, newest), h.scale(z.partial.d_vc, f.pdf_rev_w))
+        area = photon.connection + photon.older * f.pdf_fwd_w + camera
+        # The render's light subpaths are not aimed.
+        return self.samples * area * (found.number * photon.aim / merging.eta(z.si.p))

@@ -1,0 +1,234 @@
+"""Light that a render of few samples hardly ever finds, through lobes that are nearly specular."""
+
+import re
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from mitsuba_bdpt.merging import undersampled
+from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.run.rendering import Render
+
+from stress_cases.warned import Warned
+
+T = mi.ScalarTransform4f
+
+POINT = {"type": "point", "position": [0.3, 0.2, 2], "intensity": 10.0}
+
+# Mean of the image of the slab, whatever its roughness: 0.27 to 0.31 in renders of 2^20 samples.
+MEAN = 0.3
+
+
+def slab(bsdf, lamp=POINT, size=32, **more):
+    """A floor seen through a slab, lit through it."""
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    eye = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, -0.5, 3.2], [0, 0, 0], [0, 1, 0])}
+    plate = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05]), "bsdf": bsdf}
+    floor = {"type": "rectangle", "to_world": T().scale(1.5)}
+    scene = {"type": "scene", "eye": eye | {"film": film}, "floor": floor, "slab": plate, "lamp": lamp}
+    return mi.load_dict(scene | more, optimize=False)
+
+
+def frosted(alpha):
+    return {"type": "roughdielectric", "alpha": alpha, "int_ior": 1.5, "ext_ior": 1.0}
+
+
+def principled(roughness, **keys):
+    white = {"type": "rgb", "value": 1.0}
+    return {"type": "principled", "roughness": roughness, "spec_trans": 1.0, "base_color": white, **keys}
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 10, **parameters})
+
+
+def render_of(scene, spp=64, **parameters):
+    return Render(scene, scene.sensors()[0], bdpt(**parameters).settings, 0, spp)
+
+
+def lost_in(scene, spp=64, **parameters):
+    """The light that such a render lacks, None if it is not looked for or there is none."""
+    return render_of(scene, spp, **parameters)._lost()
+
+
+def share_of(lost):
+    return sum(lost.radiance.values()) if lost else 0.0
+
+
+def said(scene, mean=MEAN, spp=64, **parameters):
+    """The warning about an image of this ``mean``."""
+    render = render_of(scene, spp, **parameters)
+    lost = render._lost()
+    if lost is None:
+        return ""
+    shares = lost_light.shares(lost, mean)
+    return lost_light.in_words(render.prepared, render.plan, shares, lost, spp)
+
+
+@pytest.mark.parametrize(
+    "bsdf, warned",
+    [
+        *((frosted(alpha), True) for alpha in (0.001, 0.003, 0.01, 0.03)),
+        *((frosted(alpha), False) for alpha in (0.1, 0.3)),
+        *((principled(roughness), True) for roughness in (0.0, 0.1, 0.2)),
+        *((principled(roughness), False) for roughness in (0.35, 0.5)),
+    ],
+    ids=lambda value: str(value.get("alpha", value.get("roughness"))) if isinstance(value, dict) else "",
+)
+def test_a_word_about_a_rough_slab(bsdf, warned):
+    """Rationale: none of these BSDFs is delta, and nothing was said where 97 % of the light is missing.
+    Expected: a warning up to alpha .03, which is roughness .17, and roughness .2, where 3 and 44 % of the
+    pixels of such a render are lit; none at alpha .1, where 60 % are dark but blocks of 4 by 4 pixels have
+    the right mean. The lamp, the slab and three remedies are named."""
+    text = said(slab(bsdf))
+    assert bool(text) == warned
+    if warned:
+        pattern = (
+            "undersampled, (nearly all|about [0-9]+ %) of the image's light: point light 'lamp' shines "
+            "through or off 'slab'.*64 samples.*merging=true.*small area.*make 'slab' rougher"
+        )
+        assert re.search(pattern, text), text
+
+
+def test_nearly_smooth_glass_lacks_what_smooth_glass_lacks():
+    """Rationale: `dielectric` is the limit of alpha to 0. Expected: at alpha 1e-3 all of the light that is
+    lost with `dielectric`, within 10 % (noise of 2^13 subpaths: 3 %), absent, not rare, but never 0."""
+    delta, rough = lost_in(slab({"type": "dielectric", "int_ior": 1.5})), lost_in(slab(frosted(1e-3)))
+    assert share_of(rough) == pytest.approx(share_of(delta), rel=0.1)
+    assert delta.never == 1 and rough.never == 0 and rough.absent > 0.99
+
+
+def test_delta_lobes_beside_near_specular_ones_are_never_sampled():
+    """Rationale: scenes with near-specular lobes have an estimate of their own. Expected: under a slab of
+    `dielectric` beside a polished ball that is out of view the same light is lost as without the ball
+    (within 10 %: other random numbers), and the old words say so."""
+    glass = {"type": "dielectric", "int_ior": 1.5}
+    metal = {"type": "roughconductor", "alpha": 0.01}
+    ball = {"type": "sphere", "center": [0, 0, -9], "radius": 0.5, "bsdf": metal}
+    beside = slab(glass, ball=ball)
+    lost = lost_in(beside)
+    assert share_of(lost) == pytest.approx(share_of(lost_in(slab(glass))), rel=0.1)
+    assert lost.never > 0.99
+    assert "not sampled" in said(beside) and "through 'slab' (no ray hits" in said(beside)
+
+
+@pytest.mark.parametrize("alpha", [0.03, 0.1])
+def test_the_expected_number_of_samples_is_that_of_a_render(alpha, monkeypatch):
+    """Rationale: an independent count. Expected: of the pixels of a render of 16 samples per pixel a share is
+    lit by more than a tenth of the mean, from which the number of samples follows; half of the light
+    expects fewer than that, and half more than an eighth (a third to a fifth was measured: pixels are also
+    lit by paths with two diffuse vertices, and by small parts of the light)."""
+    scene = slab(frosted(alpha), size=64)
+    image = np.array(bdpt().render(scene, spp=16))[..., 0]
+    lit = -np.log(np.mean(image < 0.1 * MEAN))
+    monkeypatch.setattr(lost_light, "PREVIEW", 16)
+    found = []
+    for bound in (1.0, lit, lit / 8):
+        monkeypatch.setattr(undersampled, "FEWEST", bound)
+        render = render_of(scene, 16)
+        found.append(share_of(lost_light.estimate(render.prepared, render.plan, render.settings, 16)))
+    whole, more, less = found
+    assert less < whole / 2 < more
+
+
+def test_light_that_next_event_estimation_finds_is_not_missing():
+    """Expected: of a floor with the lamp beneath the slab at most what the slab reflects back to it (3 % of
+    the image; all of its mean of 0.66 if the connection of floor and lamp did not count)."""
+    assert share_of(lost_in(slab(frosted(0.005), lamp=POINT | {"position": [0.3, 0.2, 0.6]}))) < 0.05
+
+
+def test_light_that_light_tracing_finds_is_not_missing():
+    """Expected: nothing is missing to a camera beneath the slab, and without light subpaths all of it is."""
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    to_world = T().look_at([0, -0.3, 0.8], [0, 0, 0], [0, 1, 0])
+    scene = slab(frosted(0.005), eye={"type": "perspective", "fov": 80, "to_world": to_world, "film": film})
+    assert share_of(lost_in(scene)) < 0.005
+    assert share_of(lost_in(scene, light_paths=0)) == pytest.approx(0.35, rel=0.1)
+    assert "leave light_paths" in said(scene, light_paths=0)
+
+
+def test_a_path_is_merged_once():
+    """Rationale: each vertex with a near-specular lobe stores photons. Expected: of a polished floor only
+    light in the tails of its lobe counts (0.025; 0.13 if paths that are near-specular everywhere did)."""
+    floor = {"type": "rectangle", "to_world": T().scale(1.5)}
+    scene = slab(frosted(0.003), floor=floor | {"bsdf": {"type": "roughconductor", "alpha": 0.003}})
+    assert share_of(lost_in(scene)) < 0.05
+
+
+def test_more_samples_find_it():
+    """Expected: of the light under frosted glass less is missing the longer the render, and a preview counts
+    as a render of 64 samples."""
+    found = [share_of(lost_in(slab(frosted(0.05)), spp)) for spp in (1, 64, 256, 1 << 14)]
+    assert found[0] == pytest.approx(found[1]) and found[1] > 2 * found[2] > 0
+    assert found[3] < 0.01 * found[1]
+
+
+def test_edits_of_the_roughness_are_seen():
+    """Expected: no warning at alpha .3, one after an edit to .005, none after the edit back."""
+    scene = slab(frosted(0.3))
+    parameters = mi.traverse(scene)
+    for alpha, warned in ((0.3, False), (0.005, True), (0.3, False)):
+        parameters["slab.bsdf.alpha.value"] = alpha
+        parameters.update()
+        assert bool(said(scene)) == warned
+
+
+@pytest.mark.parametrize(
+    "metal, warned",
+    [
+        ({"type": "roughconductor", "alpha": 0.001}, True),
+        ({"type": "principled", "metallic": 1.0, "roughness": 0.03}, True),
+        ({"type": "roughconductor", "alpha": 0.2}, False),
+    ],
+    ids=["polished", "principled", "dull"],
+)
+def test_light_off_a_metal_ceiling(metal, warned):
+    """Rationale: metal, not glass alone. Expected: a ceiling that a spot lights and a camera sees from below
+    lights and shows the floor: a warning about it where it is polished (the mean is without the spot's
+    reflection)."""
+    up = {"to_world": T().look_at([0, 0, 1.2], [0.2, 0, 2], [0, 1, 0])}
+    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    ceiling = {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(3)}
+    scene = {
+        "type": "scene",
+        "eye": {"type": "perspective", "fov": 50, "film": film, **up},
+        "lamp": {"type": "spot", "cutoff_angle": 35, "intensity": 10.0, **up},
+        "floor": {"type": "rectangle", "to_world": T().scale(3)},
+        "ceiling": ceiling | {"bsdf": metal},
+    }
+    text = said(mi.load_dict(scene, optimize=False), mean=0.2)
+    assert bool(text) == warned and (not warned or "off 'ceiling'" in text)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        lambda: slab({"type": "null"}),
+        lambda: slab(frosted(0.4)),
+        lambda: slab(principled(0.7)),
+        lambda: slab({"type": "thindielectric"}, lamp={"type": "constant"}),
+        lambda: slab(frosted(0.01), lamp={"type": "constant"}),
+    ],
+    ids=["null", "rough", "principled", "sky", "sky through glass"],
+)
+def test_no_near_specular_estimate_of_other_scenes(scene):
+    """Expected: scenes without near-specular lobes or delta emitters have the estimate of before."""
+    render = render_of(scene())
+    assert not lost_light.is_undersampling_possible(render.prepared, render.settings)
+
+
+def test_merging_finds_it():
+    """Expected: nothing is missing with merging."""
+    ball = {"type": "sphere", "bsdf": frosted(0.01)}
+    assert render_of(slab({"type": "dielectric"}, ball=ball), merging=True)._lost() is None
+
+
+def test_it_is_said_before_the_first_pass(monkeypatch):
+    """Expected: one warning, by a pilot, whose mean has none of the light of which there are few samples; the
+    share is within a fifth of that in a converged image (0.22 of 0.30)."""
+    scene, begun, trace = slab(frosted(0.01), size=64), [], Render._pass
+    with Warned() as warnings, monkeypatch.context() as patch:
+        patch.setattr(Render, "_pass", lambda self, step: begun.append(len(warnings)) or trace(self, step))
+        bdpt().render(scene, spp=64)
+    assert begun == [1] and len(warnings) == 1
+    assert float(re.search("about ([0-9]+) %", warnings[0])[1]) == pytest.approx(75, rel=0.3)
