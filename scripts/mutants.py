@@ -1698,6 +1698,30 @@ MUTANTS = (
             "tests/transport/test_bsdf.py::test_steps_find_what_is_evaluated[blendbsdf black bumps]",
         ),
     ),
+    Mutant(
+        "errors: the renders that are judged divide their own errors",
+        "measure/metrics.py",
+        'weights = 1 / np.sqrt(image_of("reference", reference) ** 2 + rel_mse_epsilon(reference))',
+        "weights = 1 / np.sqrt(centre**2 + rel_mse_epsilon(reference))",
+        ("tests/measure/test_estimates.py::test_the_normaliser_is_not_of_the_renders_that_are_judged",),
+    ),
+    Mutant(
+        "errors: light that was not met is in no error",
+        "measure/analysis.py",
+        "return bool(self.lacks(scene, method)) or mean_differs(rows, reference)",
+        "return False",
+        (
+            "tests/measure/test_estimates.py::test_rare_light_that_was_not_met_is_a_lower_bound",
+            "tests/measure/test_estimates.py::test_variance_and_bias_apart[5-0.01]",
+        ),
+    ),
+    Mutant(
+        "errors: the reference's own error counts",
+        "measure/estimates.py",
+        "found = measured - own\n",
+        "found = measured\n",
+        ("tests/measure/test_estimates.py::test_the_variance_of_an_unbiased_integrator[0.05]",),
+    ),
 )
 
 

@@ -237,7 +237,7 @@ def rows_of(one: Found, options: Namespace, project: Project) -> tuple[list[dict
         others = f" (and {len(sweep.failed) - 1} more like it)" if len(sweep.failed) > 1 else ""
         raise CommandError(f"{sweep.failed[0]}{others}")
     if reference.given:
-        found = given.judged(found, given.own_errors(reference.image, _by_seed(project.root, found)))
+        found = given.with_own_errors(found, given.own_errors(reference.image, _by_seed(project.root, found)))
     return found, notes
 
 

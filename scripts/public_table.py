@@ -8,7 +8,8 @@ from functools import cached_property, partial
 
 import numpy as np
 from mitsuba_bdpt.measure import analysis, report
-from mitsuba_bdpt.measure.analysis import OWN, NotJudged, Refused, Results, geometric_mean, refused_share
+from mitsuba_bdpt.measure.analysis import Refused, Results, geometric_mean
+from mitsuba_bdpt.measure.estimates import OWN
 from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.tables import ratio, said, table
 from public_checks import DEFAULT, OURS, Check, check
@@ -41,7 +42,9 @@ class Findings:
     def _figure(self, scene: str, method: str, error: str) -> analysis.Summary:
         """The efficiency of one of `OURS` over `path`, whether or not that finds all light."""
         path = self.results.standard_in(scene)[0]
-        return analysis.efficiency(self.results.of(scene, method), self.results.of(scene, path), error)
+        differ = self.results.differs(scene, method), self.results.differs(scene, path)
+        ours, theirs = self.results.of(scene, method), self.results.of(scene, path)
+        return analysis.efficiency(ours, theirs, error, differ)
 
     @cached_property
     def _figures(self) -> dict[str, dict[tuple[str, str], float]]:
@@ -160,7 +163,7 @@ References that are made are this package's own: that `path` misses light by the
         lines += [self._means(complete=True)]
         if any(found.path or found.unchecked for found in self.checks.values()):
             lines += [self._means(complete=False)]
-        return "".join(f"* {line}\n" for line in [*lines, *self._worst(), *self._bias(), *self._unjudged()])
+        return "".join(f"* {line}\n" for line in [*lines, *self._worst(), *self._bias(), *self._unmeasured()])
 
     def _means(self, complete: bool) -> str:
         """Geometric means over `path`, of scenes in which a check finds that it has all light, or of all."""
@@ -220,26 +223,13 @@ References that are made are this package's own: that `path` misses light by the
             lines.append(f"Bias was not checked in {', '.join(f'`{scene}`' for scene in unchecked)}: {why}")
         return lines
 
-    def _unjudged(self) -> list[str]:
-        """Scenes without some figures: why, and what to do."""
-        lines = []
-        for scene in self.results.scenes:
-            refused = self._refused(scene)
-            noisy = [why for why in refused if isinstance(why, NotJudged)]
-            others = dict.fromkeys(str(why) for why in refused if not isinstance(why, NotJudged))
-            lines += [f"`{scene}`: no figure: {text}." for text in others]
-            if noisy:
-                remedy = (
-                    "the image that is given is noisy, or shows something else (filter, max_depth, other "
-                    "light): try --own-references"
-                    if self.made[scene].given
-                    else "run again, which goes on with it, with a larger --reference-seconds"
-                )
-                share = refused_share(max(why.share for why in noisy), 3)
-                lines.append(
-                    f"`{scene}`: the reference carries up to {share} of an error, 1 % is allowed; {remedy}."
-                )
-        return lines
+    def _unmeasured(self) -> list[str]:
+        """Scenes without some figures: why."""
+        return [
+            f"`{scene}`: no figure: {text}."
+            for scene in self.results.scenes
+            for text in dict.fromkeys(map(str, self._refused(scene)))
+        ]
 
     def _refused(self, scene: str) -> list[Refused]:
         """Why figures of a scene are refused."""

@@ -98,8 +98,7 @@ def test_trimming_only_lowers(image, reference, trim):
 
 def test_the_spread_of_renders():
     """Expected: without bias the mean relMSE, within three standard errors of 2 / sqrt(values); with an error
-    that all have, such as light that none finds, that of before; trimmed, less for a value that one alone
-    has."""
+    that all have, such as light that none finds, that of before."""
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.5, 2, (40, 40, 3))
     images = [truth * (1 + 0.1 * rng.standard_normal(truth.shape)) for _ in range(6)]
@@ -108,9 +107,6 @@ def test_the_spread_of_renders():
     assert np.mean(found) == pytest.approx(np.mean(errors), rel=6 / math.sqrt(5 * truth.size))
     darker = [image - 0.2 for image in images]
     np.testing.assert_allclose(metrics.spread(darker, truth), found)
-    images[2][3, 4, 1] += 50
-    raw, trimmed = (metrics.spread(images, truth, trim) for trim in (0.0, 0.001))
-    assert raw[2] > 5 * found[2] and trimmed[2] == pytest.approx(found[2], rel=0.1)
     with pytest.raises(CommandError, match="1 images"):
         metrics.spread(images[:1], truth)
 
@@ -538,24 +534,3 @@ def test_bootstrap_median_moves_with_its_values(values, shift):
     moved = analysis.bootstrap_median([v + shift for v in values])
     expected = (found.low + shift, found.value + shift, found.high + shift)
     assert (moved.low, moved.value, moved.high) == pytest.approx(expected)
-
-
-def test_a_good_enough_reference():
-    """At most 1 %: 0.001 of 0.1 is, 0.0011 is not; of no error at all a reference without one."""
-    assert analysis.judged(0.001, 0.1) and analysis.judged(0, 0.1) and analysis.judged(0, 0)
-    assert not analysis.judged(0.0011, 0.1) and not analysis.judged(0.1, 0)
-
-
-def test_reference_refusal():
-    """0.0023 of 0.1 is 2.3 %, so 2.3 times the samples bring it to 1 %; 2.31 % needs 2.4 times."""
-
-    def refusal(own):
-        with pytest.raises(analysis.NotJudged) as refused:
-            analysis.check_judged([{"rel_mse": 0.1, "reference_rel_mse": own}], "rel_mse")
-        return str(refused.value)
-
-    assert refusal(0.0023) == (
-        "The reference carries 2.3 % of the error measured with it (2.30e-03 of 1.00e-01) and may carry 1 %: "
-        "render it with at least 2.3 times the samples."
-    )
-    assert "carries 2.31 %" in refusal(0.00231) and "at least 2.4 times" in refusal(0.00231)

@@ -12,7 +12,7 @@ import public_texts
 import pytest
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.images import write_layers
-from mitsuba_bdpt.measure import given, making, metrics, sweep
+from mitsuba_bdpt.measure import estimates, given, making, metrics, sweep
 from mitsuba_bdpt.measure.agreement import Means, apart, compare_means
 from mitsuba_bdpt.measure.analysis import ALONE, NONE, Results
 from mitsuba_bdpt.measure.making import Job
@@ -173,7 +173,7 @@ def test_the_own_error_of_a_given_image():
 
 def test_fireflies_of_a_given_image():
     """Rationale: a pixel that is ten times too bright in the image given adds to each raw error, and to no
-    trimmed one. Expected: raw figures are not judged with it, trimmed ones are."""
+    trimmed one. Expected: the error of a render is 0.05^2 all the same, once the image's own is known."""
     rng = np.random.default_rng(6)
     truth = rng.uniform(1, 2, (100, 133, 3))
     renders = [truth * (1 + 0.05 * rng.standard_normal(truth.shape)) for _ in range(16)]
@@ -181,8 +181,11 @@ def test_fireflies_of_a_given_image():
     image[40, 50] *= 10
     own = given.own_errors(image, renders)
     errors = {error: metrics.rel_mse(renders[0], image, trim) for error, trim in given.TRIMS.items()}
-    (row,) = given.judged([errors], own)
-    assert not row["judged"] and row["judged_trimmed"]
+    rows = given.with_own_errors([errors], own)
+    expected = metrics.rel_mse(renders[0], truth)
+    for error in given.TRIMS:
+        ((found,), bound) = estimates.seed_errors(rows, error, False)
+        assert bound == "" and found == pytest.approx(expected, rel=0.03)
     assert own["rel_mse"] == pytest.approx(0.9**2 * 3 / truth.size, rel=0.05)
 
 
@@ -335,8 +338,8 @@ def rows_of(scene, ratios, path=1.0):
     methods = {ALONE: ratios[0], NONE: ratios[1], "bdpt": ratios[2], "path": 1.0}
     own = {"reference_rel_mse": 0.0, "reference_rel_mse_trimmed": 0.0}
     return [
-        {"scene": scene, "method": method, "first": "bdpt", "budget": 64, "seed": seed, "seconds": 2.0, **own}
-        | {"statistics": "{}"}
+        {"scene": scene, "method": method, "first": "bdpt", "budget": 64, "seed": seed, **own}
+        | {"statistics": "{}", "spp": 64, "seconds": 2.0}
         | {"rel_mse": (1 if method == "path" else 0.5) / figure, "rel_mse_trimmed": 1 / figure}
         | {"tile_means": columns}
         for number, (method, figure) in enumerate(methods.items())
@@ -346,11 +349,11 @@ def rows_of(scene, ratios, path=1.0):
 
 def test_the_summary_in_words():
     """Expected: geometric means of the medians, of the scenes with all figures, apart for those in which
-    `path` finds all light; the worst of the default; where `path` misses light; a scene whose reference is
-    too noisy has no part in the means, and is said."""
+    `path` finds all light; the worst of the default; where `path` misses light; a scene in which an
+    integrator is exact has no part in the means, and is said."""
     rows = rows_of("a", (1, 0.5, 2)) + rows_of("b", (1, 0.5, 8)) + rows_of("c", (1, 0.5, 0.5), path=0.8)
-    shares = {"bdpt": 0.5}
-    rows += [row | {"reference_rel_mse": shares.get(row["method"], 0.02)} for row in rows_of("d", (1, 1, 1))]
+    exact = {"bdpt": {"rel_mse": 0.0}}
+    rows += [row | exact.get(row["method"], {}) for row in rows_of("d", (1, 1, 1))]
     reference = Means.of(sample(1.0, 64, 9))
     kept = Reference(np.ones((4, 4, 3)), np.zeros((4, 4, 3)), reference, {})
     results = Results(rows, dict.fromkeys("abcd", reference), {})
@@ -365,6 +368,6 @@ def test_the_summary_in_words():
         ": tile 1,2 (-20 %).",
         "Biased by us: 0 of 4 scenes.",
         "`c`: path tracing alone: darker than the reference, no more than `path`.",
-        "`d`: the reference carries up to 100 % of an error, 1 % is allowed; run again",
+        "`d`: no figure: bdpt is exact here.",
     ):
         assert text in words

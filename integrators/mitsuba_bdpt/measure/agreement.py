@@ -178,12 +178,14 @@ class Means:
     whole: Sample
 
     @staticmethod
-    def of(columns: Sequence[Sequence[float] | np.ndarray], name: str = "columns") -> Means:
-        """Return the means of ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
+    def of(
+        columns: Sequence[Sequence[float] | np.ndarray], name: str = "columns", fewest: int = FEWEST_RUNS
+    ) -> Means:
+        """Return the means of at least ``fewest`` ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
         values = np.asarray(columns, dtype=np.float64)
-        if len(values) < FEWEST_RUNS:
+        if len(values) < fewest:
             raise CommandError(
-                f"{name} has {len(values)} renders, too few for the test's level; give {FEWEST_RUNS} or more."
+                f"{name} has {len(values)} renders, too few for the test's level; give {fewest} or more."
             )
         return Means(Sample.of(values), Sample.of(values[:, -3:].mean(1, keepdims=True)))
 

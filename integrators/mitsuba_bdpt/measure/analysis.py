@@ -1,36 +1,29 @@
 """Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
-Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error). Comparisons pair renders of equal
-seed, which ran consecutively. Unavailable figures raise `Refused` with the reason, or `Biased` with the
-missing energy.
+Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error), with the errors of `estimates`.
+Comparisons pair renders of equal seed, which ran consecutively. Unavailable figures raise `Refused` with the
+reason.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 
 from ..errors import CommandError
 from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means
+from .estimates import Bound, RelativeError, bound_of_ratio, mean_differs, relative_error, seed_errors, unlike
 from .metrics import CONFIDENCE, Estimate, number_of, values_of
-from .record import Error, Errors, Row
+from .record import Error, Row
 
 # Bootstrap resamples: the ends of a 95 % interval vary by 1 % of its width between seeds.
 RESAMPLES = 10_000
-
-# Largest share of the reference's own error in a measured error.
-REFERENCE_SHARE = 0.01
-
-# Error columns of a row, and the reference's own.
-OWN: dict[
-    Literal["rel_mse", "rel_mse_trimmed"], Literal["reference_rel_mse", "reference_rel_mse_trimmed"]
-] = {"rel_mse": "reference_rel_mse", "rel_mse_trimmed": "reference_rel_mse_trimmed"}
 
 # Names of the integrators that reports compare with, as in presets/benchmark.toml.
 RIVALS = ("path", "path multijitter")
@@ -49,23 +42,6 @@ DECIDING = 64
 
 class Refused(CommandError):
     """A figure that cannot be computed from the data; the text has the reason."""
-
-
-class NotJudged(Refused):
-    """The reference is too noisy for a figure: ``share`` of the error is its own."""
-
-    def __init__(self, text: str, share: float):
-        super().__init__(text)
-        self.share = share
-
-
-class Biased(Refused):
-    """All rivals fail the bias check; ``lacks``: missing energy by integrator."""
-
-    def __init__(self, lacks: dict[str, str]):
-        several = "; ".join(f"{name}: {what}" for name, what in lacks.items())
-        super().__init__(several if len(lacks) > 1 else next(iter(lacks.values())))
-        self.lacks = lacks
 
 
 def slope(
@@ -124,7 +100,10 @@ def bootstrap_median(values: Iterable[float], confidence: float = CONFIDENCE, se
 
 @dataclass(frozen=True)
 class Summary:
-    """Median, extremes and 95 % interval of the median of ``count`` ratios."""
+    """Median, extremes and 95 % interval of the median of ``count`` ratios.
+
+    ``bound``: whether the true ratio is at least ("≥") or at most ("≤") that, or either ("~").
+    """
 
     median: float
     low: float
@@ -132,6 +111,7 @@ class Summary:
     smallest: float
     largest: float
     count: int
+    bound: Bound = ""
 
 
 def summary(values: Sequence[float]) -> Summary:
@@ -144,64 +124,6 @@ def select(rows: Iterable[Row], **wanted: object) -> list[Row]:
     return [row for row in rows if wanted.items() <= row.items()]
 
 
-def judged(own: float, measured: float) -> bool:
-    """Return whether a reference of error ``own`` can judge the error ``measured``.
-
-    Both are squared errors, which add, since those of image and reference are independent: at the limit the
-    measured error is 1 % too large.
-    """
-    return own <= REFERENCE_SHARE * measured
-
-
-def refused_share(share: float, digits: int) -> str:
-    """Format a ``share`` above `REFERENCE_SHARE` in percent, never rounded down to it."""
-    text, limit = f"{100 * share:.{digits}g}", 100 * REFERENCE_SHARE
-    return f"{text} %" if float(text) > limit else f"just above {limit:g} %"
-
-
-def _refusal(own: float, measured: float) -> str:
-    """Return why a figure is refused, and the samples that the reference lacks."""
-    times = math.ceil(round(10 * own / measured / REFERENCE_SHARE, 6)) / 10
-    return (
-        f"The reference carries {refused_share(own / measured, 3)} of the error measured with it ({own:.2e} "
-        f"of {measured:.2e}) and may carry {100 * REFERENCE_SHARE:g} %: render it with at least {times:g} "
-        "times the samples."
-    )
-
-
-def check_judged(rows: Sequence[Errors], error: Error) -> None:
-    """Raise `Refused` if the reference is too noisy for the median error.
-
-    Errors not in `OWN` need no reference.
-    """
-    if error == "spread" or error == "spread_trimmed":
-        return
-    measured, own = (float(np.median([row[key] for row in rows])) for key in (error, OWN[error]))
-    if judged(own, measured):
-        return
-    if measured == 0:
-        raise Refused("every value is exactly that of the reference, which has an error of its own")
-    raise NotJudged(_refusal(own, measured), own / measured)
-
-
-def unjudged(rows: Sequence[Row]) -> dict[tuple[str, int], NotJudged]:
-    """Return integrators and budgets whose errors the reference cannot judge.
-
-    With the exception, for the worse of raw and trimmed error.
-    """
-    found: dict[tuple[str, int], NotJudged] = {}
-    for method, budget in dict.fromkeys((row["method"], row["budget"]) for row in rows):
-        for error in OWN:
-            try:
-                check_judged(select(rows, method=method, budget=budget), error)
-            except NotJudged as why:
-                if (method, budget) not in found or found[method, budget].share < why.share:
-                    found[method, budget] = why
-            except Refused:  # an error of 0 cannot be judged
-                continue
-    return found
-
-
 def paired(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:
     """Return pairs of renders with equal seeds; raises `Refused` for less than two."""
     by_seed = {row["seed"]: row for row in theirs}
@@ -211,60 +133,65 @@ def paired(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:
     return pairs
 
 
-def speedup(ours: Mapping[str, Any], theirs: Mapping[str, Any], error: str) -> float:
-    """Return the ratio of efficiencies 1 / (seconds * error) of two renders, ours over theirs.
+def _ratios(
+    ours: Sequence[Row], theirs: Sequence[Row], error: Error, differ: tuple[bool, bool]
+) -> tuple[list[float], Bound]:
+    """Return the ratio of efficiencies 1 / (seconds * error) of each pair, ours over theirs, and its bound.
 
     Also the ratio of errors at equal time, and of times at equal error, if errors fall as 1 / time, which
-    `slope` tests.
+    `slope` tests. Raises `Refused` for errors of 0.
     """
-    return theirs["seconds"] * theirs[error] / (ours["seconds"] * ours[error])
+    by_seed: list[dict[int, float]] = []
+    bounds: list[Bound] = []
+    for rows, differs in zip((ours, theirs), differ, strict=True):
+        errors, bound = seed_errors(rows, error, differs)
+        if min(errors) == 0:
+            raise Refused(f"{rows[0]['method']} is exact here")
+        by_seed.append({row["seed"]: x * row["seconds"] for row, x in zip(rows, errors, strict=True)})
+        bounds.append(bound)
+    ratios = [by_seed[1][b["seed"]] / by_seed[0][a["seed"]] for a, b in paired(ours, theirs)]
+    return ratios, bound_of_ratio(bounds[1], bounds[0])
 
 
-def pair_ratios(ours: Sequence[Row], theirs: Sequence[Row], error: Error = "rel_mse_trimmed") -> list[float]:
-    """Return `speedup` of each pair."""
-    return [speedup(*pair, error) for pair in paired(ours, theirs)]
+def efficiency(
+    ours: Sequence[Row],
+    theirs: Sequence[Row],
+    error: Error = "rel_mse_trimmed",
+    differ: tuple[bool, bool] = (False, False),
+) -> Summary:
+    """Return the summary of the ratios of efficiencies, ours over theirs, of pairs of seeds.
 
-
-def efficiency(ours: Sequence[Row], theirs: Sequence[Row], error: Error = "rel_mse_trimmed") -> Summary:
-    """Return the summary of `pair_ratios`.
-
-    Raises `Refused` like `check_judged`, and for errors of 0.
-
-    ``error``: one of `OWN`, or ``spread`` or ``spread_trimmed``: see `metrics.spread`.
+    ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises `Refused` for fewer
+    than two pairs, and for errors of 0.
     """
     if len(ours) < 2 or len(theirs) < 2:
         raise Refused("fewer than two renders")
-    if any(row.get(error) is None for row in (*ours, *theirs)):
-        raise Refused("not measured")
-    for rows in (ours, theirs):
-        if any(row[error] == 0 for row in rows):
-            raise Refused(f"{rows[0]['method']} is exact here")
-        check_judged(rows, error)
-    return summary(pair_ratios(ours, theirs, error))
+    ratios, bound = _ratios(ours, theirs, error, differ)
+    return replace(summary(ratios), bound=bound)
 
 
-def gap(rows: Sequence[Row]) -> Summary:
-    """Return the summary of raw over trimmed relMSE.
-
-    Large where few values carry most of the error. Raises `Refused` like `efficiency`.
-    """
+def gap(rows: Sequence[Row], differs: bool = False) -> Summary:
+    """Return the summary of raw over trimmed relMSE: large where few values carry most of the error."""
     if len(rows) < 2:
         raise Refused("fewer than two renders")
-    for error in OWN:
-        if any(row[error] == 0 for row in rows):
-            raise Refused(f"{rows[0]['method']} is exact here")
-        check_judged(rows, error)
-    return summary([row["rel_mse"] / row["rel_mse_trimmed"] for row in rows])
+    (raw, _), (trimmed, _) = (seed_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
+    if min(*raw, *trimmed) == 0:
+        raise Refused(f"{rows[0]['method']} is exact here")
+    return summary([a / b for a, b in zip(raw, trimmed, strict=True)])
 
 
 def widths(rows: Sequence[Row], methods: Sequence[str]) -> dict[str, float]:
     """Return the interval widths of median efficiency ratios (trimmed), by rival.
 
-    Ratios of the first method over each other one, regardless of the reference.
+    Ratios of the first method over each other one.
     """
     ours = select(rows, method=methods[0])
-    found = {name: bootstrap_median(pair_ratios(ours, select(rows, method=name))) for name in methods[1:]}
-    return {name: middle.high - middle.low for name, middle in found.items()}
+    found: dict[str, float] = {}
+    for name in methods[1:]:
+        ratios, _ = _ratios(ours, select(rows, method=name), "rel_mse_trimmed", (False, False))
+        middle = bootstrap_median(ratios)
+        found[name] = middle.high - middle.low
+    return found
 
 
 def cost(ours: Sequence[Row], theirs: Sequence[Row]) -> Summary:
@@ -272,24 +199,23 @@ def cost(ours: Sequence[Row], theirs: Sequence[Row]) -> Summary:
     return summary([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
 
 
-def convergence(rows: Sequence[Row], error: Literal["rel_mse", "rel_mse_trimmed"] = "rel_mse") -> Estimate:
+def convergence(
+    rows: Sequence[Row], differs: Callable[[int], bool] = lambda budget: False, error: Error = "rel_mse"
+) -> Estimate:
     """Return the slope of log(error) over log(samples), over all renders of a method.
 
-    Excludes budgets whose error the reference cannot judge.
+    ``differs``: whether the mean differs from the reference at a budget.
     """
     if not rows:
         raise Refused("not rendered")
     runs: dict[float, list[float]] = {}
     for budget in sorted({row["budget"] for row in rows}):
         at = select(rows, budget=budget)
-        if len(at) >= 2 and all(row[error] > 0 for row in at):
-            try:
-                check_judged(at, error)
-            except Refused:
-                continue
-            runs[float(np.median([row["spp"] for row in at]))] = [row[error] for row in at]
+        errors, _ = seed_errors(at, error, differs(budget))
+        if len(at) >= 2 and min(errors) > 0:
+            runs[float(np.median([row["spp"] for row in at]))] = errors
     if len(runs) < 2:
-        raise Refused("fewer than two budgets with errors that the reference can judge")
+        raise Refused("fewer than two budgets with two renders")
     return slope(list(runs), list(runs.values()))
 
 
@@ -389,9 +315,58 @@ class Results:
             raise Refused("measured of another version or on another machine")
         return probe["values"]
 
+    def lacks(self, scene: str, method: str) -> str:
+        """Describe the energy that an integrator lacks in a scene; empty if the bias check finds nothing."""
+        return self._lacks(scene, method)
+
+    def differs(self, scene: str, method: str, budget: int | None = None) -> bool:
+        """Return whether the mean of an integrator differs from the reference.
+
+        By the bias check, or by the renders of one budget alone, by default the deciding one.
+        """
+        return self._differs(scene, method, budget or self.deciding)
+
+    @cached_property
+    def _lacks(self) -> Callable[[str, str], str]:
+        @cache
+        def found(scene: str, method: str) -> str:
+            try:
+                check = self.bias(scene, method)
+            except Refused:
+                # Too few seeds for a check: only an image that is black where the reference is not fails.
+                rows = self.of(scene, method) if scene in self.references else []
+                return NOTHING if rows and not np.any([row["tile_means"] for row in rows]) else ""
+            return "" if check.passed else missing(check)
+
+        return found
+
+    @cached_property
+    def _differs(self) -> Callable[[str, str, int], bool]:
+        @cache
+        def found(scene: str, method: str, budget: int) -> bool:
+            rows, reference = self.of(scene, method, budget), self.references.get(scene)
+            if reference is None or not rows:
+                return False
+            return bool(self.lacks(scene, method)) or mean_differs(rows, reference)
+
+        return found
+
+    def error(
+        self, scene: str, method: str, error: Error = "rel_mse_trimmed", budget: int | None = None
+    ) -> RelativeError:
+        """Return the relMSE of an integrator at a budget, by default the deciding one."""
+        rows = self.of(scene, method, budget or self.deciding)
+        if not rows:
+            raise Refused("not rendered")
+        return relative_error(rows, error, self.differs(scene, method, budget))
+
+    def convergence(self, scene: str, method: str) -> Estimate:
+        """Return the `convergence` of an integrator in a scene."""
+        return convergence(self.of(scene, method), lambda budget: self.differs(scene, method, budget))
+
     def gap(self, scene: str, method: str) -> Summary:
         """Return `gap` of an integrator at the deciding budget."""
-        return gap(self.of(scene, method, self.deciding))
+        return gap(self.of(scene, method, self.deciding), self.differs(scene, method))
 
     def by_gap(self, method: str) -> list[str]:
         """Return the scenes by decreasing `gap`; those without one are last."""
@@ -405,53 +380,43 @@ class Results:
         return sorted(self.scenes, key=size, reverse=True)
 
     def efficiency(
-        self, scene: str, rival: str, error: Error = "rel_mse_trimmed", budget: int | None = None
+        self,
+        scene: str,
+        rival: str,
+        error: Error = "rel_mse_trimmed",
+        budget: int | None = None,
+        first: str | None = None,
     ) -> Summary:
-        """Return the efficiency of the first integrator over ``rival``.
+        """Return the efficiency of the ``first`` integrator over ``rival``, by default at the deciding budget.
 
-        At the deciding budget by default.
+        Where both means differ from the reference but not from each other, raw errors are variances: what
+        both lack is no difference between them.
         """
-        budget = budget or self.deciding
-        return efficiency(self.of(scene, self.methods[0], budget), self.of(scene, rival, budget), error)
-
-    def fair_efficiency(
-        self, scene: str, rival: str, error: Error = "rel_mse_trimmed", budget: int | None = None
-    ) -> Summary:
-        """Like `efficiency`; raises `Biased` if ``rival`` fails the bias check.
-
-        With too few seeds for a check, only an image that is black where the reference is not fails.
-        """
-        try:
-            check = self.bias(scene, rival)
-        except Refused:
-            check = None
-            rows = self.of(scene, rival)
-            if rows and not np.any([row["tile_means"] for row in rows]):
-                raise Biased({rival: NOTHING}) from None
-        if check is not None and not check.passed:
-            raise Biased({rival: missing(check)})
-        return self.efficiency(scene, rival, error, budget)
+        first, budget = first or self.methods[0], budget or self.deciding
+        ours, theirs = self.of(scene, first, budget), self.of(scene, rival, budget)
+        differ = self.differs(scene, first, budget), self.differs(scene, rival, budget)
+        if error == "rel_mse" and all(differ) and not unlike(ours, theirs):
+            differ = False, False
+        return efficiency(ours, theirs, error, differ)
 
     def against_path(
         self, scene: str, error: Error = "rel_mse_trimmed", budget: int | None = None
     ) -> Summary:
         """Return the efficiency over the strongest of `standard` (smallest ratio).
 
-        Considers integrators that pass the bias check; raises `Biased` if none does.
+        Considers integrators that pass the bias check, if any does.
         """
-        found: list[Summary] = []
-        biased: dict[str, str] = {}
         rivals = self.standard_in(scene)
         if not rivals:
             raise Refused(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
-        for rival in rivals:
-            try:
-                found.append(self.fair_efficiency(scene, rival, error, budget))
-            except Biased as why:
-                biased |= why.lacks
-        if not found:
-            raise Biased(biased)
+        fair = [rival for rival in rivals if not self.lacks(scene, rival)] or rivals
+        found = [self.efficiency(scene, rival, error, budget) for rival in fair]
         return min(found, key=lambda ratio: ratio.median)
+
+    def path_lacks(self, scene: str) -> str:
+        """Describe the energy that the last of `standard` lacks in a scene, if all of them do."""
+        found = [self.lacks(scene, rival) for rival in self.standard_in(scene)]
+        return found[-1] if found and all(found) else ""
 
 
 NOTHING = "all energy is missing"

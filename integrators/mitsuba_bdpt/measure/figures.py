@@ -22,10 +22,8 @@ from .analysis import (
     NONE,
     RIVALS,
     UNAIMED,
-    Biased,
     Refused,
     Results,
-    check_judged,
     select,
 )
 
@@ -54,6 +52,7 @@ RAYS = {
 }
 ERRORS = {"rel_mse_trimmed": ("trimmed", "#0072B2", "o"), "rel_mse": ("raw", "#D55E00", "s")}
 COLUMNS = 4
+WIDEST = 100.0
 
 
 def style(method: str) -> dict:
@@ -65,15 +64,14 @@ def style(method: str) -> dict:
 def convergence(results: Results, against: str, path: Path):
     """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene.
 
-    Medians over seeds with the range of all; hollow where the reference is too noisy; the dotted line has
-    slope -1.
+    Means over seeds with 95 % intervals; hollow where the figure is a bound; the dotted line has slope -1.
     """
     rows = math.ceil(len(results.scenes) / COLUMNS)
     figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
     for scene, axis in zip(results.scenes, axes.flat, strict=False):
         for method in results.methods:
-            _curve(axis, results.of(scene, method), against, method)
-        _ideal(axis, results.of(scene, results.methods[0]), against)
+            _curve(axis, results, scene, method, against)
+        _ideal(axis, results, scene, against)
         axis.set(xscale="log", yscale="log")
         axis.xaxis.set_minor_formatter(NullFormatter())
         axis.yaxis.set_minor_formatter(NullFormatter())
@@ -97,14 +95,16 @@ def convergence(results: Results, against: str, path: Path):
     _save(figure, path)
 
 
-def _curve(axis, rows, against, method):
+def _curve(axis, results, scene, method, against):
     points = []
-    for budget in sorted({row["budget"] for row in rows}):
-        at = select(rows, budget=budget)
-        errors = [row["rel_mse"] for row in at]
-        if min(errors) > 0:
-            points.append([np.median([row[against] for row in at]), *np.quantile(errors, (0, 0.5, 1))])
-            if not _judged(at):
+    for budget in sorted({row["budget"] for row in results.of(scene, method)}):
+        found = results.error(scene, method, "rel_mse", budget)
+        if found.total.value > 0:
+            x = np.median([row[against] for row in results.of(scene, method, budget)])
+            points.append(
+                [x, found.total.low, found.total.value, min(found.total.high, WIDEST * found.total.value)]
+            )
+            if found.bound:
                 axis.plot(*points[-1][:3:2], **style(method) | {"markerfacecolor": "white", "zorder": 3})
     if points:
         x, low, middle, high = np.array(points).T
@@ -112,32 +112,23 @@ def _curve(axis, rows, against, method):
         axis.fill_between(x, low, high, color=style(method)["color"], alpha=0.15, linewidth=0)
 
 
-def _judged(rows) -> bool:
-    try:
-        check_judged(rows, "rel_mse")
-    except Refused:
-        return False
-    return True
-
-
-def _ideal(axis, rows, against):
-    """Draw a line of slope -1 through the first integrator's first median."""
+def _ideal(axis, results, scene, against):
+    """Draw a line of slope -1 through the first integrator's first error."""
+    rows = results.of(scene, results.methods[0])
     budgets = sorted({row["budget"] for row in rows})
-    if not budgets or min(row["rel_mse"] for row in rows) == 0:
+    if not budgets:
         return
-    medians = [
-        [np.median([row[key] for row in select(rows, budget=b)]) for key in (against, "rel_mse")]
-        for b in (budgets[0], budgets[-1])
-    ]
-    (x0, y0), (x1, _) = medians
-    axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8)
-    axis.text(x1, y0 * x0 / x1, " −1", fontsize=7, va="center")
+    y0 = results.error(scene, results.methods[0], "rel_mse", budgets[0]).total.value
+    x0, x1 = (np.median([row[against] for row in select(rows, budget=b)]) for b in (budgets[0], budgets[-1]))
+    if y0 > 0:
+        axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8)
+        axis.text(x1, y0 * x0 / x1, " −1", fontsize=7, va="center")
 
 
 def efficiencies(results: Results, rivals: Sequence[str], path: Path):
     """Plot the ratio of efficiencies per scene, median and range, trimmed and raw.
 
-    Integrators that fail the bias check are left out.
+    Hollow where a figure is a bound.
     """
     figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
     for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
@@ -159,20 +150,26 @@ def efficiencies(results: Results, rivals: Sequence[str], path: Path):
 
 
 def _ratios(axis, results, scene, rival, place):
-    """Plot a scene's efficiencies over a rival at ``place``, or why there are none."""
+    """Plot a scene's efficiencies over a rival at ``place``."""
     if not results.of(scene, rival):
         return
     for (error, (label, colour, marker)), y in zip(ERRORS.items(), (place - 0.15, place + 0.15), strict=True):
         try:
-            ratio = results.fair_efficiency(scene, rival, error)
-        except Refused as why:
-            if error == "rel_mse_trimmed":
-                text = "fails the bias check" if isinstance(why, Biased) else "not judged"
-                plate = {"facecolor": "white", "edgecolor": "none", "pad": 1}
-                axis.text(1, place, text, fontsize=7, va="center", ha="center", bbox=plate)
+            ratio = results.efficiency(scene, rival, error)
+        except Refused:
             continue
         axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
-        axis.plot(ratio.median, y, marker=marker, color=colour, markersize=4, linestyle="none", label=label)
+        face = "white" if ratio.bound else colour
+        axis.plot(
+            ratio.median,
+            y,
+            marker=marker,
+            color=colour,
+            markerfacecolor=face,
+            markersize=4,
+            linestyle="none",
+            label=label,
+        )
 
 
 def rays(results: Results, path: Path):

@@ -15,8 +15,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import read_layers
-from . import analysis
-from .analysis import OWN
+from .estimates import OWN
 from .making import Job, check_size, provenance_of
 from .metrics import TRIM, rel_mse_epsilon
 from .reference import Reference, load_reference, reference_path, write
@@ -78,7 +77,7 @@ def _coverage(old: int, new: int) -> np.ndarray:
 
 
 def own_errors(image: np.ndarray, renders: Sequence[np.ndarray]) -> dict[str, float]:
-    """Return `own_error` for each error of a row, by the names in `analysis.OWN`."""
+    """Return `own_error` for each error of a row, by the names in `estimates.OWN`."""
     return {error: own_error(image, renders, trim) for error, trim in TRIMS.items()}
 
 
@@ -95,8 +94,7 @@ def own_error(image: np.ndarray, renders: Sequence[np.ndarray], trim: float) -> 
     return max(float(products[kept].mean()), 0.0)
 
 
-def judged(rows: list[dict[str, Any]], own: dict[str, float]) -> list[dict[str, Any]]:
+def with_own_errors(rows: list[dict[str, Any]], own: dict[str, float]) -> list[dict[str, Any]]:
     """Return the ``rows`` of a scene with its reference's `own_errors` filled in."""
     known = {name: own[error] for error, name in OWN.items()}
-    names = {"rel_mse": "judged", "rel_mse_trimmed": "judged_trimmed"}
-    return [row | known | {names[key]: analysis.judged(own[key], row[key]) for key in OWN} for row in rows]
+    return [row | known for row in rows]

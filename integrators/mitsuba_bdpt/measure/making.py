@@ -38,7 +38,6 @@ from ..files.whole import check_writable, replacing
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means, tile_columns
-from .analysis import REFERENCE_SHARE
 from .metrics import TRIM, rel_mse
 from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
@@ -83,7 +82,8 @@ FIRST_SEED = 1_000_000  # far from the seeds of measurements
 WINDOW_PASSES = 4  # per render of a window
 TRIALS = 3  # renders of bdpt that estimate the error to judge
 TWICE = 2  # samples of `path` in the time of one of `bdpt`, approximately
-MARGIN = 0.9  # of the largest share of a reference's error
+REFERENCE_SHARE = 0.01  # largest share of the reference's own error in a measured error
+MARGIN = 0.9  # of that share
 
 
 def _is_number(value) -> bool:

@@ -142,23 +142,18 @@ def rel_mse(image: Image, reference: Image, trim: float = 0.0) -> float:
     return float(error[kept].mean())
 
 
-def spread(images: Sequence[np.ndarray], reference: Image, trim: float = 0.0) -> list[float]:
+def spread(images: Sequence[np.ndarray], reference: Image) -> list[float]:
     """Return `rel_mse` without bias for each of n independent ``images`` of one mean.
 
     The mean of (x - m)^2 n / (n - 1) / (r^2 + eps), m the mean of the n images and r the ``reference``, which
-    only weighs pixels.
+    only weighs pixels. Their mean is the sample variance.
     """
     if len(images) < 2:
         raise CommandError(f"images has {len(images)} images; a spread takes 2 or more.")
     centre = np.mean(images, axis=0)
     scale = len(images) / (len(images) - 1)
     weights = 1 / np.sqrt(image_of("reference", reference) ** 2 + rel_mse_epsilon(reference))
-    return [scale * _kept_mean((((image - centre) * weights) ** 2).ravel(), trim) for image in images]
-
-
-def _kept_mean(errors: np.ndarray, trim: float) -> float:
-    """Return the mean of ``errors`` without the share ``trim`` of the largest."""
-    return float(errors[_smallest(errors, trim)].mean())
+    return [scale * float((((image - centre) * weights) ** 2).mean()) for image in images]
 
 
 def reference_rel_mse(difference: Image, image: Image, reference: Image, trim: float = 0.0) -> float:

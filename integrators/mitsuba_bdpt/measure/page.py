@@ -22,7 +22,7 @@ from markdown_it import MarkdownIt
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..files.whole import check_own
-from .analysis import NOTHING, RIVALS, Biased, Refused, Results
+from .analysis import NOTHING, RIVALS, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
 from .report import Report
@@ -32,6 +32,14 @@ TITLE = "mitsuba-bdpt: sweep"
 """How the title of every page begins."""
 
 FRAME = Path(__file__).with_suffix(".html")
+
+BOUNDS = {
+    "": ("", ""),
+    "≥": ("at least ", "at most "),
+    "≤": ("at most ", "at least "),
+    "~": ("about ", "about "),
+}
+"""How an efficiency and its reciprocal are bounded, in words."""
 
 COLUMNS = {
     "scene": "scene",
@@ -51,21 +59,23 @@ COLUMNS = {
 def answer(results: Results, scene: str) -> tuple[float, str]:
     """Return the ratio over a scene's strongest path tracer, and a sentence about it.
 
-    The ratio is infinite where path tracers fail, NaN where it is unknown.
+    The ratio is infinite where path tracers find nothing, NaN where there is none.
     """
-    rival = (results.standard_in(scene) or RIVALS)[0].split()[0]
+    rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+    lacks = results.path_lacks(scene)
     try:
         found = results.against_path(scene)
-    except Biased as why:
-        lost = all(what == NOTHING for what in why.lacks.values())
-        return (math.inf if lost else math.nan), f"{rival} fails the bias check here: {why}."
     except Refused as why:
         return math.nan, f"No figure: {str(why).rstrip('.')}."
+    added = f" {rival} fails the bias check here: {lacks}." if lacks else ""
+    least, most = BOUNDS[found.bound]
     if found.median >= 1:
         span = f"({ratio(found.smallest)[:-1]} to {ratio(found.largest)})"
-        return found.median, f"{rival} takes {ratio(found.median)} the time for the same error {span}."
+        words = f"{rival} takes {least}{ratio(found.median)} the time for the same error {span}.{added}"
+        return (math.inf if lacks == NOTHING else found.median), words
     span = f"({ratio(1 / found.largest)[:-1]} to {ratio(1 / found.smallest)})"
-    return found.median, f"{rival} is ahead: its efficiency is {ratio(1 / found.median)} ours {span}."
+    words = f"{rival} is ahead: its efficiency is {most}{ratio(1 / found.median)} ours {span}.{added}"
+    return found.median, words
 
 
 def answers(results: Results) -> str:

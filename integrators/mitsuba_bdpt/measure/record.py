@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, NotRequired, TypedDict
 
-Error = Literal["rel_mse", "rel_mse_trimmed", "spread", "spread_trimmed"]
-"""Columns that efficiencies are made of."""
+Error = Literal["rel_mse", "rel_mse_trimmed"]
+"""Columns of measured errors, of which `estimates` makes the errors of reports."""
 
 
 class Errors(TypedDict):
@@ -60,7 +60,4 @@ class Row(Measured):
     mape: float
     flip: float | None  # of the first seed
     delta_e_itp: float
-    judged: bool  # whether the reference is good enough for rel_mse
-    judged_trimmed: bool
-    spread: float | None  # relMSE to the mean over seeds, without bias: `metrics.spread`
-    spread_trimmed: float | None
+    spread: float | None  # variance: relMSE to the mean over seeds, without bias, `metrics.spread`

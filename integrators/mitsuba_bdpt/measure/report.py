@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -34,29 +34,26 @@ from .analysis import (
     NONE,
     RIVALS,
     UNAIMED,
-    Biased,
-    NotJudged,
     Refused,
     Results,
     Summary,
-    convergence,
     cost,
     efficiency,
     geometric_mean,
     summary,
 )
-from .metrics import rel_mse_epsilon
+from .metrics import Estimate, rel_mse_epsilon
 from .project import Project
 from .record import Error, Row
 from .reference import Reference
 from .results import load
-from .tables import by_scene, ranged, ratio, replace_part, said, table
+from .tables import by_scene, ranged, ratio, relative, replace_part, said, table
 
 # -- tables -----------------------------------------------------------------------------------
 
 
 def efficiency_table(results: Results) -> str:
-    """Efficiency per scene and rival, trimmed and raw; missing energy where biased.
+    """Efficiency per scene and rival, trimmed and raw, and the energy that rivals lack.
 
     A table per set of rivals: scenes with media have others.
     """
@@ -67,22 +64,51 @@ def efficiency_table(results: Results) -> str:
     return "\n".join(by_scene(scenes, _efficiencies(results, rivals)) for rivals, scenes in groups.items())
 
 
-def _efficiencies(results: Results, rivals: Iterable[str]) -> dict[str, Callable[[str], object]]:
+def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Callable[[str], object]]:
     """Return the columns of the first integrator's efficiencies over the ``rivals`` and everything."""
-
-    def raw(rival: str, scene: str):
-        try:
-            return results.fair_efficiency(scene, rival, "rel_mse")
-        except Biased:
-            return "–"
-
     columns: dict[str, Callable[[str], object]] = {}
     for rival in rivals:
-        columns[f"over {rival}, trimmed"] = partial(results.fair_efficiency, rival=rival)
-        columns[f"over {rival}, raw"] = partial(raw, rival)
+        columns[f"over {rival}, trimmed"] = partial(results.efficiency, rival=rival)
+        columns[f"over {rival}, raw"] = partial(results.efficiency, rival=rival, error="rel_mse")
     if NONE in results.methods[1:]:
         columns[f"over {NONE}, trimmed"] = partial(results.efficiency, rival=NONE)
+    if any(results.lacks(scene, rival) for scene in results.scenes for rival in rivals):
+        columns["bias of rivals"] = partial(_lacking, results, rivals)
     return columns
+
+
+def _lacking(results: Results, rivals: Sequence[str], scene: str) -> str:
+    """Describe what each of the ``rivals`` lacks in a scene; once where they lack the same."""
+    found = {rival: results.lacks(scene, rival) for rival in rivals}
+    several = len(rivals) > 1 and len(set(found.values())) > 1
+    said = [f"{rival}: {text}" if several else text for rival, text in found.items() if text]
+    return "; ".join(dict.fromkeys(said)) or "–"
+
+
+def errors_table(results: Results) -> str:
+    """Table of relMSE at the deciding budget: a row per scene and integrator, with its bias."""
+    head = ["scene", "integrator", "samples per pixel", "seconds", "renders"]
+    head += ["relMSE, trimmed", "relMSE, raw", "variance", "squared bias", "bias"]
+    lines: list[list[str]] = []
+    for scene in results.scenes:
+        for method in results.methods:
+            if rows := results.of(scene, method, results.deciding):
+                trimmed, raw = (results.error(scene, method, error) for error in KINDS)
+                lines.append(
+                    [
+                        *(f"`{scene}`", method, f"{np.median([row['spp'] for row in rows]):.0f}"),
+                        *(f"{np.median([row['seconds'] for row in rows]):.3g}", str(len(rows))),
+                        *(relative(trimmed), relative(raw)),
+                        "–" if raw.variance is None else f"{raw.variance:.2e}",
+                        _squared(raw.squared_bias) if raw.bound else "–",
+                        results.lacks(scene, method) or "–",
+                    ]
+                )
+    return table(head, lines)
+
+
+def _squared(found: Estimate | None) -> str:
+    return "–" if found is None else f"{found.value:.2e} ({found.low:.2e}–{found.high:.2e})"
 
 
 KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
@@ -144,16 +170,22 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         f"cost of a sample over {rival}": partial(costs, ours),
         f"{NONE} over {rival}": partial(costs, NONE),
         "slope": partial(_slope, results, notes),
-        "slope, independent points": lambda scene: convergence(results.of(scene, INDEPENDENT)),
+        "slope, independent points": partial(results.convergence, method=INDEPENDENT),
         "bias check": bias,
-        LIGHT_TRACER: partial(results.fair_efficiency, rival=LIGHT_TRACER),
+        LIGHT_TRACER: lambda scene: _with_bias(results, scene, LIGHT_TRACER),
     }
     return by_scene(results.scenes, columns)
 
 
+def _with_bias(results: Results, scene: str, rival: str) -> str:
+    """Return the efficiency over ``rival``, and the energy that it lacks."""
+    lacks = results.lacks(scene, rival)
+    return said(results.efficiency, scene, rival) + (f"; {lacks}" if lacks else "")
+
+
 def _slope(results: Results, notes: dict[str, str], scene: str) -> str:
     rows = results.of(scene, results.methods[0])
-    found = convergence(rows)
+    found = results.convergence(scene, results.methods[0])
     if len(set(map(_chosen, rows))) > 1:
         return said(lambda: found) + ", between decisions"
     expected = found.low <= -1 <= found.high or scene in notes
@@ -254,13 +286,9 @@ def gallery(results: Results) -> str:
     """Images of all scenes, with the efficiency over the stronger `path`."""
 
     def figure(scene: str) -> str:
-        try:
-            return ranged(results.against_path(scene))
-        except Biased as why:
-            rival, lacks = list(why.lacks.items())[-1]
-            return f"`{rival.split()[0]}`: {lacks}"
-        except NotJudged:
-            return "not judged"
+        lacks = results.path_lacks(scene)
+        rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+        return ranged(results.against_path(scene)) + (f"<br>`{rival}`: {lacks}" if lacks else "")
 
     cells = [
         f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
@@ -288,12 +316,10 @@ Goal = dict[str, Any]
 
 
 def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> str:
-    """Efficiency over the strongest unbiased path tracer; else their missing energy."""
-    try:
-        return ranged(results.against_path(scene, error))
-    except Biased as why:
-        found = [said(results.efficiency, scene, rival, error) for rival in results.standard_in(scene)]
-        return f"{why} (against their error all the same: {', '.join(found)})"
+    """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
+    lacks = results.path_lacks(scene)
+    rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+    return ranged(results.against_path(scene, error)) + (f"; `{rival}`: {lacks}" if lacks else "")
 
 
 # Pairs required near 1, until the interval of their median is this narrow.
@@ -302,7 +328,8 @@ MANY, NARROW = 20, 0.04
 
 def _near(found: Summary) -> str:
     wide = found.count >= MANY and found.high - found.low > NARROW
-    text = f"{found.median:.3f}x, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
+    middle = f"{found.bound} {found.median:.3f}x".lstrip()
+    text = f"{middle}, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
     return text + (f" (not narrower than {NARROW})" if wide else "")
 
 
@@ -310,31 +337,24 @@ def _near_one(results: Results, scene: str) -> str:
     """Efficiency over each of `Results.standard`."""
 
     def near(rival: str) -> str:
-        return _near(results.fair_efficiency(scene, rival))
+        return _near(results.efficiency(scene, rival))
 
     rivals = results.standard_in(scene) or RIVALS
     return "; ".join(f"{said(near, rival)} over {rival}" for rival in rivals)
 
 
 def _worst(results: Results) -> str:
-    """Smallest efficiency over scenes with an unbiased path tracer.
-
-    Names the scenes that cannot be judged.
-    """
+    """Smallest efficiency over all scenes."""
     found: dict[str, Summary] = {}
-    others: list[str] = []
     for scene in results.scenes:
         try:
             found[scene] = results.against_path(scene)
-        except Biased:
+        except Refused:  # not rendered, or exact
             continue
-        except Refused:
-            others.append(f"`{scene}`")
     if not found:
-        raise Refused("no scene can be judged")
+        raise Refused("not rendered")
     worst = min(found, key=lambda scene: found[scene].median)
-    text = f"`{worst}` of {len(found)} scenes: {_near(found[worst])}"
-    return text + (f"; not judged: {', '.join(others)}" if others else "")
+    return f"`{worst}` of {len(found)} scenes: {_near(found[worst])}"
 
 
 def _against_none(results: Results) -> str:
@@ -344,35 +364,33 @@ def _against_none(results: Results) -> str:
 
 
 def _mean_over_none(results: Results, scenes: list[str]) -> str:
-    """Mean over the judged scenes, by the errors and by the spread over seeds."""
+    """Geometric means over the scenes, trimmed and raw."""
     found: list[str] = []
-    for error in ("rel_mse_trimmed", "spread_trimmed"):
-        medians: list[float] = []
+    medians: list[float] = []
+    for error, kind in KINDS.items():
+        medians = []
         for scene in scenes:
             try:
                 medians.append(results.efficiency(scene, NONE, error).median)
-            except Refused:
+            except Refused:  # not rendered, or exact
                 continue
-        if medians:
-            found.append(f"{ratio(geometric_mean(medians))}, {len(medians)} of {len(scenes)} scenes")
-        elif not found:
-            raise Refused("no scene can be judged")
-    return ", by the spread over seeds ".join(found)
+        if not medians:
+            raise Refused("not rendered")
+        found.append(f"{ratio(geometric_mean(medians))} {kind}")
+    return f"{', '.join(found)}, {len(medians)} of {len(scenes)} scenes"
 
 
 def _unaimed(results: Results, scene: str) -> str:
-    error, noise = (
-        said(results.efficiency, scene, UNAIMED, error) for error in ("rel_mse_trimmed", "spread_trimmed")
+    return ", ".join(
+        f"{said(results.efficiency, scene, UNAIMED, error)} {kind}" for error, kind in KINDS.items()
     )
-    return f"{error}; by the spread over seeds {noise}"
 
 
 def _merged(results: Results, scene: str) -> str:
     """Raw efficiency of `merging` over each of `Results.standard`, biased or not."""
 
     def over(rival: str) -> Summary:
-        ours, theirs = (results.of(scene, name, results.deciding) for name in (MERGING, rival))
-        return efficiency(ours, theirs, "rel_mse")
+        return results.efficiency(scene, rival, "rel_mse", first=MERGING)
 
     return ", ".join(f"{said(over, rival)} over {rival}" for rival in results.standard_in(scene) or RIVALS)
 
@@ -515,12 +533,14 @@ def _introduction(results: Results) -> str:
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
-without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. An integrator that
-fails the bias check has its missing energy reported instead. A figure is refused where the reference's
-own error is above 1 % of the error measured (its share is said). Samples for equal time follow from the
-seconds at the largest budget; seconds are those measured, so other budgets are compared as if errors fell
-with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly too narrow (it
-holds the median in 90 % of cases, not 95 %).
+without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. Its expectation is free
+of the reference's noise: raw, it is the variance over seeds; trimmed, the error against the reference less
+the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
+the figure is a bound, since rare light that was not met is in no variance: ≥ where the other integrator's
+error is at least the one measured, ≤ where the first integrator's is, ~ where both are. Samples for equal
+time follow from the seconds at the largest budget; seconds are those measured, so other budgets are compared
+as if errors fell with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly
+too narrow (it holds the median in 90 % of cases, not 95 %).
 """
 
 
@@ -534,12 +554,19 @@ def page(results: Results, made: dict[str, Reference], goals: list[Goal], notes:
 {efficiency_table(results)}
 {"![Efficiency per scene](efficiency.png)" if results.rivals else ""}
 
-By budget, over {stronger(results)} that passes the bias check:
+By budget, over {stronger(results)} of those that pass the bias check, or of all where none does:
 
 {budgets_table(results)}
 How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel:
 
 {gaps_table(results)}
+## Errors
+
+At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds; of few
+seeds with rare bright values it is too narrow). Variance and squared bias add up to the raw error where the
+mean of the renders differs from the reference.
+
+{errors_table(results)}
 ## What was skipped
 
 Decided by a pilot in the first render of each scene, at {results.deciding} samples per pixel:

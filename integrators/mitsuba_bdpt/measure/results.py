@@ -58,11 +58,9 @@ def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
     """Return all error measures of an image.
 
-    ``judged`` (raw) and ``judged_trimmed`` are false where the reference is not good enough. HDR-FLIP is
-    slower than most renders: only with ``flip``, else None.
+    HDR-FLIP is slower than most renders: only with ``flip``, else None.
     """
-    found = relative_errors(image, ref)
-    return found | {
+    return relative_errors(image, ref) | {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
         "height": image.shape[0],
@@ -73,8 +71,6 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
         "mape": metrics.mape(image, ref.image),
         "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
-        "judged": analysis.judged(found["reference_rel_mse"], found["rel_mse"]),
-        "judged_trimmed": analysis.judged(found["reference_rel_mse_trimmed"], found["rel_mse_trimmed"]),
     }
 
 
@@ -129,34 +125,36 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
     found = read_rows(output, cells, wanted.values())
     spreads = _spreads(output, cells, list(wanted.values()), found) if found else {}
     for row in found:
-        row |= spreads[row["key"]] | {"first": preset.methods[0].name}
+        row |= {"spread": spreads[row["key"]], "first": preset.methods[0].name}
     return found
 
 
-def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[Row]) -> dict[str, dict]:
+def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[Row]) -> dict[str, float | None]:
     """Return `metrics.spread` by the rows' keys, for each integrator and budget.
 
-    Raw and trimmed; None for fewer than two renders, differing numbers of samples, or missing images. Cached
-    in OUTPUT/spreads, since reading the images is slow.
+    None for fewer than two renders, differing numbers of samples, or missing images. Cached in
+    OUTPUT/variances, since reading the images is slow.
     """
     there = {row["key"]: row for row in table}
     groups: dict[tuple[str, int], list[Cell]] = {}
     for cell in wanted:
         if cell.key in there:
             groups.setdefault((cell.method, cell.budget), []).append(cell)
-    file = output / "spreads" / f"{cells.subject.name}.json"
-    kept = read_json(file, "delete it, to take the spread anew") if file.exists() else {}
-    now = {}
+    file = output / "variances" / f"{cells.subject.name}.json"
+    kept = read_json(file, "delete it, to take the variance anew") if file.exists() else {}
+    now: dict[str, list[float] | None] = {}
+    found: dict[str, float | None] = dict.fromkeys(there)
     for group in groups.values():
         mark = " ".join([there[group[0].key]["reference_sha256"], *(cell.key for cell in group)])
         now[mark] = kept[mark] if mark in kept else _spread(output, cells, group, there)
+        values = now[mark] or [None] * len(group)
+        found |= {cell.key: value for cell, value in zip(group, values, strict=True)}
     if now != kept:
         write_json(file, now)
-    found = {key: {"spread": None, "spread_trimmed": None} for key in there}
-    return found | {key: value for group in now.values() for key, value in group.items()}
+    return found
 
 
-def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]) -> dict[str, dict]:
+def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]) -> list[float] | None:
     """Like `_spreads`, of the compared cells ``group``, whose rows are ``there``."""
     files = [image_file(output, cell) for cell in group]
     if (
@@ -164,15 +162,8 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]
         or len({there[cell.key]["spp"] for cell in group}) > 1
         or not all(file.exists() for file in files)
     ):
-        return {}
-    reference = load_reference(*cells.where()).image
-    images = [_image(output, cell) for cell in group]
-    raw, trimmed = (metrics.spread(images, reference, trim) for trim in (0.0, metrics.TRIM))
-    pairs = zip(raw, trimmed, strict=True)
-    return {
-        cell.key: dict(zip(("spread", "spread_trimmed"), pair, strict=True))
-        for cell, pair in zip(group, pairs, strict=True)
-    }
+        return None
+    return metrics.spread([_image(output, cell) for cell in group], load_reference(*cells.where()).image)
 
 
 def beside(table: list[Row], order: list[str], output: Path) -> list[Row]:

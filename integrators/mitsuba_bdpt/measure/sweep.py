@@ -35,6 +35,7 @@ from ..files.images import check_output
 from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from . import analysis, probes, showing
+from .estimates import seed_errors
 from .making import Job, check, obtained
 from .options import VARIANT
 from .options import Sweep as Asked
@@ -379,12 +380,15 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     found = []
     if load_reference(*cells.where()).means is None:
         found.append(too_few(scene.name, make))
-    if refused := analysis.unjudged(rows):
-        (method, budget), worst = max(refused.items(), key=lambda item: item[1].share)
-        others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+    keys = dict.fromkeys((row["method"], row["budget"]) for row in rows)
+    cells_of = {key: analysis.select(rows, method=key[0], budget=key[1]) for key in keys}
+    poor = [key for key, at in cells_of.items() if seed_errors(at, "rel_mse_trimmed", False)[1]]
+    if poor:
+        others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
+        method, budget = poor[-1]
         found.append(
-            f"{scene.name}: no figure of {method} at {budget} spp{others} will be judged. {worst} To go on: "
-            f"{make}"
+            f"{scene.name}: the reference is noisier than the renders of {method} at {budget} spp{others}, "
+            f"whose trimmed errors are upper bounds. To go on: {make}"
         )
     return found
 

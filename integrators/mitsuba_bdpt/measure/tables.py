@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 
 from ..errors import CommandError
-from .analysis import NotJudged, Refused, Summary, refused_share
+from .analysis import Refused, Summary
+from .estimates import RelativeError
 from .metrics import Estimate
 
 
@@ -33,20 +35,29 @@ def ratio(x: float) -> str:
 
 
 def ranged(found: Summary) -> str:
-    """Format median (smallest–largest)."""
-    return f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
+    """Format bound, median (smallest–largest)."""
+    middle = f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
+    return f"{found.bound} {middle}".lstrip()
+
+
+def relative(found: RelativeError) -> str:
+    """Format bound, relMSE (its interval); without the interval of a single render."""
+    text = f"{found.bound} {found.total.value:.2e}".lstrip()
+    if math.isinf(found.total.high):
+        return f"{text} (one render)"
+    return f"{text} ({found.total.low:.2e}–{found.total.high:.2e})"
 
 
 def said(figure: Callable[..., object], *given: object) -> str:
     """Call ``figure`` and format what it returns, or the reason why there is none."""
     try:
         found = figure(*given)
-    except NotJudged as why:
-        return f"not judged: reference {refused_share(why.share, 2)}"
     except Refused as why:
         return str(why)
     if isinstance(found, Summary):
         return ranged(found)
+    if isinstance(found, RelativeError):
+        return relative(found)
     if isinstance(found, Estimate):
         return f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f})"
     return str(found)

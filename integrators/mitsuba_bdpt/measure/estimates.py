@@ -1,0 +1,171 @@
+"""The relMSE of an integrator at one budget, from the renders of several seeds and a noisy reference.
+
+Of K independent renders x_i of one budget, with expected image u, the truth I, and independent halves A and B
+of the reference R = (A + B) / 2; all means are over pixels and channels with the weights 1 / (R^2 + eps) of
+`metrics.rel_mse`. The weights come from the reference alone, the same for all integrators, never from the
+renders that are judged: these divide their own fireflies by themselves.
+
+* Variance, E (x_i - u)^2: `metrics.spread`, the sample variance. No reference is in it.
+* Variance + squared bias, E (x_i - I)^2: the products (x_i - A)(x_i - B) = (x_i - R)^2 - ((A - B) / 2)^2, the
+  measured error less the reference's own. Its expectation is free of the reference's noise.
+* Squared bias, (u - I)^2: their difference, which is the mean of (x_i - A)(x_j - B) over pairs i != j.
+
+The raw relMSE is the variance where the mean of the renders agrees with the reference. Where it differs, it
+is variance + squared bias and a lower bound: the integrator is biased, or has not met rare light, whose
+variance the renders do not show. The trimmed relMSE is of the products, of the values that the trimmed
+measured error keeps. Intervals are Student's over seeds; the noise of the reference is not in them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from .agreement import FEWEST_RUNS, SIGNIFICANCE, Means, sidak, welch
+from .metrics import CONFIDENCE, Estimate, values_of
+from .record import Error, Row
+
+Bound = Literal["", "≥", "≤", "~"]
+"""Exact, at least, at most, or neither bound."""
+
+# Error columns of a row, and the reference's own.
+OWN: dict[Error, Literal["reference_rel_mse", "reference_rel_mse_trimmed"]] = {
+    "rel_mse": "reference_rel_mse",
+    "rel_mse_trimmed": "reference_rel_mse_trimmed",
+}
+
+# Above this share of the measured error the reference's own error is not subtracted: the difference would be
+# mostly noise.
+SUBTRACTED = 0.9
+
+# Fewest renders of a test for a differing mean; below `FEWEST_RUNS` the squared bias must be this share of
+# the error too, since the test of so few renders rejects too often.
+FEWEST_TESTED = 3
+MATERIAL = 0.05
+
+
+@dataclass(frozen=True)
+class RelativeError:
+    """relMSE of an integrator at one budget: the mean over ``count`` seeds with a 95 % interval.
+
+    ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where the reference is too
+    noisy. ``variance`` and ``squared_bias`` add up to the raw error; None where too few renders are there.
+    """
+
+    total: Estimate
+    bound: Bound
+    count: int
+    variance: float | None = None
+    squared_bias: Estimate | None = None
+
+
+def seed_errors(rows: Sequence[Row], error: Error, differs: bool) -> tuple[list[float], Bound]:
+    """Return an estimate of the relMSE from each row, whose mean is unbiased, and its bound.
+
+    ``differs``: whether the mean of the renders differs from the reference. If not, raw errors are scaled to
+    the mean of `metrics.spread`, whose own values are not of one seed: each has a part of the others'
+    fireflies.
+    """
+    measured, own = (np.array([row[key] for row in rows], dtype=np.float64) for key in (error, OWN[error]))
+    found = measured - own
+    is_noisy = bool(own.any()) and (own.sum() > SUBTRACTED * measured.sum() or found.min() <= 0)
+    if error == "rel_mse" and not differs and all(row.get("spread") is not None for row in rows):
+        spread = np.array([row["spread"] for row in rows], dtype=np.float64)
+        scaled = not is_noisy and found.min() > 0
+        return (found * (spread.mean() / found.mean()) if scaled else spread).tolist(), ""
+    if is_noisy:
+        return measured.tolist(), "~" if differs else "≤"
+    return found.tolist(), "≥" if differs else ""
+
+
+def relative_error(rows: Sequence[Row], error: Error, differs: bool) -> RelativeError:
+    """Return the relMSE of the ``rows`` of an integrator at one budget."""
+    values, bound = seed_errors(rows, error, differs)
+    found = RelativeError(mean_of(values), bound, len(rows))
+    if error != "rel_mse" or any(row.get("spread") is None for row in rows):
+        return found
+    variance = float(np.mean([row["spread"] for row in rows]))
+    return RelativeError(found.total, bound, len(rows), variance, squared_bias(rows))
+
+
+def mean_of(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate:
+    """Return the mean of positive values with Student's interval of its logarithm.
+
+    The standard error is the jackknife's. From 0 to infinity for a single value. The interval of few values
+    with a long tail is too narrow: a rare value was not met.
+    """
+    given = values_of("values", values, 1)
+    value, n = float(given.mean()), len(given)
+    if n == 1:
+        return Estimate(value, 0.0, math.inf)
+    without = (given.sum() - given) / (n - 1)
+    if without.min() <= 0:
+        half = _student(n - 1, confidence) * _jackknife(without)
+        return Estimate(value, max(value - half, 0.0), value + half)
+    factor = math.exp(min(_student(n - 1, confidence) * _jackknife(np.log(without)), 700.0))
+    return Estimate(value, value / factor, value * factor)
+
+
+def squared_bias(rows: Sequence[Row], confidence: float = CONFIDENCE) -> Estimate | None:
+    """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
+
+    None for fewer than 3 renders. Without bias, its expectation is 0 and it may be negative.
+    """
+    n = len(rows)
+    if n < 3 or any(row.get("spread") is None for row in rows):
+        return None
+    spread = np.array([row["spread"] for row in rows], dtype=np.float64)
+    total = np.array([row["rel_mse"] - row["reference_rel_mse"] for row in rows], dtype=np.float64)
+    # Both without one seed: the sum of squares about the mean falls by that row's `metrics.spread`.
+    variance = ((n - 1) / n * spread.sum() - spread) / (n - 2)
+    without = (total.sum() - total) / (n - 1) - variance
+    value, half = float(total.mean() - spread.mean()), _student(n - 1, confidence) * _jackknife(without)
+    return Estimate(value, value - half, value + half)
+
+
+def _jackknife(without: np.ndarray) -> float:
+    """Return the standard error from the estimates ``without`` each of n values."""
+    n = len(without)
+    return math.sqrt((n - 1) / n * float(np.sum((without - without.mean()) ** 2)))
+
+
+def _student(freedom: int, confidence: float) -> float:
+    return float(stats.t.isf((1 - confidence) / 2, freedom))
+
+
+def mean_differs(rows: Sequence[Row], reference: Means) -> bool:
+    """Return whether the mean of renders of one budget differs from the reference.
+
+    By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light.
+    """
+    if not compared(rows, reference):
+        return False
+    found, share = squared_bias(rows), 0.0 if len(rows) >= FEWEST_RUNS else MATERIAL
+    return found is None or found.value > share * float(np.mean([row["rel_mse"] for row in rows]))
+
+
+def compared(rows: Sequence[Row], other: Means) -> bool:
+    """Return whether the tile means differ significantly; False for too few renders."""
+    if len(rows) < FEWEST_TESTED:
+        return False
+    means = Means.of([row["tile_means"] for row in rows], fewest=FEWEST_TESTED)
+    return sidak(welch(means.columns, other.columns).p) < SIGNIFICANCE
+
+
+def unlike(rows: Sequence[Row], others: Sequence[Row]) -> bool:
+    """Return whether the means of two integrators' renders differ; True for too few renders."""
+    if min(len(rows), len(others)) < FEWEST_TESTED:
+        return True
+    return compared(rows, Means.of([row["tile_means"] for row in others], fewest=FEWEST_TESTED))
+
+
+def bound_of_ratio(over: Bound, under: Bound) -> Bound:
+    """Return the bound of a ratio of two errors with the bounds ``over`` and ``under``."""
+    turned: dict[Bound, Bound] = {"": "", "≥": "≤", "≤": "≥", "~": "~"}
+    other = turned[under]
+    return "~" if over and other and over != other else over or other
