@@ -387,7 +387,7 @@ class Results:
         budget: int | None = None,
         first: str | None = None,
     ) -> Summary:
-        """Return the efficiency of the ``first`` integrator over ``rival``, by default at the deciding budget.
+        """Return the efficiency of ``first`` over ``rival``, at the deciding budget by default.
 
         Where both means differ from the reference but not from each other, raw errors are variances: what
         both lack is no difference between them.
