@@ -48,13 +48,17 @@ class Undersampled:
         """Mask: the camera vertex ``z`` looks for photons."""
         return has_lobe(kernel, z)
 
-    def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Bool:
+    def missing(
+        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, only_delta: mi.Bool
+    ) -> mi.Bool:
         """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
 
-        Only where the vertex is not near-specular itself: the path is merged there alone.
+        Only where the vertex is not near-specular itself: the path is merged there alone. Light of emitters
+        that rays can hit counts only behind a near-specular event; ``only_delta``: there is none before ``z``.
         """
         expected = self.expected(kernel, merging, z, found)
         active = found.active & ~is_narrow(found.f.pdf_fwd_w, found.f.pdf_rev_w)
+        active &= ~(only_delta & found.photon.delta)
         kind = mi.UInt32(0)
         for bound in KINDS[:-1]:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)

@@ -22,6 +22,7 @@ from ..transport.inputs import Kernel, Observer
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import Kept
+from ..transport.sds import State
 from ..transport.walk import is_sds_vertex, random_walk
 from .merging import Merging
 from .merging import sample as draw
@@ -100,16 +101,18 @@ def _merged(
     walk = replace(walk, sds=None, partial=replace(walk.partial, d_vm=0))
     side = subpaths.camera_side(kernel, sample, shared, walk)
     delta = undersampled is None
+    if not delta:
+        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
     side = replace(side, connect=None, only_delta=delta, only_specular=not delta, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, len(kernel.scene.emitters()) * channels)
 
-    def merge(z, size):
+    def merge(z, only_delta, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)
         if undersampled is None:
             active, flaw = found.active, found.photon.older  # 0, or NaN
         else:
-            active, flaw = undersampled.missing(kernel, merging, z, found), 0 * found.photon.older
+            active, flaw = undersampled.missing(kernel, merging, z, found, only_delta), 0 * found.photon.older
         value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i
@@ -124,7 +127,9 @@ def _merged(
             there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
         else:
             there = undersampled.looks(kernel, z)
-        size = dr.if_stmt((z, size), there, merge, lambda z, size: size, label="unsampled light")
+        only_delta = mi.Bool(False) if delta else walk.sds.only_delta
+        arguments = z, only_delta, size
+        size = dr.if_stmt(arguments, there, merge, lambda *arguments: arguments[2], label="unsampled light")
         first = z.hit & (z.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, z.si.shape), through)
         return seen | there, size, through

@@ -97,7 +97,7 @@ class LostLight:
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
-    if plan.arrival or not prepared.emitters.traced:  # the estimate traces light subpaths
+    if not prepared.emitters.traced:  # the estimate traces light subpaths
         return False
     if prepared.light_media is not None and prepared.light_media.contradiction:  # it would see another scene
         return False
@@ -107,13 +107,15 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if is_undersampling_possible(prepared, settings):
         return True
+    if plan.arrival:
+        return False
     lost = unsampled_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
 
 
 def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
-    """Whether light of delta emitters may be undersampled."""
-    return bool(prepared.near_specular and prepared.emitters.unhittable) and settings.max_depth >= SHORTEST
+    """Whether near-specular lobes may leave light undersampled."""
+    return bool(prepared.near_specular) and settings.max_depth >= SHORTEST
 
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:

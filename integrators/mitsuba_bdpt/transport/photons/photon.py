@@ -60,15 +60,17 @@ class ConnectedPhoton(Photon):
     """A photon whose path may also be sampled by connections; ``older`` is its ``d_vc``.
 
     ``connection``: its ``d_vcm`` times the coefficient of the connection of the last edge. All partial sums
-    are those of a light subpath, whose first direction is not aimed.
+    are those of a light subpath, whose first direction is not aimed. ``delta``: from an emitter that rays can
+    hit, by delta events only.
     """
 
     connection: mi.Float
+    delta: mi.Bool
 
     @classmethod
     def types(cls) -> tuple[Any, ...]:
         """Types of the fields in the current variant, in order."""
-        return (*Photon.types(), mi.Float)
+        return (*Photon.types(), mi.Float, mi.Bool)
 
 
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):

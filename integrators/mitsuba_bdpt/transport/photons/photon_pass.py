@@ -12,7 +12,7 @@ from ...sampling.points import Points, Purpose
 from .. import spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
-from ..sds import SdsStrategy
+from ..sds import SdsStrategy, State
 from ..walk import has_lobe, is_sds_vertex, newest_coefficient, random_walk
 from .aim import Aim
 from .photon import ConnectedPhoton, Photon
@@ -40,8 +40,8 @@ class Kept(Enum):
     UNDERSAMPLED = "all vertices with a non-delta lobe behind delta and near-specular events"
 
     @property
-    def of_delta_emitters(self) -> bool:
-        """Whether only subpaths of emitters that no ray can hit are traced."""
+    def estimates(self) -> bool:
+        """Whether photons estimate how much light a render lacks, of which emitter."""
         return self in (Kept.UNSAMPLED, Kept.UNDERSAMPLED)
 
 
@@ -49,7 +49,7 @@ class Kept(Enum):
 class Traced:
     """``count`` ``photons`` in the order of threads, and counters.
 
-    ``broken``, if `Kept.of_delta_emitters`: mask by emitter, a subpath ended by a non-finite value.
+    ``broken``, if `Kept.estimates`: mask by emitter, a subpath ended by a non-finite value.
     """
 
     photons: Photon
@@ -96,13 +96,15 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         shared,
     )
     merges, finite, undersampled = kept is Kept.MERGED, mi.Bool(True), kept is Kept.UNDERSAMPLED
-    if kept.of_delta_emitters:  # traced, to see where their light arrives
+    if kept.estimates:  # traced, to see where their light arrives
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     sds = kernel.sds if merges else None
     start = replace(e, pdf_second=e.pdf_second * aimed) if undersampled else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
-    if kept.of_delta_emitters:  # s = 0 samples the others
+    if undersampled:
+        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
+    elif kept.estimates:  # s = 0 samples the others
         walk = replace(walk, active=walk.active & e.delta)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
     side = replace(side, connect=None, isolated=merges, only_delta=not merges and not undersampled)
@@ -120,7 +122,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         if undersampled:
             older, h = dr.select(finite, mi.Float(older), dr.nan), kernel.heuristic
             newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
-            more = (h.present(h.scale(y.partial.d_vcm, newest)),)
+            more = h.present(h.scale(y.partial.d_vcm, newest)), walk.sds.only_delta & ~e.delta
         distance = dr.norm(y.si.p - y.previous)
         fields = y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index
         found = type(out)(*fields, *more)
@@ -133,9 +135,10 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
     counts = counters.summed()
     broken = mi.Bool(False)
-    if kept.of_delta_emitters:
+    if kept.estimates:
         broken = dr.zeros(mi.Bool, len(kernel.scene.emitters()))
-        astray = walk.broken | (e.delta & ~dr.isfinite(dr.sum(e.d)))
+        traced = e.delta | undersampled
+        astray = walk.broken | (traced & ~dr.isfinite(dr.sum(e.d)))
         dr.scatter(broken, mi.Bool(True), e.index, astray)
     dr.eval(number, out, counts, broken)
     return Traced(out, int(number[0]), counts, broken)
