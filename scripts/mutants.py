@@ -112,6 +112,27 @@ MUTANTS = (
         ("tests/planning/test_undersampled.py::test_a_path_is_merged_once",),
     ),
     Mutant(
+        "undersampled light: lamps behind smooth glass count",
+        "merging/undersampled.py",
+        "        active &= ~(only_delta & found.photon.delta)",
+        "        pass",
+        ("tests/planning/test_undersampled.py::test_lamps_behind_smooth_glass_are_not_undersampled_lamps",),
+    ),
+    Mutant(
+        "undersampled light: hits of the lamp do not count",
+        "merging/undersampled.py",
+        "area = photon.connection + photon.older * f.pdf_fwd_w",
+        "area = photon.connection",
+        ("tests/planning/test_undersampled.py::test_small_lamps_are_hit_too_rarely",),
+    ),
+    Mutant(
+        "undersampled light: the density of aimed photons",
+        "merging/undersampled.py",
+        "(found.number * photon.aim / merging",
+        "(found.number / merging",
+        ("tests/planning/test_undersampled.py::test_the_aim_of_photons_changes_nothing",),
+    ),
+    Mutant(
         "undersampled light: of one sample per pixel",
         "merging/undersampled.py",
         "return self.samples * area",

@@ -19,7 +19,7 @@ def uncached(bsdf, name, find):
 def found_in(bsdf):
     """Whether ``bsdf`` has a near-specular lobe."""
     family = draws.family([bsdf])
-    return any(b is bsdf for b in near_specular.near_specular(family, uncached))
+    return any(b is bsdf for b, _ in near_specular.near_specular(family, uncached))
 
 
 def picture(values):

@@ -54,7 +54,7 @@ class Undersampled:
         """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
 
         Only where the vertex is not near-specular itself: the path is merged there alone. Light of emitters
-        that rays can hit counts only behind a near-specular event; ``only_delta``: there is none before ``z``.
+        that rays can hit counts only behind a near-specular event; ``only_delta``: none came before ``z``.
         """
         expected = self.expected(kernel, merging, z, found)
         active = found.active & ~is_narrow(found.f.pdf_fwd_w, found.f.pdf_rev_w)

@@ -43,6 +43,10 @@ WORTH_A_WORD = 0.01
 # and noise is no loss.
 RARE_WORTH_A_WORD = 0.125
 
+# Least density of a lobe (solid angle) that may leave light undersampled; the estimate is dear beside a short
+# render (see experiments, "Near-specular lobes").
+NARROW = 100.0
+
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
 
@@ -115,7 +119,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
 
 def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
     """Whether near-specular lobes may leave light undersampled."""
-    return bool(prepared.near_specular) and settings.max_depth >= SHORTEST
+    return prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
 
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:
@@ -274,14 +278,21 @@ def _undersampled(what: str, lost: LostLight, samples: int, remedy: str) -> str:
 def called(emitter: mi.Emitter) -> str:
     """Name an emitter by its kind and nearest id."""
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
+    on_shape = shape is not None and shape.id() and not shape.id().startswith("_unnamed_")
+    if emitter.class_name() == "AreaLight":  # its id says little: a dictionary's key
+        return (
+            f"the area light on shape '{shape.id()}'" if on_shape else "an area light on a shape without id"
+        )
     if emitter.id():
         return f"{kind} '{emitter.id()}'"
-    on_shape = shape is not None and shape.id()
     return f"the {kind} on shape '{shape.id()}'" if on_shape else f"a {kind} without id"
 
 
 def _remedy(prepared: PreparedScene, emitters: Iterable[mi.Emitter]) -> str:
+    emitters = list(emitters)
     remedy = "give it a small area: an area light on a small sphere or disk"
+    if not any(emitter.class_name() in _PLUGINS for emitter in emitters):
+        remedy = "make the emitter larger"
     if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
         remedy = "give the sun a disk: sunsky, an envmap, or an area light far away"
     return remedy if prepared.space is not None else f"set merging=true, or {remedy}"

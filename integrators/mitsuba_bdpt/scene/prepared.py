@@ -27,9 +27,9 @@ class PreparedScene:
 
     ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``smooth``, ``delta``, ``refracts``:
     some BSDF has such a lobe; ``specular``: some BSDF, as of glass or mirrors, has delta lobes alone;
-    ``near_specular``: BSDFs of shapes with lobes that are not delta, but nearly so, see `near_specular`;
-    ``traits``: see `bsdf.Traits`; ``space`` between vertices and ``light_media``, in which light subpaths
-    start, are None in scenes without media.
+    ``near_specular``: BSDFs of shapes with lobes that are not delta, but nearly so, and ``narrowest``, the
+    largest density of these: see `near_specular`; ``traits``: see `bsdf.Traits`; ``space`` between vertices
+    and ``light_media``, in which light subpaths start, are None in scenes without media.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
@@ -49,7 +49,9 @@ class PreparedScene:
         self.smooth = any(f & smooth for f in flags)
         self.specular = any(f & delta & ~null and not f & smooth for f in flags)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
-        self.near_specular = _near_specular(scene, sensor, found, family)
+        sharp = _near_specular(scene, sensor, found, family)
+        self.near_specular = [b for b, _ in sharp]
+        self.narrowest = max((density for _, density in sharp), default=0.0)
         instances = sum(map(is_instance, scene.shapes()))  # each has a BSDF
         self.traits = bsdf.Traits.of(found, instances, [b for b, _ in family])
         self.space = self.light_media = None
@@ -67,15 +69,18 @@ class PreparedScene:
         return DEFAULT_STORED if self.space is None else MAX_STORED
 
 
-def _near_specular(scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family) -> list[mi.BSDF]:
-    """Those of the BSDFs ``found`` with a near-specular lobe; ``family``: `draws.family` of them."""
+def _near_specular(scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family) -> list:
+    """Those of the BSDFs ``found`` with a near-specular lobe, and its density.
+
+    ``family``: `draws.family` of them.
+    """
 
     def known(owner: mi.BSDF, name: str, find):
         key = bsdf.registry_id(owner), name, State.of([owner])
         return cached(scene, sensor, "near-specular lobes", key, find, most=_LOBES)[0]
 
-    sharp = {id(owner) for owner in near_specular(family, known)}
-    return list({id(owner): owner for owner in found if id(owner) in sharp}.values())
+    hit = {id(owner) for owner in found}
+    return [sharp for sharp in near_specular(family, known) if id(sharp[0]) in hit]
 
 
 def _prepare_bitmaps(family):

@@ -37,15 +37,20 @@ Cached = Callable[[Any, str, Callable[[], float]], float]
 Bound = Callable[..., float]
 
 
-def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> list[mi.BSDF]:
-    """The BSDFs of a `draws.family` with a near-specular lobe, of their own or of nested BSDFs."""
+def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> list[tuple[mi.BSDF, float]]:
+    """The BSDFs of a `draws.family` with a near-specular lobe, of their own or of nested BSDFs.
+
+    With the largest `density` of their lobes.
+    """
     family = list(family)
-    found = {id(bsdf) for bsdf, held in family if density(bsdf, held, cached) >= NARROW}
-    before = set()
+    found = {id(bsdf): density(bsdf, held, cached) for bsdf, held in family}
+    before = {}
     while found != before:  # from nested BSDFs to those around them
-        before = found
-        found = found | {id(b) for b, held in family if any(id(value) in found for value in held.values())}
-    return [bsdf for bsdf, _ in family if id(bsdf) in found]
+        before = dict(found)
+        for bsdf, held in family:
+            inner = (found.get(id(value), 0.0) for value in held.values())
+            found[id(bsdf)] = max(found[id(bsdf)], *inner, 0.0)
+    return [(bsdf, found[id(bsdf)]) for bsdf, _ in family if found[id(bsdf)] >= NARROW]
 
 
 def is_narrow(pdf_fwd_w, pdf_rev_w):
