@@ -141,7 +141,8 @@ class Settings:
         False,
         "true or false",
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
-        as the floor of a pool) by vertex merging with photons: consistent, not unbiased.""",
+        as the floor of a pool), also of nearly specular surfaces, by vertex merging with photons: consistent,
+        not unbiased.""",
     )
     guiding: str = _parameter(
         "auto",

@@ -694,10 +694,10 @@ def test_density_of_aimed_directions():
 
 
 def test_what_needs_no_merging():
-    """Expected: without delta surfaces no photon is traced, the render is unbiased, and `explain` says so."""
+    """Expected: without specular surfaces no photon is traced, the render unbiased, as `explain` says."""
     scene = mi.load_dict(under_glass(ball(), plate=matte()))
     method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
-    assert "skipped (impossible): merging: without delta surfaces" in method.explain(scene)
+    assert "skipped (impossible): merging: without specular surfaces" in method.explain(scene)
     mi.render(scene, integrator=method, spp=4)
     assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
 

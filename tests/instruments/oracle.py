@@ -180,7 +180,7 @@ def log_densities(paths: Paths) -> np.ndarray:
 
 
 def log_merges(paths: Paths, eta: np.ndarray, aimed: np.ndarray | None = None) -> np.ndarray:
-    """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1), on isolated paths; -inf at delta events.
+    """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1); -inf at delta events.
 
     Both subpaths make x_m, and the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons'
     subpaths times its area, ``aimed`` (n,) the density of photons' first direction in place of ``second``.
@@ -209,7 +209,11 @@ class Explicit:
             isolated = ~np.isfinite(self.size[:, 1 : paths.k + 1]).any(1)
             merges = np.where(isolated[:, None], log_merges(paths, eta, aimed), -np.inf)
             self.size = np.concatenate([self.size, merges], axis=1)
-        self.used = np.isfinite(self.size)
+        self._take(self.size)
+
+    def _take(self, size):
+        """Keep the logarithms of kappa p."""
+        self.size, self.used = size, np.isfinite(size)
         best = self.size.max(1, keepdims=True, initial=-1e300)
         self._ratio = np.where(self.used, np.exp(np.minimum(self.size - best, 0)), 0)
 
@@ -224,3 +228,36 @@ class Explicit:
             raise ValueError(heuristic)
         total = part.sum(1, keepdims=True)
         return part / np.where(total > 0, total, 1)
+
+
+def _combined(log_terms, heuristic: str):
+    """log of the sum of each row's terms, with the power heuristic of the root of the sum of squares."""
+    exponent = {"balance": 1, "power": 2}[heuristic]
+    best = log_terms.max(1, initial=-1e300)
+    with np.errstate(divide="ignore"):
+        return best + np.log(np.exp(exponent * (log_terms - best[:, None])).sum(1)) / exponent
+
+
+class Hard(Explicit):
+    """All strategies of ``paths``, with merges on hard paths, see `mis`.
+
+    S is the sum of kappa p of all strategies but merges, V that of the merges that have at least ``least``
+    (B) times the kappa p of the connection of either edge at their vertex; a path is ``hard`` if V >= B S.
+    ``log_s``, ``log_v``: logarithms of S and V; ``near``: mask, a comparison is closer than 0.1 %, so that
+    rounding may decide it.
+    """
+
+    def __init__(self, paths: Paths, coefficients: Coefficients, eta, least: float, heuristic: str):
+        super().__init__(paths, coefficients)
+        k, size = paths.k, self.size
+        with np.errstate(divide="ignore", invalid="ignore"):
+            merges, log_b = log_merges(paths, eta), np.log(least)
+            edges = np.maximum(size[:, 1:k], size[:, 2 : k + 1])  # before and after x_1 ... x_{k-1}
+            over = merges - (log_b + edges)
+            merges = np.where(over >= 0, merges, -np.inf)
+            self.log_s, self.log_v = _combined(size, heuristic), _combined(merges, heuristic)
+            total = self.log_v - (log_b + self.log_s)
+            self.near = (np.abs(over) < 1e-3).any(1) | (np.abs(total) < 1e-3)
+        self.hard = (total >= 0) & np.isfinite(merges).any(1)
+        merges = np.where(self.hard[:, None], merges, -np.inf)
+        self._take(np.concatenate([size, merges], axis=1))

@@ -70,10 +70,13 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
     )
 
 
-def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None, aimed=None) -> np.ndarray:
+def recursion(
+    paths: Paths, kappa: Coefficients, name: str, eta=None, aimed=None, hard: bool = False
+) -> np.ndarray:
     """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use.
 
-    With ``eta`` and ``aimed``, see `oracle.log_merges`, those of the k - 1 merges follow.
+    With ``eta`` and ``aimed``, see `oracle.log_merges`, those of the k - 1 merges follow; they sample SDS
+    paths, or ``hard`` paths.
     """
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
@@ -81,7 +84,8 @@ def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None, aimed=None
     if eta is not None:
         discs = [mi.Float(x) for x in eta.astype(np.float32).T]
         merges = discs, mi.Float((paths.second if aimed is None else aimed).astype(np.float32))
-    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), merges)
+    kind = HardRecursion if hard else Recursion
+    chain = kind(Columns.of(paths), kappa, mis.Heuristic(name), merges)
     weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
     if paths.k > 1:
         weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
@@ -157,10 +161,13 @@ class Recursion:
     In the order of calls of ``walk.py`` and ``techniques.py``.
     """
 
+    _no_newest = 0
+
     def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, merges=None):
         self.path, self.kappa, self.h = path, kappa, heuristic
         self.eta, self.aimed = (None, None) if merges is None else merges
         self._no_merges = 0 if merges is None else heuristic.zero()
+        self.aimed_over_own = 1.0 if merges is None else self.aimed / path.second
         self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))
         self.light, self._last = self._along_light(path.second)
         self.photons = None if merges is None else self._along_light(self.aimed)[0]
@@ -170,7 +177,7 @@ class Recursion:
 
     def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, i, isolated):
         is_delta = self.path.delta[i]
-        isolated &= is_delta | ~mis.is_connectible(partial, coefficient)
+        isolated = self._isolated(isolated, partial, coefficient, is_delta)
         merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), isolated)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
@@ -181,6 +188,9 @@ class Recursion:
         )
         return mis.scatter(self.h, partial, coefficient, step, merge), isolated
 
+    def _isolated(self, before, partial, coefficient, is_delta):
+        return before & (is_delta | ~mis.is_connectible(partial, coefficient))
+
     def _along_light(self, second):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
@@ -189,7 +199,7 @@ class Recursion:
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
-        partial = mis.Partial(h.start(inverse), start, self._no_merges)
+        partial = mis.Partial(h.start(inverse), start, self._no_merges, self._no_newest)
         isolated = mi.Bool(True)
         at_point = dr.select(x.position, x.direct * x.dist2[0], x.direct)
         complete = dr.select(x.area, x.direct * x.cos_light[0], at_point)
@@ -211,7 +221,7 @@ class Recursion:
         x, h, k = self.path, self.h, self.path.k
         from_lens = h.start(x.cos_camera[k - 1] / (x.lens_pdf * x.sensor_pdf))
         arrival = h.scale(from_lens, self.arrival)
-        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), arrival, self._no_merges)
+        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), arrival, self._no_merges, self._no_newest)
         isolated = mi.Bool(True)
         found = [None]
         for e in range(1, k + 1):
@@ -246,10 +256,25 @@ class Recursion:
         arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1], x.transmittance[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
-        if self.eta is not None:
-            merges = h.scale(h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf), self.aimed / x.second)
-            light_side = h.combine(light_side, dr.select(mis.is_connectible(arrived, newest), 0, merges))
-        return h.weight(kappa.arrival, light_side, mi.Float(0))
+        merges = h.scale(h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf), self.aimed_over_own)
+        light_side = h.combine(light_side, self._sds(arrived, newest, merges))
+        connection = h.scale(arrived.d_vcm, newest)
+        merges = h.scale(self._before_end(arrived, connection, x.sensor_pdf), x.lens_pdf)
+        return h.weigh(kappa.arrival, light_side, mi.Float(0), merges=merges)[0]
+
+    def _sds(self, partial, newest, merges):
+        """``merges`` where the last edge is not connectible."""
+        if self.eta is None:
+            return 0
+        return dr.select(mis.is_connectible(partial, newest), 0, merges)
+
+    def _before_end(self, partial, connection, pdf):
+        """Merges on hard paths at the vertices before the end of a subpath, an emitter or the sensor."""
+        return 0
+
+    def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
+        """Merges on hard paths at the vertices of a subpath that is connected at x_i."""
+        return 0
 
     def merge(self, m):
         """Both subpaths up to x_m (merging.merge)."""
@@ -265,14 +290,14 @@ class Recursion:
         connected = dr.select(x.area, x.direct * x.cos_light[0] / x.dist2[0], x.direct)
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
-        if self.eta is not None:
-            merges = h.scale(last.d_vm, x.first * self.aimed)
-            camera_side = h.combine(camera_side, dr.select(mis.is_connectible(last, newest), 0, merges))
-        return h.weight(1, mi.Float(0), camera_side)
+        merges = 0 if self.eta is None else h.scale(last.d_vm, x.first * self.aimed)
+        camera_side = h.combine(camera_side, self._sds(last, newest, merges))
+        merges = self._before_end(last, h.scale(last.d_vcm, newest), x.first * x.second)
+        return h.weigh(1, mi.Float(0), camera_side, merges=merges)[0]
 
-    def _joined(self, kappa, light_side, camera_side, edge):
+    def _joined(self, kappa, light_side, camera_side, edge, merges=0):
         """The weight of a strategy that joins this edge (visibility.seen)."""
-        return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge])[0]
+        return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge], merges)[0]
 
     def endpoints(self):
         """(1,1) (techniques.connect_endpoints)."""
@@ -290,8 +315,9 @@ class Recursion:
         light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
         density = x.ratio * x.cos_camera[0]
         of_camera = self._of_camera(k - 1)
-        camera_side = mis.alternatives(h, self.camera[k - 1], of_camera, x.to_camera[1], density)
-        return self._joined(1, light_side, camera_side, 0)
+        end = self.camera[k - 1], of_camera, x.to_camera[1], density
+        merges = self._of_side(*end, 1.0, 1)
+        return self._joined(1, light_side, mis.alternatives(h, *end), 0, merges)
 
     def inner(self, s):
         """s and t >= 2 (connections.inner)."""
@@ -299,14 +325,12 @@ class Recursion:
         if mis.is_absent(kappa.inner):
             return mi.Float(0)
         from_camera = x.to_light[s] * x.cos_light[s - 1] / x.dist2[s - 1]
-        light_side = mis.alternatives(
-            h, self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
-        )
         from_light = x.to_camera[s - 1] * x.cos_camera[s - 1] / x.dist2[s - 1]
-        camera_side = mis.alternatives(
-            h, self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
-        )
-        return self._joined(kappa.inner, light_side, camera_side, s - 1)
+        y = self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
+        z = self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
+        merges = h.combine(self._of_side(*y, kappa.inner, s - 1), self._of_side(*z, kappa.inner, s))
+        sides = mis.alternatives(h, *y), mis.alternatives(h, *z)
+        return self._joined(kappa.inner, *sides, s - 1, merges)
 
     def splat(self):
         """t = 1 (techniques.splat)."""
@@ -314,12 +338,38 @@ class Recursion:
         if mis.is_absent(kappa.splat):
             return mi.Float(0)
         from_camera = x.sensor_pdf * x.cos_light[k - 1] / x.dist2[k - 1]
-        light_side = mis.alternatives(
-            h, self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
-        )
+        y = self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
         to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
         camera_side = h.scale(h.start(to_sensor), self.arrival)
-        return self._joined(kappa.splat, light_side, camera_side, k - 1)
+        merges = self._of_side(*y, kappa.splat, k - 1)
+        return self._joined(kappa.splat, mis.alternatives(h, *y), camera_side, k - 1, merges)
+
+
+class HardRecursion(Recursion):
+    """The same with merges on hard paths, whose photons set out by the emitter's own density."""
+
+    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, merges):
+        self._no_newest = heuristic.zero()
+        super().__init__(path, kappa, heuristic, merges)
+
+    def _isolated(self, before, partial, coefficient, is_delta):
+        return None
+
+    def _sds(self, partial, newest, merges):
+        return 0
+
+    def _before_end(self, partial, connection, pdf):
+        return mis.older_merges(self.h, partial, connection, pdf)
+
+    def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
+        return mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, own, self.h.start(self.eta[i]))
+
+    def merge(self, m):
+        """Both subpaths up to x_m (merging.merge)."""
+        x, h, e = self.path, self.h, self.path.k - m
+        light = self.light[m], h.scale(self.light[m].d_vcm, self._of_light(m)), x.to_light[m]
+        camera = self.camera[e], h.scale(self.camera[e].d_vcm, self._of_camera(e)), x.to_camera[m]
+        return mis.weigh_merge(h, h.start(self.eta[m]), light, camera)
 
 
 def columns(values, n) -> np.ndarray:

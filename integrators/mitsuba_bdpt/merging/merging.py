@@ -77,17 +77,29 @@ class Merging(SdsStrategy):
     def merge(self, kernel, vertex, isolated) -> mis.Merge:
         return mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), isolated)
 
+    def longest(self, kernel: Kernel) -> mi.UInt32:
+        """Most edges of a merged path."""
+        return kernel.max_depth
+
+    def is_merged(self, kernel: Kernel, z: Vertex, walk) -> mi.Bool:
+        """Mask: the camera vertex ``z`` looks for photons."""
+        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+
+    def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
+        """The contribution of merges at the camera vertex ``z``."""
+        return merge(kernel, self, z, stream, wavelength_set)
+
     def visit(self, kernel, z, walk, stream, shared, add, state):
         total, counters = state
 
         def merged(z, total, lost, merges):
-            c = merge(kernel, self, z, stream, shared.wavelength_set)
+            c = self.merged(kernel, z, stream, shared.wavelength_set)
             return *add(c, total, lost), merges + one(c.active)
 
-        # A separate branch: few lanes are on an SDS path.
+        # A separate branch: few lanes are on such a path.
         total, lost, merges = dr.if_stmt(
             (z, total, counters.non_finite, counters.merges),
-            is_sds_vertex(kernel, kernel.kappa.splat, walk, z),
+            self.is_merged(kernel, z, walk),
             merged,
             lambda z, total, lost, merges: (total, lost, merges),
             label="merges",
@@ -117,12 +129,14 @@ def coefficient(samples: float, radius: float) -> float:
 class Photons:
     """The photons of a pass, ``found`` (a `Photon` of arrays), sorted by bucket.
 
-    ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last.
+    ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last;
+    ``exist``: there is one (opaque).
     """
 
     found: Photon
     cell: mi.UInt64
     starts: mi.UInt32
+    exist: mi.Bool
 
 
 def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
@@ -178,7 +192,7 @@ def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, waveleng
     Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
     """
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
-    chosen, total = _draw(merging, z, kernel.max_depth - z.edges, word, wavelength_set)
+    chosen, total = _draw(merging, z, merging.longest(kernel) - z.edges, word, wavelength_set)
     active = z.hit & (total > 0)
     photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)

@@ -17,12 +17,13 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import Kept
+from .hard_paths import HardMerging
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
 from .radius import Footprints, in_pass
 from .wavelength_sets import SETS, WavelengthSets
 
-# Camera samples of a pass per photon subpath.
-SAMPLES_PER_PHOTON = 8
+# Camera samples of a pass per photon subpath, and where hard paths are merged (experiments, "Hard paths").
+SAMPLES_PER_PHOTON, SAMPLES_PER_HARD_PHOTON = 8, 16
 
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
@@ -48,11 +49,18 @@ def check(sensor: mi.Sensor, media: bool):
 
 
 class Passes:
-    """Vertex merging in one render of ``pixels`` pixels; ``aim`` of the photons."""
+    """Vertex merging in one render of ``pixels`` pixels; ``aim`` of the photons.
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, aim: Aim, pixels: int):
+    ``hard``: hard paths are merged, not SDS paths alone.
+    """
+
+    def __init__(
+        self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, aim: Aim, pixels: int, hard: bool
+    ):
         self._footprints = Footprints.of(scene, sensor)
         self._radius, self._aim, self._pixels = settings.internals.merging_radius, aim, pixels
+        self._kind = HardMerging if hard else Merging
+        self._samples_per_photon = SAMPLES_PER_HARD_PHOTON if hard else SAMPLES_PER_PHOTON
 
     def trace(
         self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None
@@ -63,20 +71,23 @@ class Passes:
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
         radius = in_pass(self._radius, done)  # in pixels
-        count = photons_of_pass(samples * self._pixels, self._pixels, radius)
+        count = photons_of_pass(samples * self._pixels, self._pixels, radius, self._samples_per_photon)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done)
             count = max(count // sets, 1) * sets
-        kappa, met = (dr.opaque(mi.Float, x) for x in (coefficient(samples / sets, radius), count / sets))
-        merging = Merging(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
+        kappa = coefficient(samples / sets, radius)
+        if self._kind.hard:  # photons beyond those of the samples would make ordinary paths hard
+            kappa *= min(1.0, samples * self._pixels / (self._samples_per_photon * count))
+        kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
+        merging = self._kind(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
         return trace(kernel, merging, points, count)
 
 
-def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
-    """Number of photon subpaths of a pass with merging; ``radius`` in pixels."""
+def photons_of_pass(samples: int, pixels: int, radius: float, each: int = SAMPLES_PER_PHOTON) -> int:
+    """Number of photon subpaths of a pass, one for ``each`` so many samples; ``radius`` in pixels."""
     most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
-    return min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most)
+    return min(photon_pass.photons_of(samples, each), most)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
@@ -99,6 +110,7 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     starts = dr.cumsum(counts)
-    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
+    exist = dr.opaque(mi.Bool, count > 0)
+    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts, exist)
     dr.eval(result)
     return result

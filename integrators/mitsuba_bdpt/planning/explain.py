@@ -82,8 +82,9 @@ def explain(
     ]
     lines += [f"used: {name}" for name in used]
     if p.merging:
+        merged = "SDS and hard paths" if prepared.near_specular else "SDS paths"
         lines.append(
-            "used: vertex merging (photon mapping) of SDS paths (the render is consistent, not unbiased)"
+            f"used: vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)"
         )
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     longest = prepared.stored_vertices(settings)

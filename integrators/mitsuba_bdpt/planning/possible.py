@@ -43,14 +43,16 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     endpoints = skip("(1,1)", "impossible", why) if why else True
     why = _why_not_arrival(prepared, settings)
     arrival = skip("t=0", "impossible", why) if why else True
-    why = _why_not_merging(emitters, prepared.delta, bool(direct)) if settings.merging else ""
+    specular = prepared.delta or bool(prepared.near_specular)
+    why = _why_not_merging(emitters, specular, bool(direct), "specular") if settings.merging else ""
     merging = skip("merging", "impossible", why) if why else settings.merging
     why = _why_not_guided(prepared, settings, bool(hit), bool(direct))
     if why and settings.guiding == "always":
         skip("guided s=0", "impossible", why)
     guidable = not why
     if merging:  # a pilot may choose not to merge where s = 0 samples that light too
-        guidable = guidable and not (emitters.unhittable or emitters.beams)
+        unguidable = emitters.unhittable or emitters.beams or bool(prepared.near_specular)
+        guidable = guidable and not unguidable
     elif guidable and settings.guiding in ("emission", "never"):
         guidable = skip("guided s=0", "by hand", f"guiding={settings.guiding}")
     for name, why in emitters.left_out:
@@ -175,12 +177,12 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def _why_not_merging(emitters: Emitters, delta: bool, direct: bool) -> str:
-    """Why no vertex can be merged, or empty. ``delta``: a BSDF has a delta lobe."""
+def _why_not_merging(emitters: Emitters, some: bool, direct: bool, kind: str) -> str:
+    """Why no vertex can be merged, or empty. ``some``: there are BSDFs with lobes of this ``kind``."""
     if not emitters.traced:
         return _UNTRACED
-    if direct and not (delta or emitters.beams):
-        return "without delta surfaces next-event estimation connects all that light meets first"
+    if direct and not (some or emitters.beams):
+        return f"without {kind} surfaces next-event estimation connects all that light meets first"
     return ""
 
 
@@ -200,7 +202,7 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
         return f"max_depth={settings.max_depth} allows no such path"
     if prepared.emitters.contrast <= EVEN:
         return "s=0 finds a uniform environment by itself"
-    return _why_not_merging(prepared.emitters, prepared.delta, direct)
+    return _why_not_merging(prepared.emitters, prepared.delta, direct, "delta")
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:

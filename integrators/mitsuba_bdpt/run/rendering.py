@@ -91,11 +91,13 @@ class Render:
         dr.make_opaque(seed)
         self.points = PassPoints(settings, seed)
         aims = self.plan.merging or self.plan.guidable
-        self.aim = Aim.of(scene, self.prepared.emitters) if aims else None
+        near_specular = self.prepared.near_specular if self.plan.merging else ()
+        self.aim = Aim.of(scene, self.prepared.emitters, near_specular) if aims else None
         self.merging = None
         if self.plan.merging:
             pixels = int(self.prepared.camera.region.size.prod())
-            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels)
+            hard = bool(near_specular)
+            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels, hard)
         features = None
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)

@@ -25,7 +25,7 @@ from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .sketches import Sketch, guess
 from .visibility import ShadowRay, guessed, seen
-from .walk import Vertex, is_lit, newest_coefficient, where_lit
+from .walk import Vertex, hard_merges, is_lit, newest_coefficient, where_lit
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -50,22 +50,14 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     active &= ~spectra.is_zero(value)
 
     direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
-    light_side = mis.alternatives(
-        h,
-        y.partial,
-        newest_coefficient(kernel, direct, y.edges),
-        f_y.pdf_rev_w,
-        f_z.pdf_fwd_w * cos_y * inverse,
-    )
-    camera_side = mis.alternatives(
-        h,
-        z.partial,
-        newest_coefficient(kernel, kernel.kappa.splat, z.edges),
-        f_z.pdf_rev_w,
-        f_y.pdf_fwd_w * cos_z * inverse,
-    )
-    sides = kernel.kappa.inner, light_side, camera_side
-    weight, shares = h.weigh(*sides)
+    newest_y = newest_coefficient(kernel, direct, y.edges)
+    at_y = newest_y, f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
+    newest_z = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    at_z = newest_z, f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
+    light_side, camera_side = mis.alternatives(h, y.partial, *at_y), mis.alternatives(h, z.partial, *at_z)
+    sides, own = (kernel.kappa.inner, light_side, camera_side), kernel.kappa.inner
+    merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
+    weight, shares = h.weigh(*sides, merges=merges)
     return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
 
 

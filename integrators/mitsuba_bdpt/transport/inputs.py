@@ -114,6 +114,8 @@ class Kernel:
         self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
+        # Longest hard path: weights of merges do not tell s = 0 and s = 1, alone beyond, from the others.
+        self.last_merged = self.last_inner if plan.light else self.max_depth
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
@@ -132,6 +134,11 @@ class Kernel:
         other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
         other.observer = observer
         return other
+
+    @property
+    def merges_hard(self) -> bool:
+        """Whether hard paths are merged."""
+        return self.sds is not None and self.sds.hard
 
     def within_store(self, k: mi.UInt32) -> mi.Bool:
         """Mask: paths of ``k`` edges use all strategies; longer ones only s = 0 and s = 1."""

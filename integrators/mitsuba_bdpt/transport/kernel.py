@@ -230,7 +230,8 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
-    sds = kernel.sds if plan.arrival else None  # t = 0 samples SDS paths
+    # t = 0 samples SDS paths, other strategies hard ones too.
+    sds = kernel.sds if plan.arrival or kernel.merges_hard else None
     walk = subpaths.light_walk(kernel, e, stream, shared, sds)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)
     state = path, counted_by_light(plan, kernel.space)

@@ -97,7 +97,8 @@ class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory.
 
     ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
-    offset and curvature of anchors, whose rest is in ``si``; ``s``: light vertices up to and including each;
+    offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vn``, where hard
+    paths are merged; ``s``: light vertices up to and including each;
     ``count``: number of stored vertices; ``medium``: None in scenes without media.
     """
 
@@ -105,6 +106,7 @@ class LightPath:
     throughput_over_cos: list[dr.Local]
     d_vcm: dr.Local[mi.Float]
     d_vc: dr.Local[mi.Float] | dr.Local[mi.Vector4f]
+    merges: list[dr.Local]
     rounding: dr.Local[mi.Vector2f]
     s: dr.Local[mi.UInt32]
     count: mi.UInt32
@@ -121,6 +123,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
         d_vcm=dr.alloc_local(mi.Float, size),
         d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
+        merges=[dr.alloc_local(mi.Float, size) for _ in range(2 if kernel.merges_hard else 0)],
         rounding=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.
@@ -143,6 +146,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         local.write(entry, slot, keep)
     path.d_vcm.write(y.partial.d_vcm, slot, keep)
     path.d_vc.write(y.partial.d_vc, slot, keep)
+    for local, entry in zip(path.merges, (y.partial.d_vm, y.partial.d_vn), strict=False):
+        local.write(entry, slot, keep)
     path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
     path.s.write(y.edges + 1, slot, keep)
     if path.medium is not None:
@@ -176,7 +181,11 @@ def read_light_vertex(
         throughput_over_cos=polarization.of_stokes(
             [local.read(slot, active) for local in path.throughput_over_cos]
         ),
-        partial=mis.Partial(path.d_vcm.read(slot, active), path.d_vc.read(slot, active)),
+        partial=mis.Partial(
+            path.d_vcm.read(slot, active),
+            path.d_vc.read(slot, active),
+            *(local.read(slot, active) for local in path.merges),
+        ),
         edges=s - 1,
         medium=None if path.medium is None else path.medium.read(slot, active),
     )

@@ -9,9 +9,14 @@ the weight of any strategy follows:
 * ``d_vc``: all older alternatives. It is multiplied by that density and by the reverse density (solid angle)
   of the vertex before the last.
 
-With vertex merging of SDS paths (see `merging`) a third number, ``d_vm``, stands for merges at older
-vertices, and is used like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share
-one scale. ``d_vc`` does not contain eta: other paths keep their weights.
+With vertex merging (see `merging`) a third number, ``d_vm``, stands for merges at older vertices, and is used
+like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share one scale. ``d_vc``
+does not contain eta: paths that are not merged keep their weights. Merged are SDS paths (see `sds`), or, in
+scenes with nearly specular lobes, *hard* paths: with V the sum of kappa p of merges, and S that of all other
+strategies, a path is hard if V >= B S (`HARD`). A merge counts in V if it also has B times the kappa p of the
+connection of either edge at its vertex, since bounds from one side are then exact at that vertex; a fourth
+number, ``d_vn``, is the newest merge, whose later edge is not known yet. Both conditions depend on the path
+alone, so that all strategies agree on them.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
@@ -47,6 +52,10 @@ CLASSES = ("hit", "direct", "light", "inner")
 # reverse density of zero would be NaN.
 SATURATION = 1e37
 
+# B: a path is hard where merges are at least this many times as likely as all other strategies (experiments,
+# "Nearly specular light"). 0 merges all paths.
+HARD = 1.0
+
 
 @dataclass
 class Partial:
@@ -55,6 +64,7 @@ class Partial:
     d_vcm: mi.Float | mi.Vector4f | int
     d_vc: mi.Float | mi.Vector4f | int
     d_vm: mi.Float | mi.Vector4f | int = 0
+    d_vn: mi.Float | mi.Vector4f | int = 0
 
 
 @dataclass
@@ -62,11 +72,12 @@ class Merge:
     """A merge at a vertex, or another strategy that samples SDS paths there.
 
     ``ratio``: its partial sum, kappa times the number of photon subpaths times the area of the disc;
-    ``isolated``: no edge of the path up to the event there is connected by a strategy in use.
+    ``isolated``: no edge of the path up to the event there is connected by a strategy in use; None where hard
+    paths are merged.
     """
 
     ratio: mi.Float | mi.Vector4f
-    isolated: mi.Bool
+    isolated: mi.Bool | None
 
 
 def is_connectible(partial: Partial, coefficient: Coefficient):
@@ -130,13 +141,18 @@ class Heuristic:
         light_side: PartialSum,
         camera_side: PartialSum,
         tr: mi.Float | None = None,
+        merges: PartialSum = 0,
     ) -> tuple[mi.Float, mi.Vector4f | None]:
         """`weight`, and the shares of the classes (only `ByClass`, else None).
 
-        ``tr``: T~ of the connected edge, which the other strategies sample; None without media.
+        ``tr``: T~ of the connected edge, which the other strategies sample; None without media. ``merges``:
+        V, which counts on hard paths.
         """
         if tr is not None:
             light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
+        if not is_absent(merges):
+            others = self.combine(self.combine(light_side, camera_side), coefficient)
+            camera_side = self.combine(camera_side, dr.select(is_hard(merges, others), merges, 0))
         return self._weigh(coefficient, light_side, camera_side)
 
     def _weigh(
@@ -193,6 +209,7 @@ def to_area(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
         d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
         d_vm=heuristic.scale(partial.d_vm, dr.rcp(cos)),
+        d_vn=heuristic.scale(partial.d_vn, dr.rcp(cos)),
     )
 
 
@@ -219,15 +236,21 @@ def scatter(
             heuristic.scale(partial.d_vc, step.cos_out),
             heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
         )
+    d_vm = d_vn = 0
+    if merge is not None and merge.isolated is not None:
+        d_vm = _scattered_merges(heuristic, partial, step, merge)
+    elif merge is not None:
+        d_vm, d_vn = _scattered_hard(heuristic, partial, coefficient, step, merge)
     return Partial(
         d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,
-        d_vm=0 if merge is None else _scattered_merges(heuristic, partial, step, merge),
+        d_vm=d_vm,
+        d_vn=d_vn,
     )
 
 
 def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
-    """``d_vm`` after an event: earlier merges, and this vertex's unless delta."""
+    """``d_vm`` after an event on SDS paths: earlier merges, and this vertex's unless delta."""
     merges = heuristic.combine(
         heuristic.scale(partial.d_vm, step.pdf_rev_w),
         merge.ratio,
@@ -238,6 +261,57 @@ def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge:
         heuristic.scale(merges, step.cos_out / step.pdf_fwd_w),
     )
     return dr.select(merge.isolated, kept, 0)
+
+
+def is_hard(merges: PartialSum, others: PartialSum):
+    """Mask: a path with these sums V and S of ``merges`` and ``others``, in one scale, is hard."""
+    return merges >= HARD * others
+
+
+def exceeds(merge: PartialSum, connection: PartialSum):
+    """Mask: a ``merge`` counts beside the ``connection`` of an edge at its vertex, both in one scale."""
+    return merge >= HARD * connection
+
+
+def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev_w: mi.Float) -> PartialSum:
+    """Merges at vertices before the last, as `alternatives` without its ``pdf_a``.
+
+    ``connection``: ``d_vcm`` times its coefficient, of the edge to the last vertex.
+    """
+    newest = h.scale(partial.d_vn, pdf_rev_w)
+    older = h.scale(partial.d_vm, pdf_rev_w)
+    return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
+
+
+def _scattered_hard(h: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge):
+    """``d_vm`` and ``d_vn`` after an event where hard paths are merged.
+
+    Next to a delta event no edge is connected: the newest merge counts.
+    """
+    connection, ratio = h.scale(partial.d_vcm, coefficient), step.cos_out / step.pdf_fwd_w
+    older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), ratio)
+    newest = h.scale(dr.select(exceeds(merge.ratio, connection), merge.ratio, 0), ratio)
+    through = h.scale(h.combine(partial.d_vm, partial.d_vn), step.cos_out)
+    return dr.select(step.delta, through, older), dr.select(step.delta, 0, newest)
+
+
+def merges(
+    h: Heuristic,
+    partial: Partial,
+    coefficient: Coefficient,
+    pdf_rev_w: mi.Float,
+    pdf_a: mi.Float,
+    own: Coefficient,
+    ratio: mi.Float,
+) -> PartialSum:
+    """Merges at the vertices of a subpath whose last vertex is connected, as `alternatives`.
+
+    ``own``: coefficient of the strategy that connects it; ``ratio`` of a merge there, see `Merge`.
+    """
+    connection = h.scale(partial.d_vcm, coefficient)
+    there = h.scale(ratio, pdf_a)
+    there = dr.select(exceeds(ratio, connection) & exceeds(there, own), there, 0)
+    return h.combine(there, h.scale(older_merges(h, partial, connection, pdf_rev_w), pdf_a))
 
 
 def alternatives(
@@ -254,3 +328,22 @@ def alternatives(
         heuristic.scale(partial.d_vc, pdf_rev_w),
     )
     return heuristic.scale(total, pdf_a)
+
+
+def weigh_merge(h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple) -> mi.Float:
+    """Weight of a merge of this ``ratio`` (see `Merge`); 0 on paths that are not hard.
+
+    ``light`` and ``camera`` subpath: `Partial`, its ``d_vcm`` times the coefficient of the connection of the
+    last edge, ``pdf_rev_w`` of that edge.
+    """
+    connections, older = h.combine(light[1], camera[1]), 0
+    v = ratio
+    for partial, connection, pdf_rev_w in (light, camera):
+        older = h.combine(older, h.scale(partial.d_vc, pdf_rev_w))
+        v = h.combine(v, older_merges(h, partial, connection, pdf_rev_w))
+    possible = exceeds(ratio, light[1]) & exceeds(ratio, camera[1])
+    others = h.present(h.combine(connections, older))
+    possible &= is_hard(v, others)
+    # v contains the merge itself.
+    weight = ratio / h.combine(v, others)
+    return dr.select(possible, dr.square(weight) if h.name == "power" else weight, 0)

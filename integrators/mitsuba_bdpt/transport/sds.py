@@ -1,11 +1,12 @@
-"""Hooks of the strategies that sample SDS paths: vertex merging, and photon-guided BSDF sampling.
+"""Hooks of the strategies that sample SDS or hard paths: vertex merging, and photon-guided BSDF sampling.
 
 An edge is *connectible* if a strategy in use connects its ends: neither end is a delta event, and the
 strategy's class has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to
 the sensor, inner connections for the others). An *SDS path* (specular-diffuse-specular) has no connectible
 edge: emitter, glass, wall, glass, camera. Of the classes of `Plan` only s = 0 and t = 0 sample it. The kernel
 has at most one further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at
-fixed points.
+fixed points. In scenes with near-specular lobes it samples *hard* paths instead, see `mis`: connectible, but
+too rarely. Which these are is decided by densities, without a `State`.
 """
 
 from __future__ import annotations
@@ -48,11 +49,27 @@ class SdsStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None.
+    subpaths use, or None; ``hard``: it samples hard paths, and `weighed` and `may_merge` are defined.
     """
 
     counters: tuple[str, ...] = ()
     wavelengths = None
+    hard = False
+
+    def weighed(self, p: mi.Point3f) -> mi.Float:
+        """Partial sum of a merge at ``p``, see `mis.Merge`."""
+        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+
+    def may_merge(self, kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
+        """Mask: a hard path may be merged at ``vertex``, as far as its side knows.
+
+        ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+
+    def goes_on(self, state: State | None, partial: mis.Partial, p: mi.Point3f) -> mi.Bool:
+        """Mask: a photon subpath may have further photons; ``partial`` after the event at ``p``."""
+        return mi.Bool(True) if state is None or state.isolated is None else state.isolated
 
     def begin_light(self, kernel, walk):
         """The light subpath ``walk`` with its `State`, on its first edge."""
@@ -66,8 +83,8 @@ class SdsStrategy:
         """The guide at ``vertex``; ``walk`` as before its arrival, ``step`` from there."""
         return None
 
-    def merge(self, kernel, vertex, isolated: mi.Bool) -> mis.Merge:
-        """What samples an SDS path at ``vertex``; ``isolated``: `State.isolated` after its event."""
+    def merge(self, kernel, vertex, isolated: mi.Bool | None) -> mis.Merge:
+        """What samples a path at ``vertex``; ``isolated``: `State.isolated` after its event, or None."""
         raise NotImplementedError(f"{type(self).__name__} has no merge")
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
@@ -91,6 +108,6 @@ class SdsStrategy:
         return merges
 
 
-def begun(walk, state: State, d_vm: mis.PartialSum = 0):
-    """``walk`` with ``state``; ``d_vm``: its partial sum of merges, 0 if there are none."""
-    return replace(walk, sds=state, partial=replace(walk.partial, d_vm=d_vm))
+def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vn: mis.PartialSum = 0):
+    """``walk`` with ``state``; ``d_vm``, ``d_vn``: its partial sums of merges, 0 if there are none."""
+    return replace(walk, sds=state, partial=replace(walk.partial, d_vm=d_vm, d_vn=d_vn))

@@ -21,7 +21,15 @@ from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
 from .sds import SdsStrategy
 from .visibility import ShadowRay, seen
-from .walk import Vertex, Walk, is_lit, newest_coefficient, where_lit
+from .walk import (
+    Vertex,
+    Walk,
+    hard_merges,
+    hard_merges_before_end,
+    is_lit,
+    newest_coefficient,
+    where_lit,
+)
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
@@ -62,7 +70,9 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     if sds is not None:
         connectible = mis.is_connectible(z.partial, newest)
         sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
-    weight, shares = h.weigh(kernel.kappa.hit, *sides)
+    merges = hard_merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
+    merges = mis.choose(z.edges <= kernel.last_merged, merges, 0)
+    weight, shares = h.weigh(kernel.kappa.hit, *sides, merges=merges)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
     emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
@@ -102,16 +112,13 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
     older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    densities = f.pdf_rev_w, e.emission_ratio * z.cosine(e.d)
+    merges = hard_merges(kernel, z, newest, *densities, kernel.kappa.direct)
+    merges = mis.choose(k <= kernel.last_merged, merges, 0)
     newest = mis.choose(kernel.within_store(k), newest, 0)
-    camera_side = mis.alternatives(
-        h,
-        mis.Partial(z.partial.d_vcm, older),
-        newest,
-        f.pdf_rev_w,
-        e.emission_ratio * z.cosine(e.d),
-    )
+    camera_side = mis.alternatives(h, mis.Partial(z.partial.d_vcm, older), newest, *densities)
     sides = kernel.kappa.direct, light_side, camera_side
-    weight, shares = h.weigh(*sides)
+    weight, shares = h.weigh(*sides, merges=merges)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
@@ -197,12 +204,14 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
 
     direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
     newest = newest_coefficient(kernel, direct, y.edges)
-    light_side = mis.alternatives(h, y.partial, newest, f.pdf_rev_w, connection.pdf_w * to_area)
+    densities = f.pdf_rev_w, connection.pdf_w * to_area
+    light_side = mis.alternatives(h, y.partial, newest, *densities)
     camera_side = 0
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
-    weight, shares = h.weigh(*sides)
+    merges = hard_merges(kernel, y, newest, *densities, kernel.kappa.splat)
+    weight, shares = h.weigh(*sides, merges=merges)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", connection.position)
@@ -247,10 +256,12 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    if kernel.sds is not None and walk.sds is not None:  # the last edge is not connected either
+    hard = h.scale(hard_merges_before_end(kernel, partial, newest, z.pdf_w), z.pdf_a)
+    if kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
         merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
+        # The last edge is not connected either.
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))
-    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0)
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=hard)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~(asked & hidden(kernel, z.surroundings, asked))

@@ -278,6 +278,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         choose(hit, in_area.d_vcm, d_vcm),
         choose(hit, in_area.d_vc, partial.d_vc),
         choose(hit, in_area.d_vm, partial.d_vm),
+        choose(hit, in_area.d_vn, partial.d_vn),
     )
     return Vertex(
         si=si,
@@ -377,8 +378,8 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     # BSDFs take a non-finite shading frame (vertex normals) for a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    if side.isolated and sds is not None:
-        active &= sds.isolated
+    if side.isolated and side.sds is not None:
+        active &= side.sds.goes_on(sds, partial, si.p)
     if side.only_delta:
         active &= step.delta
     if side.only_specular:
@@ -425,6 +426,8 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
 
     ``coefficient``: that of the class that connects the edge to it.
     """
+    if side.sds is not None and side.sds.hard:
+        return walk.sds, side.sds.merge(kernel, vertex, None)
     if walk.sds is None:
         return None, None
     isolated, only_delta, guided = walk.sds.isolated, walk.sds.only_delta, walk.sds.guided
@@ -459,6 +462,34 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
         possible &= ~vertex.volume
     isolated = None if walk.sds is None else walk.sds.isolated
     return possible if isolated is None else possible & isolated
+
+
+def hard_merges(
+    kernel: Kernel, vertex, coefficient: mis.Coefficient, pdf_rev_w, pdf_a, own: mis.Coefficient
+) -> mis.PartialSum:
+    """Merges on hard paths at the vertices up to ``vertex``, which a strategy connects; see `mis.merges`.
+
+    The number 0 if hard paths are not merged.
+    """
+    sds = kernel.sds
+    if sds is None or not sds.hard:
+        return 0
+    ratio = kernel.heuristic.start(sds.weighed(vertex.si.p))
+    return mis.merges(kernel.heuristic, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
+
+
+def hard_merges_before_end(
+    kernel: Kernel, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
+) -> mis.PartialSum:
+    """The same before the end of a subpath, on an emitter or the sensor.
+
+    ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the connection of
+    the last edge, times the density of the end if ``pdf`` contains it.
+    """
+    if not kernel.merges_hard:
+        return 0
+    connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
+    return mis.older_merges(kernel.heuristic, partial, connection, pdf)
 
 
 def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:

@@ -73,6 +73,23 @@ class ConnectedPhoton(Photon):
         return (*Photon.types(), mi.Float, mi.Bool)
 
 
+@dataclass
+class HardPhoton(Photon):
+    """A photon of hard paths, see `mis`; ``older`` is its ``d_vc``.
+
+    ``connection`` as of a `ConnectedPhoton`; ``d_vm``, ``d_vn``: its partial sums of merges.
+    """
+
+    connection: mi.Float
+    d_vm: mi.Float
+    d_vn: mi.Float
+
+    @classmethod
+    def types(cls) -> tuple[Any, ...]:
+        """Types of the fields in the current variant, in order."""
+        return (*Photon.types(), mi.Float, mi.Float, mi.Float)
+
+
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):
     """Mask: points with geometric normals ``a`` and ``b`` count as on one surface."""
     return dr.dot(a, b) > SAME_SURFACE

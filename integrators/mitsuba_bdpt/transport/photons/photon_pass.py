@@ -9,13 +9,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ...sampling.points import Points, Purpose
-from .. import spectra, subpaths
+from .. import mis, spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..sds import SdsStrategy, State
 from ..walk import has_lobe, is_sds_vertex, newest_coefficient, random_walk
 from .aim import Aim
-from .photon import ConnectedPhoton, Photon
+from .photon import ConnectedPhoton, HardPhoton, Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
@@ -72,10 +72,11 @@ def trace(
 ) -> Traced:
     """Trace ``count`` photon subpaths; ``sds``: the strategy that merges them, None for a guide."""
     kernel = kernel.bound(points, 1.0, Observer())
-    kernel.sds, kernel.last_light = sds, kernel.max_depth
+    kernel.sds = sds
+    kernel.last_light = kernel.last_merged if kernel.merges_hard else kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        out = (ConnectedPhoton if kept is Kept.UNDERSAMPLED else Photon).zeros(capacity)
+        out = _kind(kernel, kept).zeros(capacity)
         traced = _traced(kernel, aim, count, kept, out)
         if traced.count <= capacity:
             return traced
@@ -100,7 +101,9 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     sds = kernel.sds if merges else None
-    start = replace(e, pdf_second=e.pdf_second * aimed) if undersampled else e
+    # These weights do not know of the aim, see `merging.hard_paths`.
+    unaimed = kernel.merges_hard or undersampled
+    start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
     if undersampled:
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
@@ -112,7 +115,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
 
     def visit(y, counters, walk):
         older, more = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm), ()
-        keep = has_lobe(kernel, y) if undersampled else is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+        if sds is not None and sds.hard:
+            older, connection = y.partial.d_vc, _connection(kernel, y)
+            more, keep = (connection, y.partial.d_vm, y.partial.d_vn), sds.may_merge(kernel, y, connection)
+        elif undersampled:
+            keep = has_lobe(kernel, y)
+        else:
+            keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         if kept is Kept.GUIDED:
@@ -120,9 +129,8 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         if kept is Kept.UNSAMPLED:
             older = dr.select(finite, mi.Float(0), dr.nan)
         if undersampled:
-            older, h = dr.select(finite, mi.Float(older), dr.nan), kernel.heuristic
-            newest = newest_coefficient(kernel, kernel.kappa.direct, y.edges)
-            more = h.present(h.scale(y.partial.d_vcm, newest)), walk.sds.only_delta & ~e.delta
+            older = dr.select(finite, mi.Float(older), dr.nan)
+            more = _connection(kernel, y), walk.sds.only_delta & ~e.delta
         distance = dr.norm(y.si.p - y.previous)
         fields = y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index
         found = type(out)(*fields, *more)
@@ -142,3 +150,16 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         dr.scatter(broken, mi.Bool(True), e.index, astray)
     dr.eval(number, out, counts, broken)
     return Traced(out, int(number[0]), counts, broken)
+
+
+def _kind(kernel: Kernel, kept: Kept) -> type[Photon]:
+    """The record of its photons."""
+    if kernel.merges_hard:
+        return HardPhoton
+    return ConnectedPhoton if kept is Kept.UNDERSAMPLED else Photon
+
+
+def _connection(kernel: Kernel, y) -> mis.PartialSum:
+    """`ConnectedPhoton.connection` at ``y``."""
+    h, newest = kernel.heuristic, newest_coefficient(kernel, kernel.kappa.direct, y.edges)
+    return h.present(h.scale(y.partial.d_vcm, newest))

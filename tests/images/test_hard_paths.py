@@ -1,0 +1,228 @@
+"""Merges on hard paths: near-specular lobes, between what is a delta lobe and what is none.
+
+The scenes are those of `test_merging` with a rough plate. Large lamps are found by s = 0 and by connections
+too: all strategies must give one mean. Photons in discs of a quarter of a pixel, whose blur is below noise.
+"""
+
+from functools import cache
+
+import internals
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+import welch as st
+from mitsuba_bdpt.merging import hard_paths, passes
+from mitsuba_bdpt.scene.prepared import PreparedScene
+from mitsuba_bdpt.transport import mis
+from sds_scenes import (
+    IOR,
+    SIZE,
+    ball,
+    bumpy,
+    images,
+    matte,
+    point,
+    strategy_images,
+    transform,
+    under_glass,
+)
+from snapshots import ROUNDING
+
+MERGED = {"merging": True, "merging_radius": 0.25}
+
+# By default merges would have little of the weight beside a large lamp, which others find.
+PHOTONS = passes.SAMPLES_PER_HARD_PHOTON
+
+
+@pytest.fixture(autouse=True)
+def many_photons(monkeypatch):
+    """One photon subpath for each sample: merges have 0.4 to 0.65 of the images, 0.14 to 0.45 with B = 0."""
+    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", 1)
+
+
+def rough(alpha):
+    return {"type": "roughdielectric", "alpha": alpha, "int_ior": IOR, "ext_ior": 1.0}
+
+
+def principled(roughness):
+    found = {"type": "principled", "spec_trans": 1.0, "roughness": roughness, "eta": IOR}
+    return found | {"base_color": {"type": "rgb", "value": 1.0}}
+
+
+def ramp():
+    """Glass whose alpha grows along the plate from .002 to .4, by a factor in each texel."""
+    row = np.geomspace(0.002, 0.4, 16, dtype=np.float32)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.tile(row, (2, 1))[..., None]), "raw": True}
+    return {"type": "roughdielectric", "alpha": texture, "int_ior": IOR, "ext_ior": 1.0}
+
+
+def steel(alpha):
+    """A mirror of rough metal beside the floor, in which the camera sees it."""
+    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
+
+
+def sheet():
+    """A plate of one side: rough light is scattered once."""
+    return {"type": "rectangle", "to_world": transform().translate([0, 0, 0.5]).scale(4)}
+
+
+CASES = {
+    "alpha .005": {"plate": rough(0.005)},
+    "alpha .03": {"plate": rough(0.03)},
+    "alpha .15": {"plate": rough(0.15)},
+    "ramp": {"plate": ramp},
+    "principled": {"plate": principled(0.1)},
+    "blend": {"plate": {"type": "blendbsdf", "weight": 0.4, "a": rough(0.01), "b": rough(0.3)}},
+    "bumpy": {"plate": bumpy},
+    "steel": {"plate": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}, "mirror": steel(0.02)},
+    "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
+    "lens": {"plate": rough(0.02), "kind": "thinlens"},
+}
+
+
+@cache
+def scene(case):
+    more = dict(CASES[case])
+    if callable(more["plate"]):
+        more["plate"] = more["plate"](rough(0.02)) if more["plate"] is bumpy else more["plate"]()
+    return mi.load_dict(under_glass(ball(), **more))
+
+
+@cache
+def without_merging(case):
+    """Tiles of the scene without merging."""
+    return st.tiles(images(scene(case), 256, 8, first=100, guiding="never"))
+
+
+def merged(case, seeds=8, spp=128, **parameters):
+    return st.tiles(images(scene(case), spp, seeds, **MERGED, **parameters))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_images_are_those_without_merging(case):
+    """Rationale: the gate, the weights and the bounds change which strategy finds a path, not how much light
+    it carries; across the gate (a ramp of alpha) nothing may jump. Expected: the same tiles by Welch's test.
+    """
+    st.assert_agree(st.compare_images(merged(case), without_merging(case)), at_least=12)
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"skip": "none"},
+        {"light_paths": 0},
+        {"connections": "none"},
+        {"heuristic": "power"},
+    ],
+    ids=str,
+)
+def test_any_choice_of_strategies_has_the_same_mean(parameters):
+    """Rationale: S is the sum of the strategies in use, so that another choice makes other paths hard.
+    Expected: the same tiles by Welch's test.
+    """
+    found = merged("alpha .03", **parameters)
+    st.assert_agree(st.compare_images(found, without_merging("alpha .03")), at_least=12)
+
+
+LIGHTS = {
+    "point": point(),
+    "spot": {
+        "type": "spot",
+        "intensity": 10.0,
+        "cutoff_angle": 40.0,
+        "to_world": transform().look_at(origin=[0.5, 0, 4.5], target=[0, 0, 0], up=[0, 1, 0]),
+    },
+    "sun": {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0},
+    "ball": ball(),
+    "sky": {"type": "constant", "radiance": 1.0},
+}
+
+
+@pytest.mark.parametrize("light", LIGHTS)
+@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
+def test_all_vertices_merged(light, kind, monkeypatch):
+    """Rationale: with B = 0 every path is hard, also by diffuse surfaces alone, and no bound leaves out a
+    photon: every strategy shares every path with merges, from each kind of emitter and to both kinds of
+    sensors. Expected: the tiles without merging, of a floor under rough glass of which connections find all.
+    """
+    described = under_glass(LIGHTS[light], plate=rough(0.35), kind=kind)
+    if kind == "thinlens":
+        described["sensor"] |= {"aperture_radius": 0.8}
+    described = mi.load_dict(described)
+    parameters = {"max_depth": 5, "skip": "none", "guiding": "never"}
+    b = images(described, 64, 8, first=100, **parameters)
+    monkeypatch.setattr(mis, "HARD", 0.0)
+    a = images(described, 64, 8, **MERGED, **parameters)
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+@pytest.mark.parametrize("variant", ["spectral", "mono", "mono_polarized"])
+def test_variants(variant):
+    """Expected: in each kind of variant the tiles without merging."""
+    mi.set_variant(variants.of(variant))
+    described = mi.load_dict(under_glass(ball(), plate=rough(0.03)))
+    a = images(described, 128, 8, **MERGED)
+    b = images(described, 256, 8, first=100, guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+def test_bounds_lose_little_light(monkeypatch):
+    """Rationale: photons and camera vertices are left out by bounds that hold for reverse densities of a
+    quarter of a diffuse surface's. A floor of glossy metal has smaller ones.
+
+    Expected: without these bounds, with the same seeds, the merged light of both floors is the same within
+    1 % (twice the standard error of what draws of other photons change).
+    """
+    for floor in (matte(), {"type": "roughconductor", "alpha": 0.3}):
+        described = mi.load_dict(under_glass(ball(), plate=rough(0.02), floor=floor))
+        found = []
+        for slack in (4.0, 1e30):
+            monkeypatch.setattr(hard_paths, "SLACK", slack)
+            _, layers = strategy_images(described, 32, 6, max_depth=6, merging_radius=1.0)
+            found.append(layers["weighted.merged"].mean((1, 2)))
+        assert abs((found[1] - found[0]).mean()) < 0.01 * found[1].mean()
+        assert found[1].mean() > 0
+
+
+@pytest.mark.parametrize("kind", ["roughdielectric", "principled"])
+def test_the_limit_of_small_roughness(kind, monkeypatch):
+    """Rationale: nothing but merging finds a point lamp through smooth glass. Expected: through glass of the
+    least roughness the tiles of ideal glass, but for those with the lamp's reflection, which rough glass
+    shows: the median ratio is 1 within 3 % (a few standard errors of a tile's mean are 1 %).
+    """
+    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    plate = rough(1e-4) if kind == "roughdielectric" else principled(0.0)
+    found = st.tiles(images(under_glass(point(), plate=plate), 256, 8, **MERGED)).mean(0)
+    expected = st.tiles(images(under_glass(point()), 256, 8, first=100, **MERGED)).mean(0)
+    assert np.median(found / expected) == pytest.approx(1, abs=0.03)
+
+
+def test_no_photon_far_from_what_is_sharp(monkeypatch):
+    """Rationale: scenes with one thing of rough glass somewhere must not pay for it. Expected: where it lies
+    behind a room of matte walls, and no light reaches it, no photon is kept and no vertex is merged.
+    """
+    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    described = mi.cornell_box() | {
+        "far": {"type": "sphere", "center": [0, 0, -8], "radius": 0.2, "bsdf": rough(0.01)}
+    }
+    described["sensor"]["film"] |= {"width": SIZE, "height": SIZE}
+    described = mi.load_dict(described)
+    method = internals.bdpt(max_depth=6, merging=True, skip="none")
+    mi.render(described, integrator=method, spp=16)
+    assert method.statistics["merging"] == {"photons": 0, "merges": 0}
+    a, b = (images(described, 16, 1, merging=m, skip="none") for m in (True, False))
+    np.testing.assert_allclose(a, b, **ROUNDING)
+
+
+@pytest.mark.parametrize("plate", [None, rough(0.5), matte()], ids=["ideal", "rough", "matte"])
+def test_other_scenes_merge_as_before(plate, monkeypatch):
+    """Expected: without a near-specular lobe no hard path is merged, and no subpath carries ``d_vn``."""
+    described = mi.load_dict(under_glass(ball(), plate=plate))
+    assert not PreparedScene(described, described.sensors()[0]).near_specular
+    monkeypatch.setattr(passes, "HardMerging", None)
+    found, older = [], mis.older_merges
+    monkeypatch.setattr(mis, "older_merges", lambda *arguments: found.append(0) or older(*arguments))
+    images(described, 4, 1, merging=True)
+    assert not found
