@@ -294,6 +294,18 @@ def test_merging_finds_it():
     assert render_of(slab({"type": "dielectric"}, ball=ball), merging=True)._lost() is None
 
 
+def test_a_timeout_bounds_the_samples(monkeypatch):
+    """Rationale: a render of a million samples that ends after a second has few. Expected: samples per pixel
+    are those of the passes so far, at their rate until the timeout, and at most those of the render."""
+    scene = slab(frosted(0.05))
+    timed, untimed = (render_of(scene, 10**6, **keys) for keys in ({"timeout": 30.0}, {}))
+    assert timed._samples() == untimed._samples() == 10**6
+    monkeypatch.setattr(type(timed.accumulator), "passes", (8,))
+    monkeypatch.setattr(timed.meter, "rate", lambda done: done / 4)
+    assert timed._samples() == 64 and untimed._samples() == 10**6
+    assert render_of(scene, 16, timeout=30.0)._samples() == 16
+
+
 def test_it_is_said_before_the_first_pass(monkeypatch):
     """Expected: one warning, by a pilot, whose mean has none of the light of which there are few samples; the
     share is within a fifth of that in a converged image (0.22 of 0.30)."""

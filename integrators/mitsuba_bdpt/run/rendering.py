@@ -391,8 +391,15 @@ class Render:
         return lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
 
     def _samples(self) -> int:
-        """Samples per pixel of the whole render, or of a snapshot."""
-        return max(self.spp, sum(self.passes))
+        """Samples per pixel of the whole render, or of a snapshot, as far as is known.
+
+        Under ``timeout`` those that the passes so far predict, rounded, as each number has its own estimate.
+        """
+        done, timeout = sum(self.passes), self.settings.timeout
+        if not done or not 0 <= timeout < math.inf:
+            return max(self.spp, done)
+        predicted = max(self.meter.rate(done) * timeout, done, 1)
+        return min(self.spp, 2 ** round(math.log2(predicted)))
 
 
 def raise_interrupt(error: BaseException):
