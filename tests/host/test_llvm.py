@@ -142,6 +142,27 @@ def test_wheel_is_found_where_its_list_of_files_is_missing(library, monkeypatch)
     assert llvm.wheel_libraries(wheel.parents[1]) == [wheel]
 
 
+@pytest.mark.parametrize(
+    "files, starts",
+    [(["axle.lck"], 1), (["axle.lck", "axle.done"], 0), ([], 0)],
+    ids=["pending", "done", "none"],
+)
+def test_a_wheel_installed_by_this_process_is_finished(monkeypatch, files, starts):
+    """Rationale: a notebook installs the wheel, whose links to libc++ are made when Python starts next;
+    Dr.Jit could not load libLLVM. Expected: a Python is started where these links are pending, only there.
+    """
+
+    class Distribution:
+        def read_text(self, name):
+            return "" if name in files else None
+
+    started = []
+    monkeypatch.setattr("importlib.metadata.distribution", lambda name: Distribution())
+    monkeypatch.setattr(subprocess, "run", lambda command, **_: started.append(command[0]))
+    llvm.finish_installation()
+    assert started == [sys.executable] * starts
+
+
 def test_no_wheel_no_libraries(monkeypatch, tmp_path):
     monkeypatch.setattr(llvm, "WHEEL", "surely-not-an-installed-distribution")
     assert llvm.wheel_libraries(tmp_path) == []

@@ -147,6 +147,7 @@ def prepare() -> Choice:
     """Choose a library and set ``DRJIT_LIBLLVM_PATH``, or check an imported Dr.Jit."""
     drjit = sys.modules.get("drjit")
     if drjit is None:
+        finish_installation()
         machine = Machine.here()
         choice = choose(machine)
         if choice.path or machine.wheel or machine.system:
@@ -157,6 +158,22 @@ def prepare() -> Choice:
     if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
         return Choice(None, "none", "the current variant runs on CUDA", None)
     return check_loaded(drjit.detail.llvm_version(), Machine.here())
+
+
+def finish_installation() -> None:
+    """Start a Python that finishes the installation of the wheel, where that is pending.
+
+    The wheel's links, without which its libLLVM finds no libc++, are made by wheel-axle when Python starts.
+    A process that has installed the wheel itself, such as a notebook's, started before.
+    """
+    try:
+        wheel = importlib.metadata.distribution(WHEEL)
+    except importlib.metadata.PackageNotFoundError:
+        return
+    pending = wheel.read_text("axle.lck") is not None and wheel.read_text("axle.done") is None
+    if pending and sys.executable:
+        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+            subprocess.run([sys.executable, "-c", ""], timeout=60)
 
 
 @contextlib.contextmanager
