@@ -90,25 +90,9 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
-    e, aimed = aim.emission(
-        kernel.emitters,
-        kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT),
-        kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
-        shared,
-    )
-    merges, finite, undersampled = kept is Kept.MERGED, mi.Bool(True), kept is Kept.UNDERSAMPLED
-    if kept.estimates:  # traced, to see where their light arrives
-        finite = spectra.is_finite(e.weight)
-        e = replace(e, weight=dr.select(finite, e.weight, 1))
+    merges, undersampled = kept is Kept.MERGED, kept is Kept.UNDERSAMPLED
     sds = kernel.sds if merges else None
-    # These weights do not know of the aim, see `merging.hard_paths`.
-    unaimed = kernel.merges_hard or undersampled
-    start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
-    walk = subpaths.light_walk(kernel, start, stream, shared, sds)
-    if undersampled:
-        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
-    elif kept.estimates:  # s = 0 samples the others
-        walk = replace(walk, active=walk.active & e.delta)
+    e, aimed, finite, walk = _begun(kernel, aim, kept, sds, stream, shared)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
     side = replace(side, connect=None, isolated=merges, only_delta=not merges and not undersampled)
     side = replace(side, only_specular=undersampled)
@@ -150,6 +134,29 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         dr.scatter(broken, mi.Bool(True), e.index, astray)
     dr.eval(number, out, counts, broken)
     return Traced(out, int(number[0]), counts, broken)
+
+
+def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream, shared):
+    """Emissions of photons, `Photon.aim`, a mask of finite emissions, and subpaths on their first edges."""
+    e, aimed = aim.emission(
+        kernel.emitters,
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT),
+        kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION),
+        shared,
+    )
+    finite = mi.Bool(True)
+    if kept.estimates:  # traced, to see where their light arrives
+        finite = spectra.is_finite(e.weight)
+        e = replace(e, weight=dr.select(finite, e.weight, 1))
+    # These weights do not know of the aim, see `merging.hard_paths`.
+    unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED
+    start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
+    walk = subpaths.light_walk(kernel, start, stream, shared, sds)
+    if kept is Kept.UNDERSAMPLED:
+        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
+    elif kept.estimates:  # s = 0 samples the others
+        walk = replace(walk, active=walk.active & e.delta)
+    return e, aimed, finite, walk
 
 
 def _kind(kernel: Kernel, kept: Kept) -> type[Photon]:
