@@ -195,6 +195,31 @@ def test_in_other_variants(variant):
         mi.set_variant(before)
 
 
+def test_objects_that_have_no_part_in_it_are_not_named():
+    """Expected: the slab alone, not a polished ball that is out of view, and by the BSDF's id where the slab
+    has none."""
+    ball = {
+        "type": "sphere",
+        "center": [0, 0, -9],
+        "radius": 0.5,
+        "bsdf": {"type": "roughconductor", "alpha": 0.01},
+    }
+    assert "off 'slab', whose" in said(slab(frosted(0.01), ball=ball))
+    lost = lost_in(
+        slab(
+            frosted(0.01) | {"id": "satin"},
+            ball=ball,
+            slab={
+                "type": "cube",
+                "id": "",
+                "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05]),
+                "bsdf": frosted(0.01) | {"id": "satin"},
+            },
+        )
+    )
+    assert lost.sharp == ("satin",)
+
+
 def test_explain_has_the_warning():
     """Expected: with the pilot of a render, as a sentence of its text."""
     text = bdpt().explain(slab(frosted(0.01), size=64), spp=64)

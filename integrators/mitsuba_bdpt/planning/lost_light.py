@@ -71,7 +71,7 @@ class LostLight:
     ``through``: ids of the shapes through which most of it is seen, the brightest first. In scenes with
     near-specular lobes ``never``: share of it of which no sample is expected; ``absent``: share of it of
     which a render has outliers at most; ``few``: light of which more samples are expected, but few, over it;
-    ``sharp``: ids of the objects with such lobes, those of ``through`` first.
+    ``sharp``: ids of the objects with such lobes through which it is seen; of all if it is seen through none.
     """
 
     colours: dict[int, np.ndarray]
@@ -143,7 +143,7 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         undersampled = is_undersampling_possible(prepared, settings)
         kernel = (counting_kernel if undersampled else delta_kernel)(prepared, plan, settings)
-        aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular)
+        aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if undersampled else ())
         drawn = points("sobol"), points("independent")
         of = max(samples, PREVIEW) if undersampled else None
         found = components.merging.estimate(kernel, batch, SUBPATHS, *drawn, aim, of)
@@ -158,15 +158,17 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
         _warn_of_not_finite(prepared, np.flatnonzero(~finite))
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
-    through = _ids(np.array(found.through), np.array(found.size))
+    shapes = _brightest(np.array(found.through), np.array(found.size))
+    # Shapes without an id, and merged shapes, have none or one made up by Mitsuba.
+    through = tuple(s.id() for s in shapes if s.id() and not s.id().startswith("_unnamed_"))
     if found.kinds is None or not colours:
         return LostLight(colours, through)
     never, absent, rare, few = np.array(found.kinds)
     size = max(never + absent + rare, np.finfo(np.float32).tiny)
-    sharp = names(all_shapes(prepared.scene), prepared.near_specular)
-    sharp = tuple(sorted(sharp, key=lambda name: name not in through)[:NAMED])
+    sharp = names(shapes, prepared.near_specular)
+    sharp = sharp or names(all_shapes(prepared.scene), prepared.near_specular)[:NAMED]
     parts = (float(part / size) for part in (never, never + absent, few))
-    return LostLight(colours, through, *parts, sharp)
+    return LostLight(colours, through, *parts, tuple(sharp))
 
 
 def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
@@ -191,13 +193,11 @@ def points(kind: str) -> Points:
     return Points(kind, dr.opaque(mi.UInt32, SEED))
 
 
-def _ids(shapes: np.ndarray, found: np.ndarray) -> tuple[str, ...]:
-    """Ids of at most `NAMED` ``shapes`` through which most of ``found`` is seen."""
+def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
+    """At most `NAMED` of the ``shapes``, by index, through which most of ``found`` is seen."""
     amounts = np.bincount(shapes, np.where(np.isfinite(found), found, 0))
     order = [i for i in np.argsort(-amounts) if i and amounts[i] > WORTH_A_WORD * amounts.sum()]
-    names = [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0].id() for i in order[:NAMED]]
-    # Shapes without an id, and merged shapes, have none or one made up by Mitsuba.
-    return tuple(name for name in names if name and not name.startswith("_unnamed_"))
+    return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0] for i in order[:NAMED]]
 
 
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
