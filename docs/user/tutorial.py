@@ -5,8 +5,8 @@
 #
 # * in Jupyter: put the wheel of `make package` into the notebook's folder; `pip install jupyterlab`, `jupyter lab tutorial.ipynb`.
 # * in Colab: [open it there](https://colab.research.google.com/github/mitsuba-bdpt/mitsuba-bdpt/blob/main/docs/user/tutorial.ipynb),
-#   upload the wheel (*Files*, on the left), and run the cells from the top, on any type of runtime. (Tried in an
-#   environment as Colab's, not in Colab itself.)
+#   upload the wheel (*Files*, on the left), and run the cells from the top, on any type of runtime. (Tried with a kernel
+#   in a fresh environment, not in Colab itself.)
 #
 # The first cell installs the wheel; without one it installs from the repository, since the package is not on the index yet.
 
