@@ -297,6 +297,7 @@ def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, ca
         "sweep": ["x"],
         "report": ["x"],
         "page": ["x"],
+        "figure": ["x"],
         "reference": ["x"],
         "compare": ["bdpt", "path", "--scenes", "x"],
         "equal-time": ["x"],

@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.measure import pyramid
+from mitsuba_bdpt.measure import figures, pyramid
 from mitsuba_bdpt.measure.project import Project
 from repository import PROJECT
 
@@ -73,8 +73,8 @@ def test_what_cannot_be_drawn_leaves_no_file(tmp_path, monkeypatch, capsys, dark
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != file]
 
 
-def test_panels_are_those_that_contribute():
-    """Expected: neither single edges nor strategies whose layer is black, in the order of path lengths."""
+def test_panels_have_all_strategies():
+    """Expected: no single edges; of longer paths all strategies, None for those whose layer is black."""
     names = [f"weighted.s{s}t{k + 1 - s}.{c}" for k in (1, 2, 3) for s in range(k + 2) for c in "RGB"]
     image = np.zeros((2, 2, 3 + len(names)))
     for name in ("weighted.s0t2.R", "weighted.s1t2.G"):
@@ -82,7 +82,29 @@ def test_panels_are_those_that_contribute():
     image[0, 0, 3 + names.index("weighted.s2t2.B")] = 1
     images = pyramid.technique_images(image, names, "weighted")
     assert images[2, 1, 2].shape == (2, 2, 3) and len(images) == 12
-    assert list(pyramid.panels(images)) == [(2, 1, 2), (3, 2, 2)]
+    found = pyramid.panels(images)
+    assert len(found) == 9 and {key for key, one in found.items() if one is not None} == {
+        (2, 1, 2),
+        (3, 2, 2),
+    }
+
+
+def test_strategies_stand_where_they_belong(tmp_path):
+    """Rationale: strategies without light were dropped and the rest of their row moved to its middle.
+    Expected: of k = 2 and 3 edges alone (2, 1, 2) and (3, 3, 1) bring light; their panels, dark, lie at s = 1
+    of four and s = 3 of five places; the other places are empty, and k = 4, without light, has no row."""
+    white = np.ones((16, 16, 3))
+    keys = [(k, s, k + 1 - s) for k in (2, 3, 4) for s in range(k + 2)]
+    found = {key: 0.0 * white + 0.02 if key in ((2, 1, 2), (3, 3, 1)) else None for key in keys}
+    pyramid.draw(found, tmp_path / "a.png", 0.0)
+    picture = matplotlib.image.imread(tmp_path / "a.png")[..., :3]
+    height, width = picture.shape[:2]
+    panel = (width - 0.5 * figures.DPI) / 5
+    for row, (k, lit) in enumerate(((2, 1), (3, 3))):
+        y = int((row + 0.6) * height / 2)
+        for s in range(k + 2):
+            x = int(0.5 * figures.DPI + panel * (s + (3 - k) / 2 + 0.5))
+            assert (picture[y, x].max() < 0.9) == (s == lit), (k, s)
 
 
 def test_scenes_by_name_or_file(tmp_path):

@@ -104,6 +104,12 @@ COMMANDS: dict[str, tuple] = {
         _FOLDER,
         ("--readme", {"type": Path, "help": "a Markdown file whose parts are filled"}),
     ),
+    "figure": (
+        "a figure of a sweep for a paper, as PDF, SVG or PNG",
+        "figures",
+        options.Figure,
+        _FOLDER,
+    ),
     "page": (
         "a sweep as one HTML file, with images to compare",
         "page",

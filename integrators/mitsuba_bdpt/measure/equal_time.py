@@ -19,9 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from ..files.images import check_output, read_layers
+from ..files.images import read_layers
 from ..files.loading import choose_sensor
-from ..files.whole import replacing
+from .figures import check_figure, save
 from .making import Job, obtained
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from .options import RESOLUTION, VARIANT, EqualTime
@@ -144,9 +144,7 @@ def draw(found: list[Shot], target: np.ndarray, title: str, file: Path) -> None:
     for axis in axes.flat:
         axis.set_axis_off()
     figure.suptitle(title, fontsize=11)
-    with replacing(file) as temporary:
-        figure.savefig(temporary, dpi=100, format="png", metadata={"Software": None})
-    plt.close(figure)
+    save(figure, file)
 
 
 def pictured(
@@ -155,7 +153,7 @@ def pictured(
     """Draw a scene rendered by these integrators; returns the file and the renders."""
     file = project.scene(scene)
     output = options.output or project.renders / f"equal_time_{file.name}.png"
-    check_output(output, ".png")
+    check_figure(output)
     loaded, target, depth = subject(project, file, options)
     ways = dict(integrators) or {kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")}
     found = shots(loaded, target, ways, depth, options.spp)

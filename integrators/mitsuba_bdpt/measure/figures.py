@@ -1,9 +1,14 @@
-"""Plots of a sweep, readable in print: each integrator has its marker and dash."""
+"""Figures of a sweep, for print: PDF, SVG or PNG by the file's ending, one or two columns wide.
+
+Text has 7 points at the width of a column of a journal, 8.5 cm, or of its page, 17.8 cm. An integrator has
+its colour and marker everywhere; raw errors are solid, trimmed ones dashed; a hollow marker is a bound.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from argparse import Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib
@@ -11,8 +16,12 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ..errors import CommandError
+from ..files.images import check_output
+from ..files.whole import replacing
 from .analysis import (
     ALONE,
     INDEPENDENT,
@@ -24,25 +33,31 @@ from .analysis import (
     UNAIMED,
     Refused,
     Results,
-    select,
 )
+from .estimates import Bound, seed_errors
+from .options import FIGURE_FORMATS
+from .project import Project
+from .record import Error
+from .results import load
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
-    "bdpt": ("#0072B2", "o", "-"),
-    NONE: ("#56B4E9", "v", "--"),
-    INDEPENDENT: ("#009E73", "^", ":"),
-    ALONE: ("#F0E442", "P", "-."),
-    UNAIMED: ("#999999", "X", "--"),
-    MERGING: ("#009E73", "D", "-"),
-    RIVALS[0]: ("#D55E00", "s", "-"),
-    RIVALS[1]: ("#E69F00", "D", "--"),
+    "bdpt": ("#0072B2", "o"),
+    NONE: ("#56B4E9", "v"),
+    INDEPENDENT: ("#009E73", "^"),
+    ALONE: ("#F0E442", "P"),
+    UNAIMED: ("#999999", "X"),
+    MERGING: ("#009E73", "D"),
+    RIVALS[0]: ("#D55E00", "s"),
+    RIVALS[1]: ("#E69F00", "D"),
     # Only in scenes with media.
-    MEDIA_RIVALS[0]: ("#D55E00", "s", "-"),
-    MEDIA_RIVALS[1]: ("#E69F00", "D", "--"),
-    LIGHT_TRACER: ("#CC79A7", "x", ":"),
+    MEDIA_RIVALS[0]: ("#D55E00", "s"),
+    MEDIA_RIVALS[1]: ("#E69F00", "D"),
+    LIGHT_TRACER: ("#CC79A7", "x"),
 }
-PLAIN = ("#000000", ".", "-")
+PLAIN = (("#000000", "."), ("#882255", "h"), ("#117733", "<"), ("#332288", ">"))
+"""Of other integrators, in turn."""
+
 RAYS = {
     "camera": ("camera", "#0072B2", ""),
     "light": ("light", "#E69F00", "//"),
@@ -50,154 +65,223 @@ RAYS = {
     "shadow_t1": ("visibility, t = 1", "#D55E00", "xx"),
     "shadow_inner": ("visibility, s ≥ 2, t ≥ 2", "#CC79A7", "\\\\"),
 }
-ERRORS = {"rel_mse_trimmed": ("trimmed", "#0072B2", "o"), "rel_mse": ("raw", "#D55E00", "s")}
-COLUMNS = 4
-WIDEST = 100.0
+
+WIDTHS = {1: 8.5 / 2.54, 2: 17.8 / 2.54}
+"""Inches, by columns of a page."""
+
+PANELS = {1: 2, 2: 4}
+"""Scenes side by side, at most."""
+
+DPI = 200  # of PNG
+PAPER = {
+    "font.size": 7,
+    "axes.titlesize": 7,
+    "axes.labelsize": 7,
+    "xtick.labelsize": 6,
+    "ytick.labelsize": 6,
+    "legend.fontsize": 6.5,
+    "legend.frameon": False,
+    "axes.linewidth": 0.5,
+    "grid.linewidth": 0.3,
+    "lines.linewidth": 1.0,
+    "lines.markersize": 3.2,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "mitsuba-bdpt",
+}
+DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
+KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
+AXES = {"seconds": "seconds", "spp": "samples per pixel"}
+BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
 
 
-def style(method: str) -> dict:
-    """Return colour, marker and dash of an integrator."""
-    colour, marker, dash = STYLES.get(method, PLAIN)
-    return {"color": colour, "marker": marker, "linestyle": dash, "markersize": 4, "linewidth": 1.2}
+def style(methods: Sequence[str], method: str) -> dict:
+    """Return colour and marker of one of the ``methods``."""
+    others = [name for name in methods if name not in STYLES]
+    colour, marker = STYLES[method] if method in STYLES else PLAIN[others.index(method) % len(PLAIN)]
+    return {"color": colour, "marker": marker}
 
 
-def convergence(results: Results, against: str, path: Path):
-    """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene.
+def convergence(
+    results: Results, against: str, path: Path, columns: int = 2, scenes: Sequence[str] | None = None
+) -> None:
+    """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene, raw and trimmed.
 
-    Means over seeds with 95 % intervals; hollow where the figure is a bound; the dotted line has slope -1.
+    Medians over seeds, with the quartiles of the raw error; the dotted line has slope -1.
     """
-    rows = math.ceil(len(results.scenes) / COLUMNS)
-    figure, axes = plt.subplots(rows, COLUMNS, figsize=(11, 2.5 * rows), squeeze=False)
-    for scene, axis in zip(results.scenes, axes.flat, strict=False):
-        for method in results.methods:
-            _curve(axis, results, scene, method, against)
-        _ideal(axis, results, scene, against)
-        axis.set(xscale="log", yscale="log")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.yaxis.set_minor_formatter(NullFormatter())
-        axis.set_title(scene, fontsize=9)
-        axis.tick_params(labelsize=7)
-    for axis in axes.flat[len(results.scenes) :]:
-        axis.set_axis_off()
-    handles = {label: h for a in axes.flat for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
-    figure.supxlabel({"seconds": "seconds", "spp": "samples per pixel"}[against], fontsize=10)
-    figure.supylabel("relMSE, raw", fontsize=10)
-    figure.tight_layout()
-    figure.legend(
-        handles.values(),
-        handles.keys(),
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0),
-        ncols=4,
-        fontsize=9,
-        frameon=False,
-    )
-    _save(figure, path)
+    scenes = scenes or results.scenes
+    across = min(PANELS[columns], len(scenes)) if len(scenes) > PANELS[1] or columns == 2 else 1
+    rows = math.ceil(len(scenes) / across)
+    width = WIDTHS[columns] if across > 1 or columns == 1 else WIDTHS[1]
+    high = max(0.82 * width / across, 1.5)
+    with plt.rc_context(PAPER):
+        figure, axes = plt.subplots(
+            rows, across, figsize=(width, high * rows), squeeze=False, layout="constrained"
+        )
+        for scene, axis in zip(scenes, axes.flat, strict=False):
+            _curves(axis, results, scene, against)
+        for axis in axes.flat[len(scenes) :]:
+            axis.set_axis_off()
+        for i, axis in enumerate(axes.flat[: len(scenes)]):
+            if i + across >= len(scenes):
+                axis.set_xlabel(AXES[against])
+            if i % across == 0:
+                axis.set_ylabel("relMSE")
+        shown = [name for name in results.methods if any(results.of(scene, name) for scene in scenes)]
+        handles = [Line2D([], [], label=name, **style(results.methods, name)) for name in shown]
+        handles += [
+            Line2D([], [], color="black", linestyle=DASHES[kind], label=text) for kind, text in KINDS.items()
+        ]
+        handles.append(Line2D([], [], color="black", linestyle=(0, (1, 2)), linewidth=0.8, label="slope −1"))
+        _legend(figure, handles, columns)
+        save(figure, path)
 
 
-def _curve(axis, results, scene, method, against):
-    points = []
+def _legend(figure, handles: Sequence, columns: int) -> None:
+    """Put a legend under the axes, and make the figure higher by it."""
+    longest = max(len(handle.get_label()) for handle in handles)
+    across = max(1, min(len(handles), int(WIDTHS[columns] / (0.4 + 0.055 * longest))))
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + 0.15 * math.ceil(len(handles) / across) + 0.1)
+    figure.legend(handles=handles, loc="outside lower center", ncols=across)
+
+
+def _curves(axis, results: Results, scene: str, against: str) -> None:
+    """Plot all integrators in a scene."""
+    first = None
+    for method in results.methods:
+        for error in KINDS:
+            points, bounds = _points(results, scene, method, against, error)
+            if not len(points):
+                continue
+            look = style(results.methods, method) | {"linestyle": DASHES[error]}
+            x, low, middle, high = points.T
+            axis.plot(x, middle, **look | ({} if error == "rel_mse" else {"marker": ""}))
+            if error == "rel_mse":
+                axis.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
+                hollow = np.array([bool(bound) for bound in bounds])
+                axis.plot(x[hollow], middle[hollow], **look | {"linestyle": "", "markerfacecolor": "white"})
+            first = points if first is None else first
+    axis.set(xscale="log", yscale="log", title=scene)
+    for side in (axis.xaxis, axis.yaxis):
+        side.set_minor_formatter(NullFormatter())
+        side.set_major_locator(LogLocator(numticks=6))
+    if first is not None and len(first) > 1:
+        (x0, _, y0, _), (x1, _, _, _) = first[0], first[-1]
+        axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8, zorder=1)
+
+
+def _points(
+    results: Results, scene: str, method: str, against: str, error: Error
+) -> tuple[np.ndarray, list[Bound]]:
+    """Return an integrator's points (n, 4), abscissa and quantiles of positive errors, and their bounds."""
+    points: list[list[float]] = []
+    bounds: list[Bound] = []
     for budget in sorted({row["budget"] for row in results.of(scene, method)}):
-        found = results.error(scene, method, "rel_mse", budget)
-        if found.total.value > 0:
-            x = np.median([row[against] for row in results.of(scene, method, budget)])
-            points.append(
-                [x, found.total.low, found.total.value, min(found.total.high, WIDEST * found.total.value)]
-            )
-            if found.bound:
-                axis.plot(*points[-1][:3:2], **style(method) | {"markerfacecolor": "white", "zorder": 3})
-    if points:
-        x, low, middle, high = np.array(points).T
-        axis.plot(x, middle, label=method, **style(method))
-        axis.fill_between(x, low, high, color=style(method)["color"], alpha=0.15, linewidth=0)
+        rows = results.of(scene, method, budget)
+        errors, bound = seed_errors(rows, error, results.differs(scene, method, budget))
+        low, middle, high = np.quantile(errors, BAND)
+        if low > 0:
+            points.append([float(np.median([row[against] for row in rows])), low, middle, high])
+            bounds.append(bound)
+    order = np.argsort([point[0] for point in points])
+    return np.array(points)[order] if points else np.empty((0, 4)), [bounds[i] for i in order]
 
 
-def _ideal(axis, results, scene, against):
-    """Draw a line of slope -1 through the first integrator's first error."""
-    rows = results.of(scene, results.methods[0])
-    budgets = sorted({row["budget"] for row in rows})
-    if not budgets:
-        return
-    y0 = results.error(scene, results.methods[0], "rel_mse", budgets[0]).total.value
-    x0, x1 = (np.median([row[against] for row in select(rows, budget=b)]) for b in (budgets[0], budgets[-1]))
-    if y0 > 0:
-        axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8)
-        axis.text(x1, y0 * x0 / x1, " −1", fontsize=7, va="center")
+def efficiencies(
+    results: Results,
+    rivals: Sequence[str],
+    path: Path,
+    columns: int = 2,
+    scenes: Sequence[str] | None = None,
+) -> None:
+    """Plot efficiencies per scene, the first integrator's over each of the ``rivals``.
 
-
-def efficiencies(results: Results, rivals: Sequence[str], path: Path):
-    """Plot the ratio of efficiencies per scene, median and range, trimmed and raw.
-
-    Hollow where a figure is a bound.
+    Median with its 95 % interval; trimmed filled, raw hollow; arrows where a ratio is a bound.
     """
-    figure, axes = plt.subplots(1, len(rivals), figsize=(11, 0.28 * len(results.scenes) + 1.2), sharey=True)
-    for rival, axis in zip(rivals, np.atleast_1d(axes), strict=True):
-        for place, scene in enumerate(results.scenes):
-            _ratios(axis, results, scene, rival, place)
-        axis.axvline(1, color="black", linewidth=0.8)
-        axis.set(xscale="log", title=f"efficiency over {rival}, {results.deciding} spp")
-        axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}x"))
+    scenes = scenes or results.scenes
+    with plt.rc_context(PAPER):
+        most = max(len(_present(results, scene, rivals)) for scene in scenes)
+        pitch = 0.08 * max(most, 1) + 0.06
+        figure, axis = plt.subplots(
+            figsize=(WIDTHS[columns], pitch * len(scenes) + 0.4), layout="constrained"
+        )
+        for place, scene in enumerate(scenes):
+            if place % 2:
+                axis.axhspan(place - 0.5, place + 0.5, color="#f3f3f3", zorder=0, linewidth=0)
+            here = _present(results, scene, rivals)
+            for i, rival in enumerate(here):
+                for j, error in enumerate(("rel_mse_trimmed", "rel_mse")):
+                    y = place + 0.8 * ((2 * i + j + 0.5) / (2 * len(here)) - 0.5)
+                    _dot(axis, results, scene, rival, error, y, style(results.methods, rival))
+        axis.axvline(1, color="black", linewidth=0.6)
+        axis.set(xscale="log", xlabel=f"efficiency of {results.methods[0]}, {results.deciding} spp")
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}x"))
         axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.title.set_fontsize(10)
-        axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
-        axis.set_ylim(len(results.scenes) - 0.5, -0.5)
-        axis.grid(axis="x", linewidth=0.3)
-        handles, labels = axis.get_legend_handles_labels()
-        unique = dict(zip(labels, handles, strict=True))
-        axis.legend(unique.values(), unique.keys(), fontsize=8, loc="lower right")
-    figure.tight_layout()
-    _save(figure, path)
+        axis.set_yticks(range(len(scenes)), scenes)
+        axis.tick_params(axis="y", length=0)
+        axis.set_ylim(len(scenes) - 0.5, -0.5)
+        axis.grid(axis="x")
+        axis.set_axisbelow(True)
+        handles = [
+            Line2D([], [], label=f"over {rival}", **style(results.methods, rival) | {"linestyle": ""})
+            for rival in rivals
+            if any(results.of(scene, rival) for scene in scenes)
+        ]
+        plain = {"color": "black", "linestyle": "", "marker": "o"}
+        handles += [
+            Line2D([], [], label="trimmed", **plain),
+            Line2D([], [], label="raw", markerfacecolor="white", **plain),
+            Line2D(
+                [], [], label="at least, at most", **plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
+            ),
+        ]
+        _legend(figure, handles, columns)
+        save(figure, path)
 
 
-def _ratios(axis, results, scene, rival, place):
-    """Plot a scene's efficiencies over a rival at ``place``."""
-    if not results.of(scene, rival):
+def _present(results: Results, scene: str, rivals: Sequence[str]) -> list[str]:
+    """Return the ``rivals`` that were rendered in a scene."""
+    return [rival for rival in rivals if results.of(scene, rival)]
+
+
+def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float, look: dict) -> None:
+    """Plot one efficiency with its interval at the height ``y``; nothing where there is none."""
+    try:
+        ratio = results.efficiency(scene, rival, error)
+    except Refused:
         return
-    for (error, (label, colour, marker)), y in zip(ERRORS.items(), (place - 0.15, place + 0.15), strict=True):
-        try:
-            ratio = results.efficiency(scene, rival, error)
-        except Refused:
-            continue
-        axis.plot([ratio.smallest, ratio.largest], [y, y], color=colour, linewidth=1.5)
-        face = "white" if ratio.bound else colour
-        axis.plot(
-            ratio.median,
-            y,
-            marker=marker,
-            color=colour,
-            markerfacecolor=face,
-            markersize=4,
-            linestyle="none",
-            label=label,
-        )
+    face = look["color"] if error == "rel_mse_trimmed" else "white"
+    axis.plot([ratio.low, ratio.high], [y, y], color=look["color"], linewidth=0.8)
+    axis.plot(ratio.median, y, **look | {"markerfacecolor": face, "linestyle": "", "markeredgewidth": 0.6})
+    arrow = {"arrowstyle": "<|-", "color": look["color"], "linewidth": 0.6, "mutation_scale": 4}
+    for bounds, end, away in (("≥~", ratio.high, 5), ("≤~", ratio.low, -5)):
+        if ratio.bound and ratio.bound in bounds:
+            axis.annotate("", (end, y), xytext=(away, 0), textcoords="offset points", arrowprops=arrow)
 
 
-def rays(results: Results, path: Path):
+def rays(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None) -> None:
     """Plot rays per sample of the first integrator by kind, a bar per scene."""
-    figure, axis = plt.subplots(figsize=(9, 0.28 * len(results.scenes) + 1.4))
-    left = np.zeros(len(results.scenes))
-    for kind, (label, colour, hatch) in RAYS.items():
-        widths = np.array([_rays_per_sample(results, scene, kind) for scene in results.scenes])
-        axis.barh(
-            range(len(results.scenes)),
-            widths,
-            left=left,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0.3,
-            label=label,
-        )
-        left += widths
-    axis.set_yticks(range(len(results.scenes)), results.scenes, fontsize=8)
-    axis.invert_yaxis()
-    axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {results.deciding} spp")
-    axis.legend(fontsize=8, ncols=3, loc="lower center", bbox_to_anchor=(0.45, 1))
-    figure.tight_layout()
-    _save(figure, path)
+    scenes = scenes or results.scenes
+    with plt.rc_context(PAPER):
+        figure, axis = plt.subplots(figsize=(WIDTHS[columns], 0.17 * len(scenes) + 0.4), layout="constrained")
+        left = np.zeros(len(scenes))
+        for kind, (label, colour, hatch) in RAYS.items():
+            widths = np.array([_rays_per_sample(results, scene, kind) for scene in scenes])
+            look = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.3, "label": label}
+            axis.barh(range(len(scenes)), widths, left=left, **look)
+            left += widths
+        axis.set_yticks(range(len(scenes)), scenes)
+        axis.tick_params(axis="y", length=0)
+        axis.set_ylim(len(scenes) - 0.5, -0.5)
+        axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {results.deciding} spp")
+        _legend(figure, axis.get_legend_handles_labels()[0], columns)
+        save(figure, path)
 
 
-def _rays_per_sample(results, scene, kind) -> float:
+def _rays_per_sample(results: Results, scene: str, kind: str) -> float:
     rows = results.of(scene, results.methods[0], results.deciding)
     rows = [row for row in rows if row.get(f"rays_{kind}") is not None]
     pixels = [row["width"] * row["height"] for row in rows]
@@ -205,7 +289,46 @@ def _rays_per_sample(results, scene, kind) -> float:
     return float(np.median(counts)) if counts else 0.0
 
 
-def _save(figure, path: Path):
+def save(figure, path: Path) -> None:
+    """Write a figure in the format of the file's ending, the same bytes for the same figure."""
+    kind = path.suffix[1:].lower()
+    none = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, bbox_inches="tight", metadata={"Software": None})
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=DPI, format=kind, metadata=none[kind])
     plt.close(figure)
+
+
+def check_figure(output: Path) -> None:
+    """Raise ``CommandError`` now if a figure cannot be written, or not in the format of the file's ending."""
+    if output.suffix.lower() not in FIGURE_FORMATS:
+        raise CommandError(f"output={str(output)!r} must end in {', '.join(FIGURE_FORMATS)}")
+    check_output(output, output.suffix.lower())
+
+
+PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
+    "samples": lambda results, path, columns, scenes: convergence(results, "spp", path, columns, scenes),
+    "seconds": lambda results, path, columns, scenes: convergence(results, "seconds", path, columns, scenes),
+    "efficiency": lambda results, path, columns, scenes: efficiencies(
+        results, results.rivals, path, columns, scenes
+    ),
+    "rays": rays,
+}
+"""What the command `figure` draws."""
+
+
+def run(options: Namespace) -> int:
+    """Draw the figure that the command-line ``options`` request."""
+    project = Project(options.project)
+    folder = project.results(options.folder)
+    output = options.output or folder / f"{options.plot}.pdf"
+    check_figure(output)
+    results, _ = load(project, folder)
+    for scene in options.scenes or ():
+        if scene not in results.scenes:
+            raise CommandError(f"--scenes {scene}: not in the sweep, which has {', '.join(results.scenes)}")
+    if options.plot == "efficiency" and not results.rivals:
+        raise CommandError(f"{folder} has no other integrator than {results.methods[0]} to compare with")
+    PLOTS[options.plot](results, output, options.columns, options.scenes or results.scenes)
+    print(output)
+    return 0

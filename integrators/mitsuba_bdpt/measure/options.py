@@ -129,6 +129,33 @@ class Sweep(Options):
     reference_seconds: float = _reference_seconds()
 
 
+FIGURE_FORMATS = (".pdf", ".svg", ".png")
+
+
+@dataclass(frozen=True)
+class Figure(Options):
+    """Options of figures of a sweep."""
+
+    output: Path | None = option(
+        None,
+        Path,
+        "file to write, PDF, SVG or PNG by its ending; default: FOLDER/PLOT.pdf",
+        short="-o",
+        metavar="FILE",
+    )
+    plot: str = option(
+        "samples",
+        Choice(("samples", "seconds", "efficiency", "rays")),
+        "relMSE over samples or seconds, efficiencies, or rays by kind; default: %(default)s",
+    )
+    columns: int = option(
+        1, Number(int, 1, 2), "width, in columns of a page: 1 is 8.5 cm, 2 are 17.8 cm; default: %(default)s"
+    )
+    scenes: tuple[str, ...] | None = option(
+        None, str, "scenes to draw; default: all", nargs="+", metavar="SCENE"
+    )
+
+
 @dataclass(frozen=True)
 class MakeReference(Options):
     """Options of references."""
@@ -175,7 +202,10 @@ class EqualTime(Options):
     resolution: int | None = _width(None)
     reference_seconds: float = _reference_seconds()
     output: Path | None = option(
-        None, Path, "PNG file to write; default: PROJECT/renders/equal_time_SCENE.png", short="-o"
+        None,
+        Path,
+        "file to write, PDF, SVG or PNG by its ending; default: PROJECT/renders/equal_time_SCENE.png",
+        short="-o",
     )
 
 

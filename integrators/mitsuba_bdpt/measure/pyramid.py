@@ -1,7 +1,7 @@
 """The technique pyramid of a scene: the contribution of each strategy (s, t).
 
 A row for each path length of k = 2, 3, ... edges with its k + 2 strategies (s, t), s light vertices and t
-camera vertices, brightened by 2^(k-1); strategies without contribution are left out.
+camera vertices, brightened by 2^(k-1). Strategies that are impossible or bring no light are empty frames.
 
 ``-o NAME.exr`` writes that file with the image and the layers ``weighted.s{S}t{T}.R`` ... and
 ``unweighted.s{S}t{T}.R`` ..., the image NAME.png, and the pyramids NAME_weighted.png, whose sum is the image,
@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import CommandError
 from ..files.images import check_channels, check_output, write_images
 from ..files.loading import choose_sensor
-from ..files.whole import replacing
+from .figures import PAPER, WIDTHS, save
 from .metrics import tone_map
 from .options import VARIANT, Pyramid
 from .project import Project
@@ -32,6 +32,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 KINDS = ("weighted", "unweighted")
+
+WIDTH = WIDTHS[2]
+TITLE, EDGE = 0.2, 0.04  # inches over a panel, and under the last
 
 SHORTEST = 2  # edges: single ones show the emitters only
 
@@ -64,12 +67,12 @@ def render(file: MeasuredScene, options: Pyramid | Namespace):
 
 
 def panels(images: dict) -> dict:
-    """Return the nonzero `technique_images` of two or more edges.
+    """Return the `technique_images` of two or more edges, None for strategies without contribution.
 
-    Raises ``CommandError`` if there are none.
+    Raises ``CommandError`` if none contributes.
     """
-    found = {key: image for key, image in images.items() if key[0] >= SHORTEST and image.any()}
-    if not found:
+    found = {key: image if image.any() else None for key, image in images.items() if key[0] >= SHORTEST}
+    if all(image is None for image in found.values()):
         raise CommandError(
             f"nothing to draw: no path of {SHORTEST} edges or more brings light; check the scene's lamps and "
             "sensor, or take more samples by --spp"
@@ -78,30 +81,36 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float):
-    """Draw the pyramid: rows of path lengths, s increasing to the right."""
-    lengths = sorted({k for k, _, _ in found})
-    rows = [[key for key in found if key[0] == k] for k in lengths]
-    columns = max(len(row) for row in rows)
-    height, width = next(iter(found.values())).shape[:2]
-    panel, margin, title = 1.9, 0.5, 0.3  # inches
-    high = panel * height / width + title
-    wide = margin + panel * columns
-    figure = plt.figure(figsize=(wide, high * len(rows)))
-    for i, row in enumerate(rows):
-        bottom = 1 - (i + 1) / len(rows)
-        for j, (k, s, t) in enumerate(row):
-            # Centred rows form the pyramid.
-            left = margin + panel * (j + (columns - len(row)) / 2)
-            box = (left / wide, bottom, 0.97 * panel / wide, (1 - title / high) / len(rows))
-            axis = figure.add_axes(box)
-            axis.imshow(tone_map(found[k, s, t], exposure + k - 1), interpolation="nearest")
-            axis.set_title(f"s = {s}, t = {t}", fontsize=8, pad=2)
-            axis.set_axis_off()
-        text = f"k = {lengths[i]}\n{2 ** (lengths[i] - 1)}x"
-        figure.text(0.05 / wide, bottom + 0.5 / len(rows), text, fontsize=8)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
-    plt.close(figure)
+    """Draw the pyramid: a row per path length k, the strategies s = 0 ... k + 1 from left to right.
+
+    Rows are centred. Strategies that are impossible or bring no light are empty frames. Rows below the last
+    with light are left out.
+    """
+    shape = next(image.shape for image in found.values() if image is not None)
+    longest = max(k for (k, _, _), image in found.items() if image is not None)
+    lengths = range(SHORTEST, longest + 1)
+    margin, panel = 0.5, (WIDTH - 0.5) / (longest + 2)  # inches
+    high = panel * shape[0] / shape[1] + TITLE
+    wide, tall = WIDTH, high * len(lengths) + EDGE
+    with plt.rc_context(PAPER):
+        figure = plt.figure(figsize=(wide, tall))
+        for row, k in enumerate(lengths):
+            bottom = tall - (row + 1) * high
+            for s in range(k + 2):
+                left = margin + panel * (s + (longest - k) / 2)
+                size = 0.97 * panel / wide, (high - TITLE) / tall
+                axis = figure.add_axes((left / wide, bottom / tall, *size))
+                axis.set_title(f"$s={s}$, $t={k + 1 - s}$", fontsize=min(7, 9 * panel), pad=2)
+                axis.set(xticks=[], yticks=[])
+                if (image := found.get((k, s, k + 1 - s))) is None:
+                    for side in axis.spines.values():
+                        side.set(color="#bbbbbb", linestyle=(0, (3, 3)))
+                else:
+                    axis.imshow(tone_map(image, exposure + k - 1), interpolation="nearest", aspect="auto")
+                    axis.set_axis_off()
+            text = f"$k={k}$\n{2 ** (k - 1)}x"
+            figure.text(0.02 / wide, (bottom + (high - TITLE) / 2) / tall, text, va="center")
+        save(figure, path)
 
 
 def pictured(

@@ -1,0 +1,127 @@
+"""Figures of a sweep: sizes and formats for print, and text that can be read."""
+
+import itertools
+import re
+from argparse import Namespace
+
+import numpy as np
+import pytest
+from mitsuba_bdpt.errors import CommandError
+from mitsuba_bdpt.measure import figures
+from mitsuba_bdpt.measure.agreement import Means
+from mitsuba_bdpt.measure.analysis import Results
+
+METHODS = ("bdpt", "path", "path multijitter", "bdpt skip=none", "an integrator with a long name of its own")
+KNOWN = Means.known(np.full((4, 4, 3), 2.0))
+
+
+def results(scenes=("a_caustic_with_a_long_name", "b")):
+    """Errors c / spp at four budgets; `path` lacks a tenth of the light, its errors are lower bounds."""
+    rng, rows = np.random.default_rng(1), []
+    for scene, (i, method), budget in itertools.product(scenes, enumerate(METHODS), (4, 16, 64, 256)):
+        for seed in range(8):
+            error = (i + 1) / budget * rng.lognormal(0, 0.2)
+            level = 1.8 if method == "path" else 2.0
+            rows.append(
+                {
+                    "scene": scene,
+                    "method": method,
+                    "first": "bdpt",
+                    "budget": budget,
+                    "spp": budget,
+                    "seed": seed,
+                    "seconds": budget / 100,
+                    "rel_mse": 2 * error,
+                    "rel_mse_trimmed": error,
+                    "reference_rel_mse": 0.0,
+                    "reference_rel_mse_trimmed": 0.0,
+                    "width": 8,
+                    "height": 8,
+                    "tile_means": (level + 0.01 * rng.standard_normal(51)).tolist(),
+                }
+                | {f"rays_{kind}": 64 * budget for kind in figures.RAYS}
+            )
+    return Results(rows, dict.fromkeys(scenes, KNOWN), {})
+
+
+def drawn(monkeypatch, plot, columns, scenes=("a_caustic_with_a_long_name", "b")):
+    """The figure of a plot, as it is saved."""
+    found = []
+    monkeypatch.setattr(
+        figures, "save", lambda figure, path: (figure.draw_without_rendering(), found.append(figure))
+    )
+    figures.PLOTS[plot](results(scenes), None, columns, scenes)
+    return found[0]
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+@pytest.mark.parametrize("plot", figures.PLOTS)
+def test_no_text_lies_over_another(monkeypatch, plot, columns):
+    """Rationale: "fails the bias check" was printed over names of scenes, and an axis' label over the legend.
+    Expected: the figure is as wide as its columns, all text is inside of it, none smaller than 6 points, and
+    no two texts overlap."""
+    figure = drawn(monkeypatch, plot, columns)
+    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
+    texts = [t for t in figure.findobj(figures.plt.Text) if t.get_text().strip() and t.get_visible()]
+    labels = [t for a in figure.axes for axis in (a.xaxis, a.yaxis) for t in hidden(axis)]
+    texts = [t for t in texts if not any(t is label for label in labels)]
+    boxes = {t.get_text() + str(i): t.get_window_extent() for i, t in enumerate(texts)}
+    assert len(texts) > 8 and min(t.get_fontsize() for t in texts) >= 6
+    for (one, a), (other, b) in itertools.combinations(boxes.items(), 2):
+        across = min(a.x1, b.x1) - max(a.x0, b.x0)
+        along = min(a.y1, b.y1) - max(a.y0, b.y0)
+        assert across < 1 or along < 1, (one, other)
+    inside = figure.bbox.padded(1)
+    assert all(inside.contains(b.x0, b.y0) and inside.contains(b.x1, b.y1) for b in boxes.values())
+
+
+def hidden(axis):
+    """Labels of ticks outside of an axis' limits, which are not drawn."""
+    low, high = sorted(axis.get_view_interval())
+    return [
+        label
+        for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks())
+        for label in (tick.label1, tick.label2)
+        if not low <= tick.get_loc() <= high
+    ]
+
+
+def test_curves_are_raw_and_trimmed(monkeypatch):
+    """Expected: of each integrator the medians of raw errors, solid with markers, and of trimmed ones, half
+    of them, dashed; hollow markers where the error is a lower bound; a line of slope -1."""
+    figure = drawn(monkeypatch, "samples", 1, ("b",))
+    (axis,) = figure.axes
+    rows = [r for r in results(("b",)).rows if r["method"] == "bdpt" and r["budget"] == 16]
+    expected = np.median([r["rel_mse"] for r in rows])
+    lines = {(line.get_color(), line.get_linestyle()): line for line in axis.lines}
+    blue, orange = (figures.STYLES[name][0] for name in ("bdpt", "path"))
+    assert lines[blue, "-"].get_xydata()[1] == pytest.approx([16, expected])
+    np.testing.assert_allclose(lines[blue, "--"].get_ydata() * 2, lines[blue, "-"].get_ydata())
+    hollow = [line for line in axis.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
+    assert [line.get_color() for line in hollow] == [orange]
+    x, y = next(line for line in axis.lines if line.get_color() == "black").get_data()
+    assert y[1] / y[0] == pytest.approx(x[0] / x[1])
+    assert axis.get_xscale() == axis.get_yscale() == "log"
+
+
+@pytest.mark.parametrize("ending", ["pdf", "svg", "png"])
+def test_the_format_is_that_of_the_ending(tmp_path, ending):
+    """Expected: a file of that format, the same bytes each time, of exactly 8.5 cm."""
+    files = [tmp_path / f"{i}.{ending}" for i in (1, 2)]
+    for file in files:
+        figures.PLOTS["efficiency"](results(("b",)), file, 1, ("b",))
+    data = files[0].read_bytes()
+    assert data == files[1].read_bytes()
+    if ending == "pdf":
+        assert data.startswith(b"%PDF")
+        width = float(re.search(rb"/MediaBox \[\s*0 0 ([\d.]+)", data)[1])
+        assert width == pytest.approx(8.5 / 2.54 * 72, abs=0.1)
+    else:
+        assert data[:200].find({"svg": b"<?xml", "png": b"PNG"}[ending]) >= 0
+
+
+def test_other_endings_are_refused(tmp_path):
+    """Expected: before the sweep is read, with the endings that there are."""
+    options = Namespace(project=tmp_path, folder="x", output=tmp_path / "a.jpg", plot="samples", scenes=None)
+    with pytest.raises(CommandError, match="a.jpg' must end in .pdf, .svg, .png"):
+        figures.run(options)
