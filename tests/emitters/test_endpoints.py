@@ -271,6 +271,19 @@ def test_spots_that_are_scaled_or_mirrored(scale):
     assert flux[1] == pytest.approx(flux[0], rel=1e-4)
 
 
+@pytest.mark.parametrize("weight", [float("nan"), float("inf")])
+def test_a_sampling_weight_that_is_no_number_is_named(weight):
+    """Rationale: one NaN made the probabilities of all emitters NaN, and the image black. Expected: an error
+    that names emitter, parameter and value."""
+    lamps = {
+        "a": EMITTERS["point"](),
+        "b": {"type": "spot", "intensity": 1.0, "sampling_weight": weight},
+    }
+    scene = mi.load_dict(room() | lamps)
+    with pytest.raises(ValueError, match=rf"'b' has sampling_weight={weight:g}; set a finite number"):
+        Emitters(scene)
+
+
 def test_emitters_are_chosen_by_sampling_weight():
     """Rationale: selection is part of every density. Expected: the share of emissions per emitter is
     its sampling_weight's (a weight of zero: never chosen, and `path` does not see it either), and the

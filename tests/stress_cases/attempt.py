@@ -26,8 +26,8 @@ def attempt(path: str, integrator: str) -> dict:
     """What became of a scene file: the ``stage`` that was reached, and an error or figures of the images.
 
     ``stage``: ``load``, ``render`` or ``image``. Of an exception its ``kind`` and ``text``; of the images of
-    all seeds their ``means``, how many values of them are ``bad``, not finite, and how many were ``counted``
-    and left out.
+    all seeds their ``means``, how many values of them are ``bad``, not finite, how many were ``counted`` and
+    left out, and whether the scene is ``bounded``: else Mitsuba's environments are in front of all shapes.
     """
     stage = "load"
     try:
@@ -49,6 +49,7 @@ def attempt(path: str, integrator: str) -> dict:
         "means": [float(image.mean()) for image in images],
         "bad": bad,
         "counted": counted,
+        "bounded": bool(np.isfinite(np.array(scene.bbox().bounding_sphere().radius)).all()),
     }
 
 

@@ -14,9 +14,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..errors import UsageError
 from ..geometry import rounding
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import number
+from ..host.introspection import named, number
 from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context, Group
 from .infinite import contrast
@@ -52,7 +53,7 @@ class Emitters:
         self.shape_errors = facts.errors
         emitters = scene.emitters()
         types = [group_of(emitter) for emitter in emitters]
-        weights = [number(emitter.sampling_weight()) for emitter in emitters]
+        weights = [_sampling_weight(emitter) for emitter in emitters]
         registered = registered_emitters()
         self._summarize(emitters, types)
         # It evaluates a mask, which cannot be recorded.
@@ -311,3 +312,13 @@ def _make_opaque(emitters, facts: ShapeFacts):
         else:
             facts.about("opaque", partial(fresh.append, shape), shape)
     make_parameters_opaque(fresh)
+
+
+def _sampling_weight(emitter: mi.Emitter) -> float:
+    """The emitter's weight in the choice among emitters; one that is none would spoil every choice."""
+    weight = number(emitter.sampling_weight())
+    if not 0 <= weight < math.inf:
+        raise UsageError(
+            f"emitter {named(emitter)} has sampling_weight={weight:g}; set a finite number of 0 or more"
+        )
+    return weight
