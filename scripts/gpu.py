@@ -31,7 +31,6 @@ import repository
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
-from mitsuba_bdpt.measure.analysis import speedup
 from mitsuba_bdpt.measure.results import relative_errors
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import ratio, table
@@ -139,6 +138,11 @@ def collect(names: list[str], variant: str) -> tuple[list[dict], dict, dict]:
 def batched(names: list[str], size: int) -> list[list[str]]:
     """``names`` in lists of ``size`` (`itertools.batched` is not in Python 3.11)."""
     return [names[i : i + size] for i in range(0, len(names), size)]
+
+
+def speedup(ours: dict, theirs: dict, error: str) -> float:
+    """Ratio of efficiencies 1 / (seconds * error) of two methods, ours over theirs."""
+    return theirs["seconds"] * theirs[error] / (ours["seconds"] * ours[error])
 
 
 def page(found: dict) -> str:

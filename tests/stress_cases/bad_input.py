@@ -154,8 +154,8 @@ OR_WORDS = (
 )
 AS_PATH = (
     f"{OR_WORDS}. Where `path` renders it too, its mean: within ten standard errors of four seeds and 2 % "
-    "(so few seeds have heavy tails; a lost lamp or a doubled light is off by far more), but in scenes without "
-    "bounds, where `path` sees its environments through all shapes"
+    "(so few seeds have heavy tails; a lost lamp or a doubled light is off by far more), but in scenes "
+    "without bounds, where `path` sees its environments through all shapes"
 )
 VARIED = tuple(path.stem for path in sorted((repository.ROOT / "scenes").glob("*.xml")))
 # Scenes whose light `path` finds as well.
