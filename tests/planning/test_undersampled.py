@@ -286,12 +286,15 @@ def test_light_off_a_metal_ceiling(metal, warned):
         lambda: slab(frosted(0.4)),
         lambda: slab(principled(0.7)),
         lambda: slab({"type": "thindielectric"}),
+        lambda: slab(frosted(0.01), lamp=sphere(0.5)),
+        lambda: slab(frosted(0.01), lamp={"type": "constant"}),
     ],
-    ids=["null", "rough", "principled", "thin"],
+    ids=["null", "rough", "principled", "thin", "large lamp", "sky"],
 )
 def test_no_near_specular_estimate_of_other_scenes(scene):
-    """Expected: scenes without near-specular lobes have the estimate of before, and so do those in which none
-    is narrow enough to leave light undersampled."""
+    """Rationale: the estimate takes longer than a small preview. Expected: scenes without near-specular lobes
+    have the estimate of before, and so do those in which none is narrow enough to leave light undersampled,
+    or all emitters are large."""
     render = render_of(scene())
     assert not lost_light.is_undersampling_possible(render.prepared, render.settings)
 
