@@ -49,6 +49,34 @@ class Mutant:
 
 MUTANTS = (
     Mutant(
+        "light groups: a merge's group is that of the camera's side",
+        "merging/merging.py",
+        "kernel.light_group(photon.emitter,",
+        "kernel.light_group(mi.UInt32(0),",
+        ("tests/images/test_light_groups.py::test_a_merge_knows_its_emitter[dielectric]",),
+    ),
+    Mutant(
+        "light groups: connections are of the newest light subpath",
+        "transport/light_path.py",
+        "path.light_group if groups is None else groups.read(slot, active)",
+        "path.light_group",
+        ("tests/images/test_light_groups.py::test_connections_to_several_light_subpaths_know_their_emitter",),
+    ),
+    Mutant(
+        "light groups: splats have none",
+        "image/accumulator.py",
+        "row = 0 if c.light_group is None else c.light_group * self._down",
+        "row = 0",
+        ("tests/images/test_light_groups.py::test_a_layer_is_the_image_of_its_emitters_alone[one]",),
+    ),
+    Mutant(
+        "light groups: inner connections have none",
+        "image/sink.py",
+        "_plus(total, found, group)",
+        "_plus(total, found, None if group is None else group & 0)",
+        ("tests/images/test_light_groups.py::test_a_layer_is_the_image_of_its_emitters_alone[one]",),
+    ),
+    Mutant(
         "features: normals of maps are flipped without being asked",
         "image/mapped_normals.py",
         "        if self._flips:",
@@ -1273,32 +1301,6 @@ MUTANTS = (
         "plan.arrival or kernel.merges_hard",
         "plan.arrival",
         ("tests/transport/test_oracle.py::test_kernel_with_merges_on_hard_paths[power-n1c1-False-0.0]",),
-    ),
-    Mutant(
-        "hard paths: stored vertices lose the newest merge",
-        "transport/light_path.py",
-        "(y.partial.d_vm, y.partial.d_vn), strict=False",
-        "(y.partial.d_vm, mi.Float(0)), strict=False",
-        ("tests/images/test_hard_paths.py::test_stored_vertices_keep_their_merges",),
-    ),
-    Mutant(
-        "hard paths: photons start with the density of their aim",
-        "transport/photons/photon_pass.py",
-        "unaimed = kernel.merges_hard or undersampled",
-        "unaimed = undersampled",
-        ("tests/images/test_hard_paths.py::test_images_are_those_without_merging[steel]",),
-    ),
-    Mutant(
-        "hard paths: longer than stored for s = 0 alone",
-        "transport/techniques.py",
-        "mis.choose(z.edges <= kernel.last_merged, merges, 0)",
-        "mis.choose(z.edges <= kernel.max_depth, merges, 0)",
-        (
-            (
-                "tests/images/test_hard_paths.py::test_any_choice_of_strategies_has_the_same_mean"
-                "[{'skip': 'none', 'stored_vertices': 3}]"
-            ),
-        ),
     ),
     Mutant(
         "merging: photons of other cells in the same bucket count",

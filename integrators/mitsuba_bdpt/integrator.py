@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
+from .emitters.light_groups import parsed
 from .errors import UnsupportedError, UsageError, UsageTypeError
 from .host import tracebacks
 from .image.layers import film_layers
@@ -37,7 +38,7 @@ parameters that hold such values. Other warnings name BSDFs that reflect more li
 light that no strategy samples. Entries of ``statistics``: see `mitsuba_bdpt.Statistics`.
 
 Layers of the film, in this order: colours and alpha, Stokes vectors, features, denoised colours, variance,
-strategies.
+light groups, strategies.
 
 Scalar and Metal variants, derivatives, renders under ``dr.freeze``, and ``layers`` but ``variance`` on a
 ``specfilm`` raise an error. With participating media edges count as in ``volpath``, and the medium that an
@@ -101,6 +102,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         self.statistics = cast(Statistics, {})
         self.on_pass = None
         self._cancelled = False
+        # Of the last scene.
+        self._light_groups, self._colours = tuple(parsed(settings.light_groups)), tuple("RGB")
 
     @property
     def max_depth(self) -> int:
@@ -152,7 +155,14 @@ class BDPTIntegrator(metaclass=ABCMeta):
         """Check the arguments and prepare a render."""
         check_made_for(self, scene)
         sensor = resolve_sensor(scene, sensor)
-        return Render(scene, sensor, self.settings, seed, samples_per_pixel(sensor, spp, self.settings))
+        spp = samples_per_pixel(sensor, spp, self.settings)
+        return self._made(Render(scene, sensor, self.settings, seed, spp))
+
+    def _made(self, render: Render) -> Render:
+        self._colours = render.accumulator.colour.names
+        if render.light_groups is not None:
+            self._light_groups = render.light_groups.names
+        return render
 
     def cancel(self):
         """Stop the render after its current pass; called by ``on_pass`` or another thread."""
@@ -213,7 +223,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if not isinstance(snapshot, Snapshot):
             raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
         sensor = resolve_sensor(scene, sensor)
-        render = Render(scene, sensor, self.settings, 0, 1)
+        render = self._made(Render(scene, sensor, self.settings, 0, 1))
         render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
         render.accumulator.finish()
         self.statistics = statistics(render)
@@ -222,8 +232,12 @@ class BDPTIntegrator(metaclass=ABCMeta):
         return _result(render.sensor.film(), develop, evaluate)
 
     def aov_names(self) -> list[str]:
-        """Return the names of the film's layers beside colours and alpha."""
-        return film_layers(self.settings)
+        """Return the names of the film's layers beside colours and alpha.
+
+        Groups of ``light_groups=auto``, the group ``rest`` and the bands of a ``specfilm`` are known from the
+        first render on.
+        """
+        return film_layers(self.settings, self._colours, self._light_groups)
 
     def sample(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""

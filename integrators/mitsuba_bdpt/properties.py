@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import removed
+from .emitters import light_groups
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
 from .image import denoising, features, film_limits
@@ -131,6 +132,11 @@ def _layers(value, name: str) -> tuple[str, ...]:
     return tuple(word for word in LAYERS if word in given)
 
 
+def _light_groups(value, name: str) -> str:
+    light_groups.parsed(_string(value, name))
+    return value
+
+
 # Readers of parameters with their own syntax.
 _READERS = {
     "max_depth": lambda value, name: UNLIMITED if (depth := _integer(value, name)) < 0 else depth,
@@ -138,6 +144,7 @@ _READERS = {
     "decisions": lambda value, name: read_decisions(text) if (text := _string(value, name)) else None,
     "aovs": lambda value, name: features.checked(_string(value, name)),
     "layers": _layers,
+    "light_groups": _light_groups,
 }
 _READERS_OF_KINDS = {bool: _boolean, int: _integer, float: _number, str: _choice}
 
@@ -184,7 +191,10 @@ def _check_together(settings: Settings):
             "decisions together with light_paths, connections, skip or layers=strategies is "
             "contradictory; leave out one or the other"
         )
-    twice = [layer for layer, count in Counter(film_layers(settings)).items() if count > 1]
+    named = film_layers(
+        settings, light_groups=[*light_groups.parsed(settings.light_groups), light_groups.REST]
+    )
+    twice = [layer for layer, count in Counter(named).items() if count > 1]
     if twice:
         raise UsageError(
             f"aovs={settings.aovs!r}: there are two layers {twice[0]}; give the feature another name"
@@ -221,7 +231,7 @@ def check_not_frozen():
         )
 
 
-def check_film(sensor, settings: Settings):
+def check_film(sensor, settings: Settings, groups: int = 0):
     """Check the film against the requested layers; returns its colours.
 
     Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
@@ -243,7 +253,8 @@ def check_film(sensor, settings: Settings):
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
-    channels = Channels.of(film, len(colour.names), count, POLARIZED if settings.stokes else 0)
+    stokes = POLARIZED if settings.stokes else 0
+    channels = Channels.of(film, len(colour.names), count, stokes, groups)
     film_limits.check_film(film, channels, settings.variance)
     film_limits.check_strategies(film, settings.strategy_depth, settings.merge_images)
     return colour

@@ -172,6 +172,13 @@ class Settings:
         """Adds other layers to the image, a list of ``variance`` (of each pixel), ``denoised`` (by Intel's
         Open Image Denoise), ``stokes`` (Stokes vectors) and ``strategies`` (an image of each).""",
     )
+    light_groups: str = _parameter(
+        "",
+        "a string such as 'key: lamp1, lamp2; sky: envmap', or 'auto'",
+        """Adds layers of the light of single emitters or groups of them, whose sum is the image:
+        ``key: lamp1, lamp2; sky: envmap`` by ids of emitters or their shapes (``*`` for any characters),
+        ``auto`` each emitter by itself, from the ninth on together.""",
+    )
     target_error: float = _parameter(
         0.0,
         "the relMSE to stop at, or 0 for none",

@@ -384,7 +384,7 @@ class Recorder(Observer):
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)
             return total, counted
-        value, counted = connections.connect_one(traced, z, lane.path, stream)
+        value, counted, _ = connections.connect_one(traced, z, lane.path, stream)
         drawn = np.argmin([self._distances(c, self._drawn) for c in found], axis=0) if found else None
         for i, c in enumerate(found):
             self._note(c, dr.select(mi.Bool(drawn == i), value, 0))

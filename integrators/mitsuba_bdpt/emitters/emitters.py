@@ -45,6 +45,7 @@ class Emitters:
     * ``left_out``: strategies that single emitters lack, with reasons.
     * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
     * ``tables``: squares of primary numbers of each emitter, see `place`; ``has_places``: it has `place`.
+    * ``indexed``: samples of next-event estimation have the index of their emitter.
     """
 
     def __init__(self, scene: mi.Scene, facts: ShapeFacts | None = None):
@@ -58,7 +59,7 @@ class Emitters:
         self._summarize(emitters, types)
         # It evaluates a mask, which cannot be recorded.
         self.evaluated = "TimedSunskyEmitter" in registered
-        self.groups, self.disks, self.has_places = (), None, False
+        self.groups, self.disks, self.has_places, self.indexed = (), None, False, False
         if not emitters:
             return
         _make_opaque(emitters, facts)
@@ -126,7 +127,7 @@ class Emitters:
     def placed(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
         """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
         other = copy(self)
-        other.has_places = True
+        other.has_places = other.indexed = True
         other.groups = tuple(
             group.placed(guide if guide is not None and any(is_guided[i] for i in own) else None)
             for group, own in zip(self.groups, self._of_groups, strict=True)
@@ -254,7 +255,7 @@ class Emitters:
         )
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
-        if self.has_places:  # only then: branches would carry it along
+        if self.indexed:  # only then: branches would carry it along
             direct.index = chosen.index
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
@@ -266,6 +267,16 @@ class Emitters:
         """Radiance of the emitter hit (or missed into) at ``si`` towards ``si.wi``."""
         emitter = si.emitter(self.scene)
         return emitter.eval(si, active)
+
+    def with_indices(self) -> Emitters:
+        """Return a copy whose samples of next-event estimation have the index of their emitter."""
+        other = copy(self)
+        other.indexed = True
+        return other
+
+    def index_of_hit(self, si, active):
+        """Index of the emitter hit (or missed into) at ``si``."""
+        return self._index_of(si.emitter(self.scene), active)
 
     def _index_of(self, emitter, active):
         return dr.gather(mi.UInt32, self._inverse, dr.reinterpret_array(mi.UInt32, emitter), active)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import reduce
 from math import ceil
+from operator import add
 
 import drjit as dr
 import mitsuba as mi
@@ -81,6 +82,14 @@ class Block:
         strips = mi.TensorXd(mi.Float64(self.data), (self._length // (stride * self.row), stride * self.row))
         return dr.gather(mi.Float64, dr.sum(strips, axis=0).array, dr.arange(mi.UInt32, rows * self.row))
 
+    def strips(self, stride: int, rows: int) -> mi.Float64:
+        """The strips of ``rows`` rows, one every ``stride`` rows, one after the other."""
+        count, size = self._length // (stride * self.row), dr.opaque(mi.UInt32, rows * self.row)
+        index = dr.arange(mi.UInt32, count * rows * self.row)
+        strip = index // size
+        place = strip * dr.opaque(mi.UInt32, stride * self.row) + index - strip * size
+        return dr.gather(mi.Float64, self.data, place)
+
     def _in_centres(self, position):
         """Return a film position in the block's pixels; integers are pixel centres."""
         return position - mi.Point2f(self._offset) - 0.5
@@ -111,23 +120,57 @@ def even(count: int) -> int:
     return count + count % 2
 
 
+# Most channels that Dr.Jit adds as one packet.
+PACKET = 8
+
+# Bytes that copies of the sums for each thread may take, see `reduce_mode`.
+COPIES_MEMORY = 1 << 30
+
+
+def reduce_mode(numbers: int, samples: int):
+    """Return how samples of many channels are added to ``numbers`` sums.
+
+    A copy of the sums for each of T threads needs no atomic additions: less work from about T^2 / 16
+    ``samples`` per pixel and launch on (with 16 additions per sample).
+    """
+    threads = dr.thread_count()
+    copied = threads * numbers * 4 <= COPIES_MEMORY and threads**2 <= 16 * samples
+    on_cpu = (mi.variant() or "").startswith("llvm")
+    return dr.ReduceMode.Expand if copied and on_cpu else dr.ReduceMode.Local
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts of a film's sums.
+
+    ``strips``: number of sums of each pixel's camera samples, see `batch.strip_count`; ``samples`` per pixel
+    of a launch, at most; ``light_groups``: their names.
+    """
+
+    strips: int
+    samples: int
+    light_groups: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True)
 class Channels:
     """Order of the channels of a pixel's camera samples.
 
-    ``colours``, ``alpha`` (0 or 1 channels), the filter's weight W, ``features``, and ``stokes`` (channels
-    beside the colours). Splats have colours and Stokes channels only.
+    ``colours``, ``alpha`` (0 or 1 channels), the filter's weight W, ``features``, ``stokes`` (channels
+    beside the colours), and the colours of each of the light ``groups``. Splats have colours and Stokes
+    channels only; those of each light group have sums of their own.
     """
 
     colours: int
     alpha: int
     features: int
     stokes: int = 0
+    groups: int = 0
 
     @classmethod
-    def of(cls, film, colours: int, features: int, stokes: int) -> Channels:
+    def of(cls, film, colours: int, features: int, stokes: int, groups: int = 0) -> Channels:
         """Return the channels of a film with these numbers of channels of each kind."""
-        return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes)
+        return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes, groups)
 
     @property
     def weight(self) -> int:
@@ -137,16 +180,24 @@ class Channels:
     @property
     def camera(self) -> int:
         """Number of channels of camera samples, padded to an even number."""
-        return even(self.weight + 1 + self.features + self.stokes)
+        count = self.weight + 1 + self.features + self.stokes
+        if not self.groups:
+            return even(count)
+        return -(-(count + self.groups * self.colours) // PACKET) * PACKET
 
     @property
     def light(self) -> int:
         """Number of channels of splats, padded to an even number."""
         return even(self.colours + self.stokes)
 
-    def sample(self, colours, alpha, features, stokes) -> list:
+    @property
+    def splats(self) -> int:
+        """Number of sums of splats: of each light group, or one."""
+        return max(self.groups, 1)
+
+    def sample(self, colours, alpha, features, stokes, groups) -> list:
         """Return the channels of a camera sample with filter weight 1."""
-        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes]
+        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes, *groups]
 
 
 # Names of the blocks in `Snapshot.arrays`.
@@ -158,11 +209,11 @@ class Accumulator:
 
     ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
     pixels that camera samples reach beyond the crop window; ``settings``: the layers, of which the variance
-    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``strips``:
-    number of sums of each pixel's camera samples, see `batch.strip_count`.
+    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``parts`` of the
+    sums.
     """
 
-    def __init__(self, film, colour, border: int, settings: Settings, features, strips: int):
+    def __init__(self, film, colour, border: int, settings: Settings, features, parts: Parts):
         self.film, self.colour, self.features = film, colour, features
         self.border = border
         self.depth = settings.strategy_depth
@@ -171,17 +222,25 @@ class Accumulator:
         self.rfilter = film.rfilter()
         self.variance, self.replicates = settings.variance, Replicates()
         self.stokes = colour.stokes
-        colour.prepare(film_layers(settings, colour.names))
+        colour.prepare(film_layers(settings, colour.names, parts.light_groups))
         self._channels = Channels.of(
-            film, len(colour.names), features.count if features else 0, POLARIZED if self.stokes else 0
+            film,
+            len(colour.names),
+            features.count if features else 0,
+            POLARIZED if self.stokes else 0,
+            len(parts.light_groups),
         )
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
-        self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride)
-        rows = self.size[1] if strips == 1 else strips * self._stride
-        self.camera = self._block(self._channels.camera, dr.ReduceMode.Local, mi.ArrayXf, rows)
+        self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride)
+        rows = self.size[1] if parts.strips == 1 else parts.strips * self._stride
+        mode, channels = dr.ReduceMode.Local, self._channels.camera
+        if self.light_groups:
+            mode = reduce_mode(channels * self.size[0] * rows, parts.samples)
+        self.camera = self._block(channels, mode, mi.ArrayXf, rows)
         # Double precision: one pixel may receive millions of splats of a small lamp.
-        self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd)
+        rows = self._stride * self.light_groups if self.light_groups else None
+        self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd, rows)
         rows = image_count(self.depth, settings.merge_images) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
         # Sums and passes; the sums of several passes are in double precision.
@@ -196,20 +255,26 @@ class Accumulator:
     def alpha(self) -> bool:
         return bool(self._channels.alpha)
 
+    @property
+    def light_groups(self) -> int:
+        """Number of light groups that are kept."""
+        return self._channels.groups
+
     def put_camera(self, position, values, active, strip):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-        ``values``: colours, alpha, features, and the channels of `Stokes`, if kept; ``strip``: index of the
-        sum to which it is added.
+        ``values``: colours, alpha, features, the channels of `Stokes` and the colours of light groups, if
+        kept; ``strip``: index of the sum to which it is added.
         """
         self.camera.put(position, self._channels.sample(*values), active, strip * self._down)
 
-    def put_light(self, position, colours, polarized, active, u):
-        """Add a splat at a continuous film position.
+    def put_light(self, c, colours, polarized, active, u):
+        """Add the splat ``c`` to the sum of its light group.
 
         ``polarized``: channels of `Stokes`; ``u``: see `Block.splat`.
         """
-        self.light.splat(position, [*colours, *polarized], active, u)
+        row = 0 if c.light_group is None else c.light_group * self._down
+        self.light.splat(c.position, [*colours, *polarized], active, u, row)
 
     def put_strategy(self, position, weighted, unweighted, c, active, u=None):
         """Add the contribution ``c`` to the image of its strategy; ``u`` of splats as in `put_light`."""
@@ -241,6 +306,8 @@ class Accumulator:
         sums = [b.data for b in blocks]
         if self._strips > 1:
             sums[0] = self.camera.totals(self._stride, self.size[1])
+        if self.light_groups:
+            sums[1] = self.light.strips(self._stride, self.size[1])
         before, passes = self._done
         if before:
             sums = [mi.Float64(a) + mi.Float64(b) for a, b in zip(before, sums, strict=True)]
@@ -266,8 +333,9 @@ class Accumulator:
     def restore(self, passes: tuple[int, ...], arrays: dict, halves: tuple[Spread, Spread] | None):
         """Restore the state that `store` and `halves` returned after ``passes``."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
+        rows = {"camera": self.size[1], "light": self.size[1] * self._channels.splats}
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
-            expected = self.size[1] * block.row if name == "camera" else len(block.data)
+            expected = rows[name] * block.row if name in rows else len(block.data)
             if len(s) != expected:
                 raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {expected}")
         self._done = (sums, tuple(passes))
@@ -303,10 +371,18 @@ class Accumulator:
             return [[mi.Float64(sums[next(numbers) :: width]) for _ in range(count)] for count in counts]
 
         c = self._channels
-        *of_camera, polarized = parts(camera, c.camera, c.colours, c.alpha, 1, c.features, c.stokes)
-        colours, alpha, [weight], features = of_camera
-        splats, of_splats = parts(light, c.light, c.colours, c.stokes)
-        return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats))
+        count = c.groups * c.colours
+        *of_camera, of_groups = parts(camera, c.camera, c.colours, c.alpha, 1, c.features, c.stokes, count)
+        colours, alpha, [weight], features, polarized = of_camera
+        of_each, size = [light], self.size[1] * self.light.row
+        if c.groups:
+            of_each = [light[i * size : (i + 1) * size] for i in range(c.groups)]
+        each = [parts(sums, c.light, c.colours, c.stokes) for sums in of_each]
+        splats, of_splats = (
+            [reduce(add, values) for values in zip(*kind, strict=True)] for kind in zip(*each, strict=True)
+        )
+        groups = of_groups, [value for group, _ in each for value in group] if c.groups else []
+        return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats), groups)
 
     def mean(self):
         """Return the mean of the image so far, the scale of roulette.
@@ -366,6 +442,7 @@ class Accumulator:
             layers += pixels.features
         if self.variance:
             layers += self._variance(sum(passes), pixels.weight)
+        layers += _added(*pixels.groups, to_film)
         if self.strategies is not None:
             layers += self._strategy_layers(self.strategies, sums[2], to_film)
         stored = self.colour.stored(colours + pixels.alpha, pixels.weight, layers)
@@ -420,7 +497,8 @@ def _channels(image: np.ndarray) -> list[mi.Float64]:
 class _Pixels:
     """Sums of an image: channels, each an array over pixels in double precision.
 
-    ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats.
+    ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats; ``groups``: colours of
+    light groups, of both.
     """
 
     colours: list[mi.Float64]
@@ -429,3 +507,4 @@ class _Pixels:
     features: list[mi.Float64]
     light: list[mi.Float64]
     polarized: tuple[list[mi.Float64], list[mi.Float64]]
+    groups: tuple[list[mi.Float64], list[mi.Float64]]

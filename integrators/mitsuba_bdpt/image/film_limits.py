@@ -29,12 +29,13 @@ def check_film(film, channels: Channels, variance: bool):
     The memory is that of a render of several passes; one of a single pass takes less than half.
     """
     width, height = (int(x) for x in film.crop_size())
-    numbers = width * height * max(channels.camera, channels.light)
-    per_pixel = channels.camera * (SINGLE + ALL) + channels.light * (DOUBLE + ALL)
+    light = channels.light * channels.splats
+    numbers = width * height * max(channels.camera, light)
+    per_pixel = channels.camera * (SINGLE + ALL) + light * (DOUBLE + ALL)
     of_film = channels.camera + channels.stokes
     if variance:  # and the sums at the last replicate
         of_film += channels.colours
-        per_pixel += DOUBLE * (channels.camera + channels.light + OF_VARIANCE * channels.colours)
+        per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
     # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")

@@ -11,6 +11,9 @@ from .features import feature_names
 # Layers of the denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
 
+# Prefix of the layers of light groups.
+GROUP = "groups."
+
 
 def strategies(depth: int):
     """Return all ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order.
@@ -36,11 +39,15 @@ def strategy_index(s, t):
     return (k - 1) * (k + 4) // 2 + s
 
 
-def film_layers(settings: Settings, colours: Iterable[str] = "RGB") -> list[str]:
+def film_layers(
+    settings: Settings, colours: Iterable[str] = "RGB", light_groups: Iterable[str] = ()
+) -> list[str]:
     """Return the names of the film's layers beside its ``colours`` and alpha, in order."""
+    colours = list(colours)
     names = [*(STOKES_NAMES if settings.stokes else ()), *feature_names(settings.aovs)]
     names += DENOISED if settings.denoise else ()
     names += [f"variance.{colour}" for colour in colours if settings.variance]
+    names += [f"{GROUP}{group}.{colour}" for group in light_groups for colour in colours]
     of_strategies = [f"s{s}t{t}" for _, s, t in strategies(settings.strategy_depth)]
     of_strategies += ["merged"] * settings.merge_images
     return names + [

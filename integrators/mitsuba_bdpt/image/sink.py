@@ -7,6 +7,8 @@ camera sample is complete) and ``splat`` (t <= 1). The last three return `Counte
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -28,13 +30,15 @@ class Image:
 
     def begin(self):
         """Return the initial ``total``."""
-        return dr.zeros(mi.Spectrum)
+        if not self._film.light_groups:
+            return dr.zeros(mi.Spectrum)
+        return _Total.begin(self._film.light_groups)
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2 to the ``total`` of a camera subpath."""
         if kernel.strategy_images:
             self._put_strategy(c, start.counted, shared)
-        return total + c.weighted()
+        return _plus(total, c.weighted(), c.light_group, c.active)
 
     def connect(self, kernel, z, lane, stream, total, start):
         """Connect the camera vertex ``z`` to light vertices of its lane.
@@ -47,8 +51,8 @@ class Image:
                 return self.add(kernel, seen, total, start, lane.shared)
 
             return connections.connect_all(kernel, z, lane.path, stream, total, add)
-        found, counted = connections.connect_one(kernel, z, lane.path, stream)
-        return total + found, counted
+        found, counted, group = connections.connect_one(kernel, z, lane.path, stream)
+        return _plus(total, found, group), counted
 
     def splat(self, kernel, c, shared, stream) -> Counters:
         """Add a contribution with t <= 1; ``stream``: of its light subpath.
@@ -61,7 +65,7 @@ class Image:
         polarized = self._polarized(whole, shared, c.towards)
         finite = dr.all(dr.isfinite(value)) & _all_finite(polarized)
         u = _of_filter(kernel, self._film, c, stream)
-        self._film.put_light(c.position, value, polarized, c.active & finite, u)
+        self._film.put_light(c, value, polarized, c.active & finite, u)
         if kernel.strategy_images:
             self._put_strategy(c, c.position, shared, u)
         return Counters(non_finite=one(c.active & ~finite))
@@ -74,13 +78,21 @@ class Image:
             features, finite = film.features.sample(
                 kernel.points, sample.stream, start.position, sample.u_lens, shared.time, sample.covered
             )
+        groups = []
+        if film.light_groups:
+            groups = [
+                number
+                for i in range(film.light_groups)
+                for number in film.colour(total.groups.read(mi.UInt32(i)) * shared.weight, shared.wavelengths)
+            ]
+            total = total.whole
         whole = polarization.scaled(total, shared.weight)
         colours = film.colour(whole, shared.wavelengths)
         polarized = self._polarized(whole, shared, -start.ray.d)
         shown = dr.all(dr.isfinite(colours)) & _all_finite(polarized)
         alpha = _alpha(kernel, seen)
-        polarized = [dr.select(shown, value, 0) for value in polarized]
-        values = dr.select(shown, colours, 0), alpha, features, polarized
+        polarized, groups = ([dr.select(shown, v, 0) for v in values] for values in (polarized, groups))
+        values = dr.select(shown, colours, 0), alpha, features, polarized, groups
         film.put_camera(start.counted, values, sample.covered, sample.strip)
         return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
@@ -94,6 +106,31 @@ class Image:
         unweighted = self._film.colour(polarization.scaled(c.value, shared.weight), shared.wavelengths)
         finite = dr.all(dr.isfinite(weighted)) & dr.all(dr.isfinite(unweighted))
         self._film.put_strategy(position, weighted, unweighted, c, c.active & finite, u)
+
+
+@dataclass
+class _Total:
+    """Sum of a camera subpath's contributions: the ``whole``, and the intensity of each light group."""
+
+    whole: mi.Spectrum
+    groups: dr.Local
+
+    @staticmethod
+    def begin(count: int) -> _Total:
+        """Zero, for ``count`` light groups."""
+        groups = dr.alloc_local(mi.UnpolarizedSpectrum, count)
+        for i in range(count):
+            groups.write(dr.zeros(mi.UnpolarizedSpectrum), mi.UInt32(i))
+        return _Total(dr.zeros(mi.Spectrum), groups)
+
+
+def _plus(total, value: mi.Spectrum, light_group, active: mi.Bool | bool = True):
+    """Return ``total`` with ``value`` added, a `_Total` if there are light groups."""
+    if light_group is None:
+        return total + value
+    before = total.groups.read(light_group, active)
+    total.groups.write(before + mi.unpolarized_spectrum(value), light_group, active)
+    return replace(total, whole=total.whole + value)
 
 
 def _of_filter(kernel, film, c, stream):

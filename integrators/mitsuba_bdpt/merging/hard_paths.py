@@ -90,4 +90,5 @@ class HardMerging(Merging):
         h = kernel.heuristic
         weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera)
         active = drawn.active & ~(weight == 0)
-        return Contribution(drawn.value, weight, y.edges + 1, z.edges, active, None, "merge")
+        c = Contribution(drawn.value, weight, y.edges + 1, z.edges, active, None, "merge")
+        return replace(c, light_group=kernel.light_group(y.emitter, active))

@@ -213,7 +213,8 @@ def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelengt
     older = h.scale(older, photon.aim)  # t = 0 starts with the emitter's density, not the photons'
     camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
-    return Contribution(drawn.value, weight, photon.edges + 1, z.edges, drawn.active, shares, "merge")
+    c = Contribution(drawn.value, weight, photon.edges + 1, z.edges, drawn.active, shares, "merge")
+    return replace(c, light_group=kernel.light_group(photon.emitter, drawn.active))
 
 
 @dr.syntax

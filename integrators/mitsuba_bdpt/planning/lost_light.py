@@ -119,8 +119,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
 
 def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
     """Whether near-specular lobes may leave light undersampled."""
-    narrow = prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
-    return narrow and prepared.has_small_emitter
+    return prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
 
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:

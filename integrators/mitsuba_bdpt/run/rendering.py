@@ -14,11 +14,12 @@ import mitsuba as mi
 import numpy as np
 
 from .. import components
+from ..emitters.light_groups import LightGroups
 from ..errors import UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
-from ..image.accumulator import Accumulator
+from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
 from ..planning import lost_light, missed_direct
@@ -77,7 +78,9 @@ class Render:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
         check_variant()
         check_not_frozen()
-        colour = check_film(sensor, settings)
+        self.light_groups = LightGroups.of(scene, settings.light_groups)
+        names = () if self.light_groups is None else self.light_groups.names
+        colour = check_film(sensor, settings, len(names))
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
@@ -102,8 +105,9 @@ class Render:
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
         border = self.prepared.camera.region.border
-        sums = strip_count(longest_pass(self.prepared.camera, settings))
-        self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, sums)
+        longest = longest_pass(self.prepared.camera, settings)
+        parts = Parts(strip_count(longest), min(longest, spp), names)
+        self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
@@ -208,6 +212,8 @@ class Render:
         kernel = Kernel(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
         if self.planner.threshold and self.plan.roulette:
             kernel.set_threshold(dr.opaque(mi.Float64, self.planner.threshold))
+        if self.light_groups is not None:
+            kernel.use_light_groups(self.light_groups)
         return kernel
 
     def _steps(self) -> Iterator[Step]:

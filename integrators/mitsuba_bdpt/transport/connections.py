@@ -58,7 +58,8 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     sides, own = (kernel.kappa.inner, light_side, camera_side), kernel.kappa.inner
     merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
     weight, shares = h.weigh(*sides, merges=merges)
-    return Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
+    c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
+    return replace(c, light_group=y.light_group)
 
 
 @dr.syntax
@@ -87,10 +88,12 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     return total, counted + crossed
 
 
-def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> tuple[mi.Spectrum, Counters]:
+def connect_one(
+    kernel: Kernel, z: Vertex, path: LightPath, stream: Stream
+) -> tuple[mi.Spectrum, Counters, mi.UInt32 | None]:
     """Connect ``z`` with one light vertex, drawn by weighted unshadowed contribution.
 
-    Estimates the sum over all vertices. Returns the weighted contribution and `Counters`.
+    Estimates the sum over all vertices. Returns the weighted contribution, `Counters`, and its light group.
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
@@ -120,12 +123,12 @@ def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> t
     kernel.observer.drawn(end)
     if kernel.space is None:
         active &= ~rays.occluded(kernel.scene, ray, active, own)
-        return dr.select(active, value / survival, 0), counted
+        return dr.select(active, value / survival, 0), counted, drawn.light_group
     shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
     estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
     c = drop_non_finite(seen(kernel, c, shadow_ray))
-    return c.weighted(), counted + c.counted
+    return c.weighted(), counted + c.counted, drawn.light_group
 
 
 # Probability of a uniform draw, so that connections of approximate size 0 are drawn too.
@@ -142,7 +145,7 @@ class _Drawn:
     Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
     `ShapeErrors.small`), rescaled random number ``u``, number ``evaluated`` and nonzero, number ``lost`` as
     non-finite. In scenes with media, where the weight is known after the shadow ray, also ``unweighted``
-    value, ``sides`` (see `Contribution`) and ``size`` in the draw.
+    value, ``sides`` (see `Contribution`) and ``size`` in the draw. ``light_group``: see `Contribution`.
     """
 
     value: mi.Spectrum
@@ -155,6 +158,7 @@ class _Drawn:
     unweighted: mi.Spectrum | None = None
     sides: tuple | None = None
     size: mi.Float | None = None
+    light_group: mi.UInt32 | None = None
 
 
 @dr.syntax
@@ -186,7 +190,8 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         nonzero += one(c.active)
         lost += c.counted.non_finite
         slot += 1
-    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost)
+    # One light subpath: all vertices are of one emitter.
+    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost, light_group=path.light_group)
     if kept is not None:
         unweighted, light_side, camera_side, size = kept
         sides = kernel.kappa.inner, light_side, camera_side
@@ -231,7 +236,8 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
     value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
-    return _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
+    found = _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
+    return replace(found, light_group=y.light_group)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:

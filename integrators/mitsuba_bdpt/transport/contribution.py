@@ -115,7 +115,7 @@ class Contribution:
     for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
     the connected edge until `visibility.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
     ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
-    sensor, None for t >= 2 (`CameraStart`).
+    sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, None without such layers.
     """
 
     value: mi.Spectrum
@@ -130,6 +130,7 @@ class Contribution:
     sides: Any = None
     emission: Cell | None = None
     towards: mi.Vector3f | None = None
+    light_group: mi.UInt32 | None = None
 
     def weighted(self) -> mi.Spectrum:
         """The weighted contribution to the image."""

@@ -17,6 +17,7 @@ from .plan import Plan
 from .sds import SdsStrategy
 
 if TYPE_CHECKING:
+    from ..emitters.light_groups import LightGroups
     from ..guided_emission import Cells
 
 # Sizes of the lanes' local memory: irrelevant to the speed of CPUs; few sizes give few kernels.
@@ -121,6 +122,8 @@ class Kernel:
         self.inverse_threshold = f32(dr.inf)
         # The further strategy for SDS paths: that of a pass, or None.
         self.sds: SdsStrategy | None = None
+        # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
+        self.light_groups: LightGroups | None = None
         # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 
@@ -139,6 +142,14 @@ class Kernel:
     def merges_hard(self) -> bool:
         """Whether hard paths are merged."""
         return self.sds is not None and self.sds.hard
+
+    def use_light_groups(self, groups: LightGroups):
+        """Let contributions store their light group."""
+        self.light_groups, self.emitters = groups, self.emitters.with_indices()
+
+    def light_group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32 | None:
+        """The light group of the emitter ``index``; None without such layers."""
+        return None if self.light_groups is None else self.light_groups.at(index, active)
 
     def within_store(self, k: mi.UInt32) -> mi.Bool:
         """Mask: paths of ``k`` edges use all strategies; longer ones only s = 0 and s = 1."""

@@ -206,11 +206,13 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     emitted = None
     if kernel.cells is not None:
         emitted = kernel.cells.at(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
-    counters = Counters()
+    counters, light_group = Counters(), kernel.light_group(e.index, mi.Bool(True))
+    if light_group is not None:
+        path = replace(path, light_group=light_group)
 
     def splat(c):
         """Pass a contribution with t <= 1 to the sink."""
-        c = contribution.drop_non_finite(replace(c, emission=emitted))
+        c = contribution.drop_non_finite(replace(c, emission=emitted, light_group=light_group))
         return c.counted + sink.splat(kernel, c, shared, stream)
 
     if plan.endpoints:

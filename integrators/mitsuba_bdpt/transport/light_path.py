@@ -22,7 +22,8 @@ class StoredVertex:
     ``throughput_over_cos``: f cos / pdf of all events before this vertex, including the edge to it, over the
     geometric cosine of incidence |n.wi|, the constant part of the adjoint factor |n.wo| / |n.wi| (in volumes
     both are 1); ``partial``: partial sums in the area measure; ``edges`` up to it, s - 1; ``anchor``: starts
-    rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media.
+    rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media; ``light_group``: see
+    `Contribution`.
     """
 
     si: mi.SurfaceInteraction3f
@@ -32,6 +33,7 @@ class StoredVertex:
     partial: mis.Partial
     edges: mi.UInt32
     medium: mi.UInt32 | None = None
+    light_group: mi.UInt32 | None = None
 
     @property
     def volume(self) -> mi.Bool | None:
@@ -98,8 +100,9 @@ class LightPath:
 
     ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
     offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vn``, where hard
-    paths are merged; ``s``: light vertices up to and including each;
-    ``count``: number of stored vertices; ``medium``: None in scenes without media.
+    paths are merged; ``s``: light vertices up to and including each; ``count``: number of stored vertices;
+    ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
+    ``light_groups`` of each vertex if there are several.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -111,13 +114,15 @@ class LightPath:
     s: dr.Local[mi.UInt32]
     count: mi.UInt32
     medium: dr.Local[mi.UInt32] | None = None
+    light_group: mi.UInt32 | None = None
+    light_groups: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
     sketches: Any = None  # `Sketches`, for draws by approximation
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
-    size = kernel.store_size
+    size, several = kernel.store_size, kernel.plan.joined > 1
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
         throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
@@ -129,7 +134,9 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
         medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
-        sketches=Sketches.allocate(kernel, size) if kernel.plan.joined > 1 else None,
+        light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
+        light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
+        sketches=Sketches.allocate(kernel, size) if several else None,
     )
 
 
@@ -152,6 +159,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     path.s.write(y.edges + 1, slot, keep)
     if path.medium is not None:
         path.medium.write(y.medium, slot, keep)
+    if path.light_groups is not None:
+        path.light_groups.write(path.light_group, slot, keep)
     if path.sketches is not None:
         newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
         path.sketches.write(Sketch.of(kernel, vertex, newest, keep, alone=True), slot, keep)
@@ -174,6 +183,7 @@ def read_light_vertex(
     rounding = path.rounding.read(slot, active)
     s = path.s.read(slot, active)
     curvature = rounding.y if kernel.shape_errors.any else mi.Float(0)
+    groups = path.light_groups
     return StoredVertex(
         si=si,
         bsdf=si.bsdf(),
@@ -188,4 +198,5 @@ def read_light_vertex(
         ),
         edges=s - 1,
         medium=None if path.medium is None else path.medium.read(slot, active),
+        light_group=path.light_group if groups is None else groups.read(slot, active),
     )

@@ -76,7 +76,10 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
     emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
-    return Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
+    c = Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
+    if kernel.light_groups is not None:
+        c.light_group = kernel.light_group(emitters.index_of_hit(z.si, active), active)
+    return c
 
 
 def _known(value, *pdfs):
@@ -131,6 +134,8 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
         emission = kernel.cells.at(e.index, z.si.p, -e.d, cos, active)
     ends = mi.UInt32(1), k
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
+    if kernel.light_groups is not None:
+        c.light_group = kernel.light_group(e.index, active)
     return seen(kernel, c, shadow_ray)
 
 

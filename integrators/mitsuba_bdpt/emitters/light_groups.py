@@ -1,0 +1,147 @@
+"""Light groups: which emitters share a layer of the image."""
+
+from __future__ import annotations
+
+import re
+from fnmatch import fnmatchcase
+
+import drjit as dr
+import mitsuba as mi
+
+from ..errors import UsageError, did_you_mean
+
+# Names of the plugins of Mitsuba's emitters, by class.
+PLUGINS = {
+    "AreaLight": "area",
+    "DirectionalArea": "directionalarea",
+    "PointLight": "point",
+    "SpotLight": "spot",
+    "Projector": "projector",
+    "DirectionalEmitter": "directional",
+    "ConstantBackgroundEmitter": "constant",
+    "EnvironmentMapEmitter": "envmap",
+    "SunskyEmitter": "sunsky",
+    "TimedSunskyEmitter": "timed_sunsky",
+}
+
+# Value of the parameter that gives each emitter a group, up to this number of emitters.
+AUTO, MOST_OWN = "auto", 8
+
+# Most groups that a user can define: each costs three channels of the film.
+MOST_GROUPS = 16
+
+# Group of the emitters that are in no other.
+REST = "rest"
+
+_EXAMPLE = "write it like 'key: lamp1, lamp2; sky: envmap'"
+
+
+def parsed(text: str) -> dict[str, list[str]]:
+    """Return the patterns of each group of a ``text`` like ``key: lamp1, lamp2; sky: envmap``.
+
+    Empty for an empty text and for ``auto``. Raises ``UsageError``.
+    """
+    if text.strip() in ("", AUTO):
+        return {}
+    found: dict[str, list[str]] = {}
+    for part in filter(str.strip, text.split(";")):
+        name, colon, listed = (word.strip() for word in part.partition(":"))
+        patterns = [pattern.strip() for pattern in listed.split(",") if pattern.strip()]
+        if not colon:
+            raise _error(text, f"{name!r} has no group; {_EXAMPLE}, or use {AUTO}")
+        if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+            raise _error(text, f"{name!r} cannot be a layer's name; use letters, digits, _ and -")
+        if not patterns:
+            raise _error(text, f"the group {name} has no emitters; {_EXAMPLE}")
+        if name == REST:
+            raise _error(text, f"{REST} is the group of all other emitters; give the group another name")
+        if name in found:
+            raise _error(text, f"there are two groups {name}; list their emitters in one")
+        found[name] = patterns
+    if len(found) > MOST_GROUPS:
+        raise _error(text, f"there are {len(found)} groups, {MOST_GROUPS} at most; join some of them")
+    return found
+
+
+def _error(text: str, what: str) -> UsageError:
+    return UsageError(f"light_groups={' '.join(text.split())!r}: {what}")
+
+
+def ids(emitter: mi.Emitter) -> list[str]:
+    """Return the names of an emitter: its shape's id, its own, or that of its plugin if it has none."""
+    shape = emitter.get_shape()
+    own = [owner.id() for owner in (shape, emitter) if owner is not None and owner.id()]
+    return own or [PLUGINS.get(emitter.class_name(), emitter.class_name())]
+
+
+class LightGroups:
+    """The light groups of a scene.
+
+    ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter.
+    """
+
+    def __init__(self, names: list[str], of_emitters: list[int]):
+        self.names, self.of_emitters = tuple(names), tuple(of_emitters)
+        self._table = mi.UInt32(of_emitters)
+        dr.make_opaque(self._table)
+
+    @staticmethod
+    def of(scene: mi.Scene, text: str) -> LightGroups | None:
+        """Return the groups that the parameter's ``text`` defines; None for an empty text.
+
+        Emitters in no group form the group `REST`. Raises ``UsageError``.
+        """
+        if not text.strip():
+            return None
+        emitters = scene.emitters()
+        if not emitters:
+            raise _error(text, "the scene has no emitters; leave light_groups out")
+        groups = parsed(text)
+        chosen = _matched(text, groups, emitters) if groups else _own(emitters)
+        names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
+        if len(chosen) < len(emitters):
+            names.append(REST)
+        return LightGroups(names, [names.index(chosen.get(i, REST)) for i in range(len(emitters))])
+
+    def at(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
+        """Return the groups of the emitters ``index``."""
+        return dr.gather(mi.UInt32, self._table, index, active)
+
+
+def _matched(text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]) -> dict[int, str]:
+    """Return the group of each emitter that is in one, by index."""
+    found: dict[int, str] = {}
+    known = [ids(emitter) for emitter in emitters]
+    for name, patterns in groups.items():
+        for pattern in patterns:
+            own = [i for i, names in enumerate(known) if any(fnmatchcase(n, pattern) for n in names)]
+            if not own:
+                every = sorted({n for names in known for n in names})
+                there = ", ".join(every[:20]) + (", ..." if len(every) > 20 else "")
+                remedy = f"{did_you_mean(pattern, every)}Emitters: {there}"
+                raise _error(text, f"no emitter, and no shape with one, has the id {pattern!r}; {remedy}")
+            for i in own:
+                if found.setdefault(i, name) != name:
+                    raise _error(
+                        text,
+                        f"the emitter {known[i][0]!r} is in the groups {found[i]} and {name}; "
+                        "take it out of one",
+                    )
+    return found
+
+
+def _own(emitters: list[mi.Emitter]) -> dict[int, str]:
+    """Return a name for each of the first `MOST_OWN` emitters by name, by index."""
+
+    def key(i: int):
+        # Emitters of equal names by their place: the order of a scene's shapes may vary.
+        shape = emitters[i].get_shape()
+        place = str(emitters[i]) if shape is None else str(shape.bbox())
+        return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", ids(emitters[i])[0])], place
+
+    found: dict[int, str] = {}
+    for i in sorted(range(len(emitters)), key=key)[:MOST_OWN]:
+        base = re.sub(r"[^A-Za-z0-9_-]", "_", ids(emitters[i])[0])
+        names = [base, *(f"{base}_{n}" for n in range(2, len(emitters) + 2))]
+        found[i] = next(name for name in names if name not in (*found.values(), REST))
+    return found

@@ -1,0 +1,256 @@
+"""Light groups: layers of the image by emitter."""
+
+import json
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+from internals import bdpt
+from media_parts import fog
+from mitsuba_bdpt.emitters.emitters import Emitters
+from mitsuba_bdpt.emitters.light_groups import LightGroups, ids
+from mitsuba_bdpt.image import sink
+from sds_scenes import point, under_glass
+from snapshots import ROUNDING, stopped
+
+T = mi.ScalarTransform4f
+
+# Radiance, or intensity, of each emitter.
+LAMPS = {"panel": (5, 1, 1), "globe": (0, 3, 1), "bulb": (0, 0, 4), "sky": (0.1, 0.1, 0.1)}
+GROUPS = "low: globe, b*; high: panel"
+# One connection to one of four light subpaths in each lane.
+JOINED = json.dumps(
+    [
+        {"pass": 0, "light_paths": 1 / 16, "connections": "one", "joined": 4}
+        | {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
+    ]
+)
+OF_GROUPS = {"low": ("globe", "bulb"), "high": ("panel",), "rest": ("sky",)}
+
+
+def scene(lit=tuple(LAMPS), medium=None, rfilter="gaussian", **crop):
+    """A floor, a wall and a ball of glass under four emitters, black but those in ``lit``."""
+
+    def light(name):
+        return {"type": "rgb", "value": [float(x) * (name in lit) for x in LAMPS[name]]}
+
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": rfilter}}
+    film |= {"pixel_format": "rgb", "component_format": "float32"} | crop
+    view = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
+    view |= {"film": film, "sampler": {"type": "independent", "sample_count": 8}}
+    placed = T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.5)
+    if medium is not None:
+        view["medium"] = medium
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": view,
+            "floor": {
+                "type": "rectangle",
+                "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3),
+            },
+            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(3)},
+            "ball": {"type": "sphere", "radius": 0.6, "bsdf": {"type": "dielectric"}},
+            "panel": {
+                "type": "rectangle",
+                "to_world": placed,
+                "light": {"type": "area", "radiance": light("panel")},
+            },
+            "globe": {
+                "type": "sphere",
+                "radius": 0.3,
+                "center": [1.5, 0, 0],
+                "light": {"type": "area", "radiance": light("globe")},
+            },
+            "bulb": {"type": "point", "position": [-1.5, 1, 1], "intensity": light("bulb")},
+            "sky": {"type": "constant", "radiance": light("sky")},
+        },
+        optimize=False,
+    )
+
+
+def integrator(**parameters):
+    return bdpt(**{"max_depth": 4, "light_groups": GROUPS} | parameters)
+
+
+def layers(integrator, target, spp=8, seed=3):
+    """The image (height, width, colours), and that of each light group, by name."""
+    image = np.array(integrator.render(target, spp=spp, seed=seed), dtype=np.float64)
+    names = integrator.aov_names()
+    first = image.shape[-1] - len(names)
+    found = {}
+    for i, name in enumerate(names):
+        if name.startswith("groups."):
+            group = name.split(".")[1]
+            found.setdefault(group, []).append(image[..., first + i])
+    return image[..., :first], {group: np.stack(channels, axis=-1) for group, channels in found.items()}
+
+
+def check_sum(image, groups):
+    """The layers add up to the image up to the rounding of single precision (2^-24 for each of some ten
+    additions, relative to the brightest pixel, whose filtered samples a pixel may share)."""
+    assert sum(group.max() > 0 for group in groups.values()) > 1
+    np.testing.assert_allclose(sum(groups.values()), image, rtol=2e-6, atol=2e-6 * image.max())
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{"connections": "one"}, {"connections": "all"}, {"light_paths": 0}],
+    ids=["one", "all", "path tracing"],
+)
+def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
+    """Rationale: emitters are selected by their sampling weight, not their radiance, so that a render in
+    which the others are black traces the same paths with the same weights. Expected: each layer is that
+    image, of a crop window, with every strategy. Tolerance: order of atomic additions."""
+    window = {"crop_offset_x": 1, "crop_offset_y": 2, "crop_width": 6, "crop_height": 5}
+    method = integrator(skip="none", **parameters)
+    image, groups = layers(method, scene(**window))
+    assert image.shape == (5, 6, 3) and list(groups) == list(OF_GROUPS)
+    check_sum(image, groups)
+    alone = bdpt(max_depth=4, skip="none", **parameters)
+    for name, lit in OF_GROUPS.items():
+        expected, _ = layers(alone, scene(lit, **window))
+        np.testing.assert_allclose(groups[name], expected, rtol=1e-5, atol=2e-6 * image.max())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "of_scene"),
+    [
+        ({}, {"rfilter": "box"}),
+        ({"merging": True}, {}),
+        ({"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}, {}),
+        ({"max_depth": 3, "layers": "strategies"}, {}),
+        ({"guiding": "always"}, {}),
+        ({"connections": "all"}, {"medium": fog()}),
+    ],
+    ids=["pilot", "merging", "other layers", "strategies", "guiding", "fog"],
+)
+def test_layers_add_up_to_the_image(parameters, of_scene):
+    """Expected: with what else a render may do, the layers add up."""
+    check_sum(*layers(integrator(**parameters), scene(**of_scene)))
+
+
+def test_layers_of_bands_add_up_to_them():
+    """Expected: on a ``specfilm`` a group has a layer of each band, in the film and in aov_names()."""
+    mi.set_variant(variants.of("spectral"))
+    low, high = ({"type": "spectrum", "value": v} for v in ([(400, 1), (500, 1)], [(500, 1), (700, 1)]))
+    film = {"type": "specfilm", "width": 4, "height": 4, "low": low, "high": high}
+    box = mi.cornell_box() | {"bulb": {"type": "point", "position": [0, 0, 0.5]}}
+    box["sensor"]["film"] = film
+    method = integrator(light_groups="lamp: light")
+    image, groups = layers(method, mi.load_dict(box))
+    assert method.aov_names() == [f"groups.{g}.{b}" for g in ("lamp", "rest") for b in ("low", "high")]
+    check_sum(image, groups)
+
+
+def test_connections_to_several_light_subpaths_know_their_emitter():
+    """Rationale: a lane draws a connection to one of four light subpaths, of different emitters. The panel
+    alone is red. Expected: no red light in the layers of the others but the sky's, which is grey."""
+    method = integrator(decisions=JOINED)
+    image, groups = layers(method, scene(rfilter="box"), spp=64)
+    assert method.statistics["decisions"][-1]["joined"] == 4
+    check_sum(image, groups)
+    assert groups["low"][..., 0].max() == 0 < groups["high"][..., 0].max()
+    assert np.ptp(groups["rest"], axis=-1).max() < 1e-5 * image.max()
+
+
+@pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
+def test_a_merge_knows_its_emitter(plate):
+    """Rationale: merges alone sample a point light seen through a plate; through one that is nearly smooth
+    they are those of hard paths. A red and a blue light. Expected: each layer has its light's colour alone.
+    """
+    glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
+    glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
+    red, blue = (
+        point() | {"intensity": {"type": "rgb", "value": value}, "position": [x, 0, 4.5]}
+        for value, x in (([9.0, 0, 0], 0.5), ([0, 0, 9.0], -0.5))
+    )
+    target = mi.load_dict(under_glass(red, plate=glass, other=blue))
+    image, groups = layers(bdpt(max_depth=6, merging=True, light_groups="auto"), target)
+    check_sum(image, groups)
+    assert groups["light"][..., 2].max() == 0 < groups["light"][..., 0].max()
+    assert groups["other"][..., 0].max() == 0 < groups["other"][..., 2].max()
+
+
+def test_a_resumed_and_a_joined_render_keep_the_layers():
+    """Expected: a render that goes on from a snapshot has the layers of one in one piece; two renders of
+    different seeds, joined, have layers that add up and are the mean of theirs. Tolerance: rounding."""
+    target, method = scene(rfilter="box"), integrator(skip="none", spp_per_pass=4)
+    _, groups = layers(method, target)
+    start = stopped(method, target, 1, spp=8, seed=3)
+    names, resumed = method.aov_names(), np.array(method.render(target, spp=8, seed=3, start=start))
+    assert names[-1] == "groups.rest.B"
+    np.testing.assert_allclose(resumed[..., -9:], np.concatenate(list(groups.values()), -1), **ROUNDING)
+    parts = [stopped(method, target, None, spp=8, seed=seed) for seed in (3, 4)]
+    joined = np.array(method.assemble(parts[0].joined(parts[1]), target), dtype=np.float64)
+    other = np.array(method.render(target, spp=8, seed=4))
+    np.testing.assert_allclose(joined, (resumed + other) / 2, **ROUNDING)
+
+
+def test_without_light_groups_nothing_is_recorded_for_them(monkeypatch):
+    """Rationale: a render without them is to record the same kernels. Expected: nothing of theirs is asked,
+    and samples of next-event estimation carry no index."""
+
+    def refuse(*_):
+        raise AssertionError("recorded for light groups")
+
+    monkeypatch.setattr(LightGroups, "at", refuse)
+    monkeypatch.setattr(Emitters, "index_of_hit", refuse)
+    monkeypatch.setattr(sink._Total, "begin", refuse)
+    target = scene()
+    image, groups = layers(bdpt(max_depth=4, skip="none"), target, spp=1)
+    assert image.max() > 0 and not groups
+    direct = Emitters(target).sample_direct(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.3), mi.Bool(True))
+    assert direct.index is None
+
+
+def test_each_emitter_has_its_own_group():
+    """Expected: ``auto`` names groups by the ids of shapes or emitters; of more than eight emitters the
+    first eight by name, in the order of their numbers, have their own, the others are the rest."""
+    target = scene()
+    made = LightGroups.of(target, "auto")
+    assert sorted(made.names) == sorted(LAMPS)
+    for emitter, group in zip(target.emitters(), made.of_emitters, strict=True):
+        assert made.names[group] in ids(emitter)
+    lamps = {f"lamp{i}": {"type": "point", "position": [i, 0, 0]} for i in range(12)}
+    made = LightGroups.of(mi.load_dict({"type": "scene"} | lamps), "auto")
+    assert made.names == (*(f"lamp{i}" for i in range(8)), "rest")
+    assert sorted(made.of_emitters) == [0, 1, 2, 3, 4, 5, 6, 7, 8, 8, 8, 8]
+
+
+def test_emitters_without_id_go_by_their_plugin():
+    """Expected: an emitter without id, and on no shape with one, is found by its plugin's name."""
+    shape = '<shape type="sphere"><emitter type="area"/></shape>'
+    target = mi.load_string(f'<scene version="3.0.0">{shape}{shape}<emitter type="constant"/></scene>')
+    assert LightGroups.of(target, "auto").names == ("area", "area_2", "constant")
+    assert LightGroups.of(target, "sky: constant").names == ("sky", "rest")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("panel", "'panel' has no group; write it like"),
+        ("a b: panel", "'a b' cannot be a layer's name; use letters"),
+        ("a:", "the group a has no emitters; write it like"),
+        ("a: panel; a: globe", "there are two groups a; list"),
+        ("rest: panel", "rest is the group of all other emitters; give"),
+        (";".join(f"g{i}: panel" for i in range(17)), "there are 17 groups, 16 at most; join"),
+        ("a: pannel", "no emitter, and no shape with one, has the id 'pannel'; did you mean panel.*globe"),
+        ("a: floor", "has the id 'floor'"),
+        ("a: panel; b: p*", "the emitter 'panel' is in the groups a and b; take it out of one"),
+    ],
+)
+def test_what_is_no_light_group(text, words):
+    """Expected: an error that names the parameter, the value and what to do."""
+    with pytest.raises(ValueError, match=f"bdpt: light_groups=.*{words}"):
+        LightGroups.of(scene(), text)
+
+
+def test_light_groups_of_a_dark_scene():
+    """Expected: an error; a scene without emitters has no light to divide."""
+    with pytest.raises(ValueError, match="light_groups='auto': the scene has no emitters; leave"):
+        LightGroups.of(mi.load_dict({"type": "scene", "s": {"type": "sphere"}}), "auto")
+    with pytest.raises(RuntimeError, match="light_groups=3 must be a string"):
+        bdpt(light_groups=3)
