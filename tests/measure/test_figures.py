@@ -62,6 +62,19 @@ def test_no_text_lies_over_another(monkeypatch, plot, columns):
     no two texts overlap."""
     figure = drawn(monkeypatch, plot, columns)
     assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
+    check_texts(figure)
+
+
+def test_a_single_panel_is_one_column_wide(monkeypatch):
+    """Rationale: one scene drew its curves into the left quarter of a white page, and the legend of two
+    columns was cut at the edge of one. Expected: 8.5 cm, all text inside."""
+    figure = drawn(monkeypatch, "seconds", 2, ("b",))
+    assert figure.get_size_inches()[0] * 2.54 == pytest.approx(8.5)
+    check_texts(figure)
+
+
+def check_texts(figure):
+    """All text is inside of a figure, of 6 points or more, and none over another."""
     texts = [t for t in figure.findobj(figures.plt.Text) if t.get_text().strip() and t.get_visible()]
     labels = [t for a in figure.axes for axis in (a.xaxis, a.yaxis) for t in hidden(axis)]
     texts = [t for t in texts if not any(t is label for label in labels)]
@@ -84,6 +97,21 @@ def hidden(axis):
         for label in (tick.label1, tick.label2)
         if not low <= tick.get_loc() <= high
     ]
+
+
+@pytest.mark.parametrize(
+    ("high", "labels"), [(0.09, ["0.01", "0.02", "0.05"]), (90, [r"10^{-2}", r"10^{1}"])]
+)
+def test_short_axes_have_labels(high, labels):
+    """Rationale: an axis of less than a decade had a single label. Expected: 1, 2 and 5 times the powers of
+    ten there, the powers alone elsewhere."""
+    figure, axis = figures.plt.subplots()
+    axis.set(xscale="log", xlim=(0.009, high))
+    figures._ticks(axis.xaxis)
+    figure.draw_without_rendering()
+    found = [label.get_text() for label in axis.get_xticklabels()]
+    figures.plt.close(figure)
+    assert all(any(label in text for text in found) for label in labels)
 
 
 def test_curves_are_raw_and_trimmed(monkeypatch):

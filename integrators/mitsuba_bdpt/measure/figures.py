@@ -94,6 +94,7 @@ PAPER = {
 DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
+SHORT = 30.0  # ratio of the ends of a logarithmic axis
 BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
 
 
@@ -135,15 +136,15 @@ def convergence(
             Line2D([], [], color="black", linestyle=DASHES[kind], label=text) for kind, text in KINDS.items()
         ]
         handles.append(Line2D([], [], color="black", linestyle=(0, (1, 2)), linewidth=0.8, label="slope −1"))
-        _legend(figure, handles, columns)
+        _legend(figure, handles)
         save(figure, path)
 
 
-def _legend(figure, handles: Sequence, columns: int) -> None:
+def _legend(figure, handles: Sequence) -> None:
     """Put a legend under the axes, and make the figure higher by it."""
     longest = max(len(handle.get_label()) for handle in handles)
-    across = max(1, min(len(handles), int(WIDTHS[columns] / (0.4 + 0.055 * longest))))
     width, height = figure.get_size_inches()
+    across = max(1, min(len(handles), int(width / (0.4 + 0.055 * longest))))
     figure.set_size_inches(width, height + 0.15 * math.ceil(len(handles) / across) + 0.1)
     figure.legend(handles=handles, loc="outside lower center", ncols=across)
 
@@ -165,12 +166,22 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
                 axis.plot(x[hollow], middle[hollow], **look | {"linestyle": "", "markerfacecolor": "white"})
             first = points if first is None else first
     axis.set(xscale="log", yscale="log", title=scene)
-    for side in (axis.xaxis, axis.yaxis):
-        side.set_minor_formatter(NullFormatter())
-        side.set_major_locator(LogLocator(numticks=6))
     if first is not None and len(first) > 1:
         (x0, _, y0, _), (x1, _, _, _) = first[0], first[-1]
         axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8, zorder=1)
+    for side in (axis.xaxis, axis.yaxis):
+        _ticks(side)
+
+
+def _ticks(side) -> None:
+    """Label powers of ten of a logarithmic axis; where there are few, 2 and 5 times these too."""
+    low, high = side.get_view_interval()
+    side.set_minor_formatter(NullFormatter())
+    if high < SHORT * low:
+        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+        side.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.10g}"))
+    else:
+        side.set_major_locator(LogLocator(numticks=6))
 
 
 def _points(
@@ -218,8 +229,8 @@ def efficiencies(
                     _dot(axis, results, scene, rival, error, y, style(results.methods, rival))
         axis.axvline(1, color="black", linewidth=0.6)
         axis.set(xscale="log", xlabel=f"efficiency of {results.methods[0]}, {results.deciding} spp")
+        _ticks(axis.xaxis)
         axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}x"))
-        axis.xaxis.set_minor_formatter(NullFormatter())
         axis.set_yticks(range(len(scenes)), scenes)
         axis.tick_params(axis="y", length=0)
         axis.set_ylim(len(scenes) - 0.5, -0.5)
@@ -238,7 +249,7 @@ def efficiencies(
                 [], [], label="at least, at most", **plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
             ),
         ]
-        _legend(figure, handles, columns)
+        _legend(figure, handles)
         save(figure, path)
 
 
@@ -277,7 +288,7 @@ def rays(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] |
         axis.tick_params(axis="y", length=0)
         axis.set_ylim(len(scenes) - 0.5, -0.5)
         axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {results.deciding} spp")
-        _legend(figure, axis.get_legend_handles_labels()[0], columns)
+        _legend(figure, axis.get_legend_handles_labels()[0])
         save(figure, path)
 
 

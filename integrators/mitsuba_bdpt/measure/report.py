@@ -174,7 +174,15 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         "bias check": bias,
         LIGHT_TRACER: lambda scene: _with_bias(results, scene, LIGHT_TRACER),
     }
-    return by_scene(results.scenes, columns)
+    of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT, LIGHT_TRACER: LIGHT_TRACER}
+    return by_scene(results.scenes, _rendered(results, columns, of))
+
+
+def _rendered(
+    results: Results, columns: dict[str, Callable[[str], object]], of: Mapping[str, str]
+) -> dict[str, Callable[[str], object]]:
+    """Return the ``columns`` without those ``of`` integrators that were not rendered."""
+    return {name: made for name, made in columns.items() if of.get(name) in (None, *results.methods)}
 
 
 def _with_bias(results: Results, scene: str, rival: str) -> str:
@@ -188,7 +196,7 @@ def _slope(results: Results, notes: dict[str, str], scene: str) -> str:
     found = results.convergence(scene, results.methods[0])
     if len(set(map(_chosen, rows))) > 1:
         return said(lambda: found) + ", between decisions"
-    expected = found.low <= -1 <= found.high or scene in notes
+    expected = found.low <= -1 <= found.high or scene in notes or not notes
     return said(lambda: found) + ("" if expected else ", **unexplained**")
 
 
@@ -224,7 +232,7 @@ def choices_table(results: Results) -> str:
         "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
         f"the same, {NONE}": lambda scene: _rays_per_sample(results.of(scene, NONE, results.deciding)),
     }
-    return by_scene(results.scenes, columns)
+    return by_scene(results.scenes, _rendered(results, columns, {f"the same, {NONE}": NONE}))
 
 
 def _chosen(row: Row) -> str:
