@@ -63,6 +63,13 @@ MUTANTS = (
         ("tests/images/test_light_groups.py::test_connections_to_several_light_subpaths_know_their_emitter",),
     ),
     Mutant(
+        "light groups: a mix takes the first weight for all colours",
+        "files/mixing.py",
+        "factors[group][i]",
+        "factors[group][0]",
+        ("tests/cli/test_mix.py::test_the_command_scales_the_layers[False]",),
+    ),
+    Mutant(
         "light groups: splats have none",
         "image/accumulator.py",
         "row = 0 if c.light_group is None else c.light_group * self._down",

@@ -30,6 +30,7 @@ __all__ = [
     "UsageTypeError",
     "__version__",
     "llvm_choice",
+    "mix",
 ]
 
 llvm_choice: _llvm.Choice | None = None
@@ -47,6 +48,7 @@ def _runs_own_command(arguments: list[str]) -> bool:
 
 try:
     llvm_choice = _llvm.prepare()
+    from .files.mixing import mix
     from .integrator import BDPTIntegrator
     from .integrator import register as _register
     from .run.rendering import PassReport

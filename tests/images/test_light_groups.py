@@ -9,6 +9,7 @@ import pytest
 import variants
 from internals import bdpt
 from media_parts import fog
+from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.light_groups import LightGroups, ids
 from mitsuba_bdpt.image import sink
@@ -31,10 +32,12 @@ OF_GROUPS = {"low": ("globe", "bulb"), "high": ("panel",), "rest": ("sky",)}
 
 
 def scene(lit=tuple(LAMPS), medium=None, rfilter="gaussian", **crop):
-    """A floor, a wall and a ball of glass under four emitters, black but those in ``lit``."""
+    """A floor, a wall and a ball of glass under four emitters, black but those in ``lit`` (names, or their
+    radiances)."""
 
     def light(name):
-        return {"type": "rgb", "value": [float(x) * (name in lit) for x in LAMPS[name]]}
+        colours = lit if isinstance(lit, dict) else LAMPS
+        return {"type": "rgb", "value": [float(x) * (name in lit) for x in colours[name]]}
 
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": rfilter}}
     film |= {"pixel_format": "rgb", "component_format": "float32"} | crop
@@ -172,6 +175,18 @@ def test_a_merge_knows_its_emitter(plate):
     check_sum(image, groups)
     assert groups["light"][..., 2].max() == 0 < groups["light"][..., 0].max()
     assert groups["other"][..., 0].max() == 0 < groups["other"][..., 2].max()
+
+
+def test_mixed_light_is_that_of_other_lamps():
+    """Rationale: see `test_a_layer_is_the_image_of_its_emitters_alone`. Expected: the mix of a render is the
+    render of lamps with radiances times the weights. Tolerance: order of atomic additions."""
+    method, target = bdpt(max_depth=4, skip="none", light_groups="auto"), scene()
+    method.render(target, spp=8, seed=3)
+    weights = {"panel": 1.5, "globe": (0.2, 0.2, 0.3), "sky": 0}
+    mixed = np.array(mix(target.sensors()[0].film().bitmap(), weights))
+    lamps = {name: tuple(np.array(LAMPS[name]) * weights.get(name, 1)) for name in LAMPS}
+    expected, _ = layers(bdpt(max_depth=4, skip="none"), scene(lamps))
+    np.testing.assert_allclose(mixed, expected, rtol=1e-5, atol=2e-6 * expected.max())
 
 
 def test_a_resumed_and_a_joined_render_keep_the_layers():

@@ -1,8 +1,8 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
-``render`` renders a scene file; ``explain`` describes such a render; ``doctor`` checks the installation;
-`measuring` declares the commands that measure. Mitsuba is imported inside `main`, because `doctor` has to run
-where that import fails.
+``render`` renders a scene file; ``explain`` describes such a render; ``mix`` weights light groups anew;
+``doctor`` checks the installation; `measuring` declares the commands that measure. Mitsuba is imported inside
+`main`, because `doctor` has to run where that import fails.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .. import removed
 from ..errors import did_you_mean
 from ..progress import KINDS
 from . import measuring, mistakes
-from .values import crop, definition, frames, number, property_, resume, size
+from .values import crop, definition, frames, number, property_, resume, size, weight
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -43,6 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
     with log.lines(getattr(options, "verbose", 0)):
         if options.command in measuring.COMMANDS:
             return measuring.run(options)
+        if options.command == "mix":
+            from . import mix
+
+            return mix.run(options)
         return render.explain(options) if options.command == "explain" else render.run(options)
 
 
@@ -106,8 +110,23 @@ def build_parser() -> argparse.ArgumentParser:
     explain = add_command("explain", text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
+    add_mix_arguments(
+        add_command("mix", "weight the light groups of a rendered image anew, without a render")
+    )
     measuring.add_commands(add_command)
     return parser
+
+
+def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("image", type=Path, help="EXR file that was rendered with light_groups")
+    text = "factor of a group's light, or three for red, green and blue; 1 for groups that are left out"
+    add("weights", type=weight, nargs="+", metavar="GROUP=X[,Y,Z]", help=text)
+    text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
+    add("-o", "--output", type=Path, help=text)
+    add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
+    text = "brightness of the PNG in stops; default: %(default)s"
+    add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
 
 
 def _versions() -> str:

@@ -49,6 +49,15 @@ def whole(text: str) -> int:
     return int(value)
 
 
+def weight(text: str) -> tuple[str, tuple[float, ...]]:
+    """Parse ``GROUP=X`` or ``GROUP=X,Y,Z``, the weight of a light group."""
+    name, equals, values = text.partition("=")
+    with contextlib.suppress(ValueError):
+        if name.strip() and equals:
+            return name.strip(), tuple(float(value) for value in values.split(","))
+    raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form GROUP=X or GROUP=X,Y,Z")
+
+
 def size(text: str) -> tuple[int, ...]:
     """Parse ``WIDTHxHEIGHT``, integers of at least 1."""
     return _pixels(text, r"(\d+)[xX](\d+)", "WIDTHxHEIGHT")

@@ -1,0 +1,39 @@
+"""``python -m mitsuba_bdpt mix``: a new balance of light groups, without a render."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections import Counter
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..errors import CommandError
+from ..files.images import check_output, developed, grey, write_whole
+from ..files.mixing import mix
+from .mistakes import answered
+
+
+def run(options: Namespace) -> int | None:
+    """Mix as the command-line `options` request; returns the exit status."""
+    return answered(lambda: _run(options))
+
+
+def _run(options: Namespace) -> int:
+    mi.set_variant(options.variant)
+    output: Path = options.output or options.image.with_suffix(".mixed.png")
+    is_exr = output.suffix.lower() == ".exr"
+    check_output(output, ".exr" if is_exr else ".png")
+    twice = [name for name, count in Counter(name for name, _ in options.weights).items() if count > 1]
+    if twice:
+        raise CommandError(f"{twice[0]} has two weights; give it one.")
+    mixed = mix(options.image, dict(options.weights))
+    if is_exr:
+        write_whole(mixed, output, mi.Bitmap.FileFormat.OpenEXR)
+    of_bands = mixed.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel
+    screen = grey(np.array(mixed)) if of_bands else mixed
+    png = developed(screen, options.exposure)
+    write_whole(png, output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+    print(output)
+    return 0
