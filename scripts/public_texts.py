@@ -25,7 +25,7 @@ def check_folder(folder: Path) -> None:
     for name, mark in (("table.md", MARK), ("summary.md", MARK), ("page.html", f"<title>{page.TITLE}")):
         check_own(folder / name, mark, remedy)
     if not (folder / "table.md").is_file():
-        for name in ("rows.csv", "rows.parquet"):
+        for name in ("rows.csv", "rows.json", "rows.parquet"):
             if (folder / name).exists():
                 raise CommandError(f"{str(folder / name)!r} exists and is of another sweep; {remedy}")
 
@@ -75,7 +75,7 @@ class Texts:
             results.write_tables(table, self.folder)
             loaded = results.load(Project(self.folder), self.folder)
         else:
-            for name in ("rows.csv", "rows.parquet", "page.html"):
+            for name in ("rows.csv", "rows.json", "rows.parquet", "page.html"):
                 (self.folder / name).unlink(missing_ok=True)
             loaded = Results([], {}, {}), {}
         findings = Findings(*loaded, self.left_out, self.notes)

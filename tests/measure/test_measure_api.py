@@ -149,6 +149,9 @@ def test_a_sweep_takes_dictionaries(here):
     rows = measure.run_sweep("mine.toml", dictionaries, reference_seconds=0, output=Path("rows"))
     assert [row["seed"] for row in rows] == [1, 2] and all(row["rel_mse"] > 0 for row in rows)
     assert json.loads(rows[0]["parameters"]) == {"type": "bdpt"}
+    content = {"resolution": 8, "spp": [4], "seeds": 2, "max_depth": 3, "integrator": [{"type": "bdpt"}]}
+    again = measure.run_sweep(content, dictionaries, reference_seconds=0, output=Path("rows"))
+    assert [row["key"] for row in again] == [row["key"] for row in rows]  # nothing is rendered anew
     with pytest.raises(ValueError, match="scheduler=x:1 with scene='room', a dictionary"):
         measure.run_sweep("mine.toml", dictionaries, scheduler="x:1")
 

@@ -1,5 +1,6 @@
 """References and sweeps: what is stored, what a restart keeps, what is refused."""
 
+import csv
 import json
 import re
 import signal
@@ -20,9 +21,9 @@ from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import agreement, analysis, making, metrics, probes, reference, scenes, sweep
 from mitsuba_bdpt.measure.making import Job
-from mitsuba_bdpt.measure.preset import Cells, read_preset
+from mitsuba_bdpt.measure.preset import Cells, preset_of, read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
-from mitsuba_bdpt.measure.results import errors
+from mitsuba_bdpt.measure.results import errors, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
 from patience import PATIENCE
@@ -694,7 +695,7 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (("seeds = 2", "seeds = 0"), "seeds=0 must be a whole number"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] of cornell_box must be as many as spp"),
         (("seeds = 2", "sedes = 2"), "sedes is not a key"),
-        (("seeds = 2\n", ""), "seeds is missing"),
+        (('scenes = ["cornell_box"]', ""), "scenes is missing"),
         (("[2, 4]", "[2.5]"), r"spp=\[2.5\] must be a list of whole numbers"),
         (("cornell_box", "nowhere"), "scene='nowhere'"),
         (('match = "seconds"', 'match = "energy"'), "match='energy'.*'seconds', 'spp'"),
@@ -752,6 +753,72 @@ def test_rivals_are_those_that_see_the_media(name):
     assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
     assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
     assert making._way(scene, "path") == {"type": path_tracers(scene.has_media)[0]}
+
+
+def test_three_lines_are_a_preset(tmp_path):
+    """Expected: scenes, samples and seeds alone; the integrators are this package's and the path tracer that
+    sees what is in the scene, in equal time; scenes and samples too may be left out in Python."""
+    text = 'scenes = ["cornell_box", "fog_lamp"]\nspp = [4, 16]\nseeds = 5\n'
+    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
+    found = [[m.name for m in Cells(REPOSITORY, preset, one).methods] for one in preset.subjects]
+    assert found == [["bdpt", "path"], ["bdpt", "volpath"]]
+    assert {m.match for m in preset.methods[1:]} == {"seconds"} and preset.resolution == 128
+    assert [(one.spp, one.seeds) for one in preset.subjects] == [((4, 16), (5, 5))] * 2
+    given = Project(tmp_path, {"mine": REPOSITORY.scene("cornell_box")})
+    (subject,) = preset_of(Path("preset"), {"seeds": 3}, given).subjects
+    assert subject.name == "cornell_box" and subject.spp == (4, 16, 64) and subject.seeds == (3, 3, 3)
+    with pytest.raises(CommandError, match="preset: sedes is not a key of a preset"):
+        preset_of(Path("preset"), {"sedes": 3}, given)
+
+
+def test_the_table_is_tidy(tmp_path):
+    """Rationale: 48 columns, five of them JSON, and images named by a hash. Expected: a row per render whose
+    cells are texts or numbers, with the name of its image, which is there under that name; parameters,
+    decisions and statistics in a file beside it; all columns in Parquet."""
+    row = {
+        "scene": "box",
+        "method": "path multijitter",
+        "sampler": "multijitter",
+        "spp": 16,
+        "seed": 1,
+        "parameters": '{"type": "path", "rr_depth": 3}',
+        "decisions": "[]",
+        "statistics": '{"rays": 3}',
+        "versions": '{"mitsuba": "3.9.1"}',
+        "machine": "a",
+        "started": "now",
+        "key": "abc",
+        "budget": 8,
+        "seconds": 1.5,
+        "spread": 0.25,
+        "rel_mse": 0.5,
+        "energy": 0.9,
+        "flip": None,
+        "rays_camera": 7,
+        "tile_means": [1.0, 2.0],
+    }
+    stored = tmp_path / "images" / "box" / "abc.exr"
+    stored.parent.mkdir(parents=True)
+    stored.write_bytes(b"an image")
+    for _ in range(2):
+        write_tables([row, row | {"seed": 2, "key": "gone"}], tmp_path)
+    first, second = csv.DictReader((tmp_path / "rows.csv").read_text().splitlines())
+    assert not [cell for cell in first.values() if set(cell) & set("{}[]")]
+    assert first["parameters"] == "path rr_depth=3" and first["integrator"] == "path multijitter"
+    assert (first["variance"], first["energy"], first["rays_camera"], first["flip"]) == (
+        "0.25",
+        "0.9",
+        "7",
+        "",
+    )
+    assert first["image"] == "box_path-multijitter_16_1.exr" and second["image"] == ""
+    assert (tmp_path / "images" / first["image"]).read_bytes() == b"an image"
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["parameters"] == {
+        "type": "path",
+        "rr_depth": 3,
+    }
+    assert set(pyarrow.parquet.read_table(tmp_path / "rows.parquet").column_names) == set(row)
+    assert not list(tmp_path.rglob(".*"))
 
 
 def keys(folder, text=PRESET):

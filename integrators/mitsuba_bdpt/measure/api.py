@@ -98,18 +98,22 @@ def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dic
 
 
 def run_sweep(
-    preset: str | Path, dictionaries: Sequence[SceneDict] = (), *, project: str | Path = ".", **options
+    preset: str | Path | Mapping[str, Any],
+    dictionaries: Sequence[SceneDict] = (),
+    *,
+    project: str | Path = ".",
+    **options,
 ) -> list[Row]:
-    """Render the missing cells of a preset, a TOML file.
+    """Render the missing cells of a preset, a TOML file or a dictionary of its keys.
 
-    ``dictionaries``: scenes by name. ``options``: those of `options.Sweep`. Returns the rows. Raises
-    ``FailureError`` if a render failed; the other rows are kept.
+    ``dictionaries``: scenes by name; a preset without ``scenes`` renders all of them. ``options``: those of
+    `options.Sweep`. Returns the rows. Raises ``FailureError`` if a render failed; the other rows are kept.
     """
     from . import sweep as module
 
     asked = _options(available.Sweep, options)
     with _measured(dictionaries, project) as (found, _):
-        rows, failed = module.swept(found, str(preset), asked)
+        rows, failed = module.swept(found, preset if isinstance(preset, Mapping) else str(preset), asked)
     if failed:
         raise FailureError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
     return rows

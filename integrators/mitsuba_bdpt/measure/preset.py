@@ -1,4 +1,12 @@
-"""Presets: what a sweep renders, as TOML.
+"""Presets: what a sweep renders, as TOML, or in Python as a dictionary of the same keys.
+
+Three lines are enough::
+
+    scenes = ["caustic.xml"]
+    spp = [4, 16, 64, 256]
+    seeds = 8
+
+`DEFAULTS` has the rest. All keys::
 
     resolution = 128
     scenes = ["cornell_box", "rooms/kitchen.xml"]   # names in PROJECT/scenes, or files seen from PROJECT
@@ -41,8 +49,10 @@ import hashlib
 import json
 import os
 import platform
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -50,7 +60,8 @@ from ..errors import CommandError
 from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
 from ..host.introspection import versions
 from . import probes
-from .agreement import TILES
+from .agreement import FEWEST_RUNS, TILES
+from .options import RESOLUTION
 from .project import Project, depth_in
 from .reference import source_digest
 from .scenes import MeasuredScene
@@ -120,9 +131,30 @@ class Preset:
     probes: dict
 
 
+DEFAULTS: dict[str, Any] = {
+    "resolution": RESOLUTION,
+    "spp": [4, 16, 64],
+    "seeds": FEWEST_RUNS,
+    "integrator": [
+        {"type": "bdpt"},
+        {"type": "path", "media": False, "match": "seconds"},
+        {"type": "volpath", "media": True, "match": "seconds"},
+    ],
+}
+"""What a preset need not say: the package's integrator and Mitsuba's path tracer in equal time."""
+
+
 def read_preset(path: Path, project: Project) -> Preset:
     """Read a TOML file of a ``project``; raises ``CommandError`` naming file and key."""
-    data = read_toml(path)
+    return preset_of(path, read_toml(path), project)
+
+
+def preset_of(path: Path, given: Mapping[str, Any], project: Project) -> Preset:
+    """Return the preset of a dictionary; ``path`` names it in errors.
+
+    By default all scenes that the ``project`` has as dictionaries.
+    """
+    data = DEFAULTS | ({"scenes": list(project.given)} if project.given else {}) | dict(given)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
     _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
     for key in {"resolution", "max_depth"} & set(data):

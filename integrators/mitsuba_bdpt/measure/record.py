@@ -26,7 +26,7 @@ class Measured(Errors):
 
 
 class Row(Measured):
-    """A render of a sweep: a row of rows.csv and rows.parquet.
+    """A render of a sweep: a row of rows.parquet.
 
     Beside these columns ``rays_KIND``, the rays of `bdpt` by kind.
     """
@@ -54,6 +54,7 @@ class Row(Measured):
     width: int
     height: int
     mean: float
+    energy: NotRequired[float]  # mean over that of the reference; missing in older sweeps
     tile_means: list[float]  # `agreement.tile_columns`
     mse: float
     rel_mse_epsilon: float

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import re
+import shutil
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 
@@ -65,6 +69,7 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
         "width": image.shape[1],
         "height": image.shape[0],
         "mean": float(image.mean()),
+        "energy": float(image.mean() / ref.image.mean()),
         "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
         "mse": metrics.mse(image, ref.image),
         "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
@@ -179,14 +184,93 @@ def beside(table: list[Row], order: list[str], output: Path) -> list[Row]:
     return sorted(found, key=lambda row: order.index(row["scene"]))
 
 
+COLUMNS: dict[str, Callable[[Row], object]] = {
+    "scene": lambda row: row["scene"],
+    "integrator": lambda row: row["method"],
+    "parameters": lambda row: _plain(row["parameters"]),
+    "sampler": lambda row: row["sampler"],
+    "spp": lambda row: row["spp"],
+    "seed": lambda row: row["seed"],
+}
+"""First columns of rows.csv."""
+
+NUMBERS = {
+    "budget": "budget",
+    "seconds": "seconds",
+    "cpu_seconds": "cpu_seconds",
+    "seconds_compile": "seconds_compile",
+    "seconds_pilot": "seconds_pilot",
+    "rel_mse": "rel_mse",
+    "rel_mse_trimmed": "rel_mse_trimmed",
+    "reference_rel_mse": "reference_rel_mse",
+    "reference_rel_mse_trimmed": "reference_rel_mse_trimmed",
+    "variance": "spread",
+    "mse": "mse",
+    "mape": "mape",
+    "flip": "flip",
+    "delta_e_itp": "delta_e_itp",
+    "mean": "mean",
+    "energy": "energy",
+    "width": "width",
+    "height": "height",
+    "max_depth": "max_depth",
+}
+"""Further columns of rows.csv, and those of rows."""
+
+
+def _plain(parameters: str) -> str:
+    """Format parameters in JSON as TYPE KEY=VALUE ..."""
+    found = json.loads(parameters)
+    kind = found.pop("type", "")
+    return " ".join([kind, *(f"{key}={value}" for key, value in sorted(found.items()))])
+
+
+def named_image(row: Row) -> str:
+    """Return the name of a render's image, scene_integrator_spp_seed.exr."""
+    method = re.sub(r"[^\w.=+-]+", "-", row["method"])
+    return f"{row['scene']}_{method}_{row['spp']}_{row['seed']}.exr"
+
+
+def _name_images(table: list[Row], output: Path) -> list[str]:
+    """Link the images of the rows under their names; returns these, empty where there is no image."""
+    names: list[str] = []
+    for row in table:
+        stored, name = output / "images" / row["scene"] / f"{row['key']}.exr", named_image(row)
+        names.append(name if stored.exists() else "")
+        if stored.exists():
+            with replacing(output / "images" / name) as temporary:
+                try:
+                    os.link(stored, temporary)
+                except OSError:  # no links on this file system
+                    shutil.copyfile(stored, temporary)
+    return names
+
+
 def write_tables(table: list[Row], output: Path) -> None:
-    """Write rows.csv and rows.parquet, with the same columns."""
+    """Write rows.parquet with all columns, rows.csv with a number or a text in each cell, and rows.json.
+
+    rows.json has the parameters, decisions, statistics and versions of each render, in the order of the rows.
+    """
     columns = list(dict.fromkeys(key for row in table for key in row))
     whole = [{key: row.get(key) for key in columns} for row in table]
+    rays = [key for key in columns if key.startswith("rays_")]
+    tidy = [
+        {name: made(row) for name, made in COLUMNS.items()}
+        | {name: row.get(key) for name, key in (NUMBERS | dict(zip(rays, rays, strict=True))).items()}
+        | {"image": image}
+        for row, image in zip(table, _name_images(table, output), strict=True)
+    ]
     with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
+        writer = csv.DictWriter(file, tidy[0])
         writer.writeheader()
-        writer.writerows(whole)
+        writer.writerows(tidy)
+    parts = "parameters", "decisions", "statistics", "versions"
+    found = [
+        {key: row[key] for key in ("scene", "method", "spp", "seed", "key", "machine", "started")}
+        | {key: json.loads(row[key] or "null") for key in parts}
+        for row in table
+    ]
+    write_json(output / "rows.json", found)
     arrays = pa.Table.from_pylist(whole)
     place = columns.index("tile_means")
     means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits, as written

@@ -8,8 +8,8 @@ Errors are against the references of `making`, which are made first if missing; 
 reference changes. HDR-FLIP is computed for the first seed only, since it is slow.
 
 On a cluster, consecutive renders go to one worker; workers need the project under the same path, and the same
-software. Probes are left out there. OUTPUT/rows.csv and OUTPUT/rows.parquet have all rows, OUTPUT/probes.json
-the results of `probes`.
+software. Probes are left out there. OUTPUT/rows.parquet has all rows; OUTPUT/rows.csv their numbers, and
+OUTPUT/rows.json the parameters, decisions and statistics of each; OUTPUT/probes.json the results of `probes`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ import json
 import math
 import tempfile
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache, lru_cache, partial
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +41,7 @@ from .estimates import seed_errors
 from .making import Job, check, obtained
 from .options import VARIANT
 from .options import Sweep as Asked
-from .preset import FIRST_SEED, Cell, Cells, Preset, machine, read_preset, software
+from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
 from .record import Row
 from .reference import load_reference, make_command, too_few
@@ -410,16 +412,27 @@ def short_of_target(table: list[Row]) -> list[str]:
     ]
 
 
-def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[list[Row], list[str]]:
-    """Render the missing cells of a ``preset``; returns all rows, and failures."""
-    if options.scheduler and project.given:
+def swept(
+    project: Project, preset: str | Mapping[str, Any], options: Asked | Namespace
+) -> tuple[list[Row], list[str]]:
+    """Render the missing cells of a ``preset``; returns all rows, and failures.
+
+    ``preset``: a TOML file, its name, or its content as a dictionary.
+    """
+    if options.scheduler and (project.given or isinstance(preset, Mapping)):
+        what = f"scene={next(iter(project.given))!r}" if project.given else "the preset"
         raise CommandError(
-            f"scheduler={options.scheduler} with scene={next(iter(project.given))!r}, a dictionary, is not "
-            "possible: workers load files; write it into one"
+            f"scheduler={options.scheduler} with {what}, a dictionary, is not possible: workers load files; "
+            "write it into one"
         )
-    file = project.preset(preset)
+    if isinstance(preset, Mapping):
+        file, text = Path("sweep"), ""
+        whole = preset_of(Path("preset"), preset, project)
+    else:
+        file = project.preset(preset)
+        whole = read_preset(file, project)
+        text = file.read_text()
     output = options.output or project.root / "results" / file.stem
-    whole = read_preset(file, project)
     part = chosen(whole, options.scenes) if options.scenes else whole
     check_output(output / "rows.csv", ".csv")  # fail before rendering
     sweep = Sweep(project, part, output)
@@ -427,7 +440,7 @@ def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[li
     with showing.bar() as progress:
         if options.scheduler:
             with workers.connected(options.scheduler) as cluster:
-                sweep.run(progress, (cluster, file.read_text()))
+                sweep.run(progress, (cluster, text))
         else:
             sweep.run(progress)
     table = sweep.rows()
@@ -435,10 +448,11 @@ def swept(project: Project, preset: str, options: Asked | Namespace) -> tuple[li
         table = beside(table, [subject.name for subject in whole.subjects], output)
     if table:
         write_tables(table, output)
-    print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
+    # What time did not allow first: the figures depend on it.
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
+    print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
     return table, sweep.failed
 
 
