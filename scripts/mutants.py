@@ -1310,6 +1310,32 @@ MUTANTS = (
         ("tests/transport/test_oracle.py::test_kernel_with_merges_on_hard_paths[power-n1c1-False-0.0]",),
     ),
     Mutant(
+        "hard paths: stored vertices lose the newest merge",
+        "transport/light_path.py",
+        "(y.partial.d_vm, y.partial.d_vn), strict=False",
+        "(y.partial.d_vm, mi.Float(0)), strict=False",
+        ("tests/images/test_hard_paths.py::test_stored_vertices_keep_their_merges",),
+    ),
+    Mutant(
+        "hard paths: photons start with the density of their aim",
+        "transport/photons/photon_pass.py",
+        "unaimed = kernel.merges_hard or undersampled",
+        "unaimed = undersampled",
+        ("tests/images/test_hard_paths.py::test_images_are_those_without_merging[steel]",),
+    ),
+    Mutant(
+        "hard paths: longer than stored for s = 0 alone",
+        "transport/techniques.py",
+        "mis.choose(z.edges <= kernel.last_merged, merges, 0)",
+        "mis.choose(z.edges <= kernel.max_depth, merges, 0)",
+        (
+            (
+                "tests/images/test_hard_paths.py::test_any_choice_of_strategies_has_the_same_mean"
+                "[{'skip': 'none', 'stored_vertices': 3}]"
+            ),
+        ),
+    ),
+    Mutant(
         "merging: photons of other cells in the same bucket count",
         "merging/merging.py",
         "(dr.gather(mi.UInt64, photons.cell, place, tried) == cell)",

@@ -5,6 +5,7 @@ too: all strategies must give one mean. Photons in discs of a quarter of a pixel
 """
 
 from functools import cache
+from types import SimpleNamespace
 
 import internals
 import mitsuba as mi
@@ -12,9 +13,10 @@ import numpy as np
 import pytest
 import variants
 import welch as st
+from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import hard_paths, passes
 from mitsuba_bdpt.scene.prepared import PreparedScene
-from mitsuba_bdpt.transport import mis
+from mitsuba_bdpt.transport import light_path, mis
 from sds_scenes import (
     IOR,
     SIZE,
@@ -28,6 +30,8 @@ from sds_scenes import (
     under_glass,
 )
 from snapshots import ROUNDING
+
+import drjit as dr  # isort: skip
 
 MERGED = {"merging": True, "merging_radius": 0.25}
 
@@ -115,12 +119,13 @@ def test_images_are_those_without_merging(case):
         {"light_paths": 0},
         {"connections": "none"},
         {"heuristic": "power"},
+        {"skip": "none", "stored_vertices": 3},
     ],
     ids=str,
 )
 def test_any_choice_of_strategies_has_the_same_mean(parameters):
-    """Rationale: S is the sum of the strategies in use, so that another choice makes other paths hard.
-    Expected: the same tiles by Welch's test.
+    """Rationale: S is the sum of the strategies in use, so that another choice makes other paths hard; beyond
+    the stored vertices of light subpaths no path is hard. Expected: the same tiles by Welch's test.
     """
     found = merged("alpha .03", **parameters)
     st.assert_agree(st.compare_images(found, without_merging("alpha .03")), at_least=12)
@@ -226,3 +231,36 @@ def test_other_scenes_merge_as_before(plate, monkeypatch):
     monkeypatch.setattr(mis, "older_merges", lambda *arguments: found.append(0) or older(*arguments))
     images(described, 4, 1, merging=True)
     assert not found
+
+
+def test_stored_vertices_keep_their_merges():
+    """Expected: what inner connections read of a light vertex are the partial sums that were stored."""
+    sums = [mi.Float(0.1 * i, i) for i in range(1, 5)]
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    anchor = rays.Anchor(si.p, si.n, mi.Float(0, 0), mi.Float(0, 0))
+    vertex = SimpleNamespace(
+        si=si,
+        bsdf=si.bsdf(),
+        cos=mi.Float(1),
+        anchor=anchor,
+        throughput=mi.Spectrum(1),
+        partial=mis.Partial(*sums),
+        edges=mi.UInt32(1),
+        hit=mi.Bool(True),
+        volume=None,
+        connectible=lambda: mi.Bool(True),
+    )
+    kernel = SimpleNamespace(
+        store_size=2,
+        merges_hard=True,
+        heuristic=mis.Heuristic("balance"),
+        space=None,
+        plan=SimpleNamespace(joined=1),
+        last_stored=mi.UInt32(9),
+        shape_errors=SimpleNamespace(any=False),
+    )
+    path = light_path.allocate_light_path(kernel, 2)
+    light_path.store_light_vertex(kernel, vertex, path)
+    found = light_path.read_light_vertex(kernel, path, mi.UInt32(0)).partial
+    for a, b in zip((found.d_vcm, found.d_vc, found.d_vm, found.d_vn), sums, strict=True):
+        np.testing.assert_array_equal(a, b)

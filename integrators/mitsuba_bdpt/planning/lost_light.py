@@ -119,7 +119,8 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
 
 def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
     """Whether near-specular lobes may leave light undersampled."""
-    return prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
+    narrow = prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
+    return narrow and prepared.has_small_emitter
 
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:

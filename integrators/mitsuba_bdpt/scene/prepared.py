@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from functools import cached_property
+
 import drjit as dr
 import mitsuba as mi
 
 from .. import components
 from ..emitters.emitters import Emitters
+from ..emitters.infinite import contrast
+from ..geometry.boxes import box_of, is_finite, scene_box
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of, own_parameters
@@ -16,7 +21,12 @@ from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
 from ..transport.near_specular import near_specular
+from ..transport.photons.aim import EVEN_SKY
 from .plugin_claims import check_plugins
+
+# Area of an emitter over the square of the scene's diagonal, pi / 64 / 10: at this size a tenth of a subpath
+# hits it, of 64 that are scattered diffusely.
+SMALL = 0.005
 
 # Most cached facts about lobes of BSDFs that follow from samples.
 _LOBES = 1024
@@ -62,11 +72,36 @@ class PreparedScene:
             delta &= ~null  # which edges pass
         self.delta = any(f & delta for f in flags)
 
+    @cached_property
+    def has_small_emitter(self) -> bool:
+        """Whether an emitter may be so small that few subpaths hit it (`SMALL`), or cannot be hit.
+
+        Judged by bounding boxes. An environment counts as small unless it is even.
+        """
+        box = scene_box(self.scene)
+        size = float(dr.squared_norm(box.extents())) if is_finite(box) else math.inf
+        return any(_is_small(emitter, size) for emitter in self.scene.emitters())
+
     def stored_vertices(self, settings: Settings) -> int:
         """Longest path, in edges, that uses all strategies."""
         if settings.internals.stored_vertices is not None:
             return settings.internals.stored_vertices
         return DEFAULT_STORED if self.space is None else MAX_STORED
+
+
+def _is_small(emitter: mi.Emitter, size: float) -> bool:
+    """Whether an emitter is small in a scene whose diagonal has the square ``size``."""
+    if emitter.is_environment():
+        return contrast(emitter) > EVEN_SKY
+    delta = mi.EmitterFlags.DeltaPosition, mi.EmitterFlags.DeltaDirection
+    shape = emitter.get_shape()
+    if shape is None or any(mi.has_flag(emitter.flags(), flag) for flag in delta):
+        return True
+    box = box_of(shape)
+    if box is None:
+        return True
+    _, width, height = sorted(float(extent) for extent in box.extents())
+    return not width * height >= SMALL * size
 
 
 def _near_specular(scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family) -> list:
