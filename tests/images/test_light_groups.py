@@ -13,6 +13,7 @@ from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.light_groups import LightGroups, ids
 from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 
@@ -219,6 +220,19 @@ def test_without_light_groups_nothing_is_recorded_for_them(monkeypatch):
     assert image.max() > 0 and not groups
     direct = Emitters(target).sample_direct(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.3), mi.Bool(True))
     assert direct.index is None
+
+
+@pytest.mark.skipif(variants.BACKEND != "llvm", reason="threads are those of a CPU")
+def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
+    """Expected: on few threads always; on many with many samples per pixel, and if the copies are small."""
+    for threads, numbers, samples, mode in (
+        (2, 1 << 20, 1, dr.ReduceMode.Expand),
+        (16, 1 << 20, 8, dr.ReduceMode.Local),
+        (16, 1 << 20, 16, dr.ReduceMode.Expand),
+        (2, 1 << 28, 64, dr.ReduceMode.Local),
+    ):
+        monkeypatch.setattr(dr, "thread_count", lambda threads=threads: threads)
+        assert reduce_mode(numbers, samples) == mode
 
 
 def test_each_emitter_has_its_own_group():

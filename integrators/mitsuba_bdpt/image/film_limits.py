@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError
 from ..host import memory
-from .accumulator import Channels
+from .accumulator import COPIES_MEMORY, Channels
 from .layers import image_count
 
 # Of one array.
@@ -37,6 +38,8 @@ def check_film(film, channels: Channels, variance: bool):
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
+    if channels.groups:
+        needed += min(width * height * channels.camera * SINGLE * dr.thread_count(), COPIES_MEMORY)
     # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")
     if needed > there.bytes and not on_gpu:
