@@ -19,7 +19,17 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files import whole
 from mitsuba_bdpt.files.images import read_layers, write_layers
 from mitsuba_bdpt.files.texts import write_json
-from mitsuba_bdpt.measure import agreement, analysis, making, metrics, probes, reference, scenes, sweep
+from mitsuba_bdpt.measure import (
+    agreement,
+    analysis,
+    making,
+    metrics,
+    probes,
+    reference,
+    scenes,
+    showing,
+    sweep,
+)
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import Cells, preset_of, read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
@@ -819,6 +829,30 @@ def test_the_table_is_tidy(tmp_path):
     }
     assert set(pyarrow.parquet.read_table(tmp_path / "rows.parquet").column_names) == set(row)
     assert not list(tmp_path.rglob(".*"))
+
+
+def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
+    """Expected: eight renders of a second each, of which 5.5 s allow six: all budgets of the first seed, then
+    of the second; the cut ones are named with the option that has time for them, two more seconds, and a
+    second run renders them."""
+    preset = read_preset(preset_file(tmp_path), REPOSITORY)
+    found, clock = [], [0.0]
+    monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
+
+    def rendered(self, bench, cell):
+        clock[0] += 1
+        found.append(cell)
+
+    monkeypatch.setattr(sweep.Sweep, "_cell", rendered)
+    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
+    made.run(showing.bar(), seconds=5.5)
+    assert [cell.seed for cell in found] == [1, 1, 1, 1, 2, 2]
+    assert {cell.budget for cell in found[:4]} == {2, 4}
+    text = "cornell_box, 2 of 8 renders, from seed 2 on; run it again with --seconds 2, about"
+    assert made.cut == text
+    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
+    made.run(showing.bar(), seconds=100)
+    assert len(found) == 6 + 8 and made.cut == ""
 
 
 def keys(folder, text=PRESET):

@@ -127,6 +127,13 @@ class Sweep(Options):
         None, str, "address of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
     )
     reference_seconds: float = _reference_seconds()
+    seconds: float | None = option(
+        None,
+        SECONDS,
+        "seconds of the renders, beside references; what does not fit is cut, later seeds first, and said; "
+        "default: no limit",
+        metavar="SECONDS",
+    )
 
 
 FIGURE_FORMATS = (".pdf", ".svg", ".png")

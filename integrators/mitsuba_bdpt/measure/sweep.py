@@ -18,6 +18,7 @@ import datetime
 import json
 import math
 import tempfile
+import time
 from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -201,10 +202,13 @@ def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
 
 
 class Sweep:
-    """A preset being rendered into a folder; ``failed``: messages of failures."""
+    """A preset being rendered into a folder.
+
+    ``failed``: messages of failures; ``cut``: what was left out for lack of time.
+    """
 
     def __init__(self, project: Project, preset: Preset, output: Path):
-        self.project, self.preset, self.output, self.failed = project, preset, output, []
+        self.project, self.preset, self.output, self.failed, self.cut = project, preset, output, [], ""
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
@@ -248,10 +252,11 @@ class Sweep:
                 self._note(f"{cells.subject.name}: no rows", error)
         return found
 
-    def run(self, progress: Progress, elsewhere=None):
+    def run(self, progress: Progress, elsewhere=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
 
-        ``elsewhere``: a `workers.Cluster` and the preset's text, to render on a cluster.
+        ``elsewhere``: a `workers.Cluster` and the preset's text, to render on a cluster. ``seconds``: limit,
+        shared equally by the scenes; what does not fit is recorded in ``cut``.
         """
         scenes, todo = self.scenes, self._todo
         probed = 0 if elsewhere else len(self.preset.probes)
@@ -261,12 +266,34 @@ class Sweep:
             self._remote(*elsewhere, scenes, todo)
             return
         self._probes()
+        if seconds is not None:
+            self._limited(seconds)
+            return
         for cells, missing in zip(scenes, todo, strict=True):
             bench = Bench(cells, self.output)
             while missing := missing or self._more(cells):
                 for cell in missing:
                     self._cell(bench, cell)
                 missing = []
+
+    def _limited(self, seconds: float):
+        """Render seed by seed, all budgets of each, until the ``seconds`` are over."""
+        started = time.monotonic()
+        total, done, cut = sum(map(len, self._todo)), 0, list[str]()
+        for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
+            bench, end = Bench(cells, self.output), started + seconds * (i + 1) / len(self.scenes)
+            for j, cell in enumerate(sorted(missing, key=lambda cell: cell.seed)):
+                if time.monotonic() >= end:
+                    cut.append(
+                        f"{cells.subject.name}, {len(missing) - j} of {len(missing)} renders, from seed "
+                        f"{cell.seed} on"
+                    )
+                    break
+                self._cell(bench, cell)
+                done += 1
+        if cut:
+            wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
+            self.cut = f"{'; '.join(cut)}; run it again with --seconds {wanted}, about"
 
     def _probes(self):
         file = self.output / "probes.json"
@@ -425,6 +452,8 @@ def swept(
             f"scheduler={options.scheduler} with {what}, a dictionary, is not possible: workers load files; "
             "write it into one"
         )
+    if options.scheduler and options.seconds is not None:
+        raise CommandError(f"seconds={options.seconds:g} with scheduler={options.scheduler} is not possible")
     if isinstance(preset, Mapping):
         file, text = Path("sweep"), ""
         whole = preset_of(Path("preset"), preset, project)
@@ -442,13 +471,15 @@ def swept(
             with workers.connected(options.scheduler) as cluster:
                 sweep.run(progress, (cluster, text))
         else:
-            sweep.run(progress)
+            sweep.run(progress, seconds=options.seconds)
     table = sweep.rows()
     if options.scenes:
         table = beside(table, [subject.name for subject in whole.subjects], output)
     if table:
         write_tables(table, output)
     # What time did not allow first: the figures depend on it.
+    if sweep.cut:
+        print(f"cut for lack of time: {sweep.cut}")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
