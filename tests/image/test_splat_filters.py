@@ -123,12 +123,12 @@ def test_numbers_of_the_filter_are_uniform_and_independent(monkeypatch):
     dr.make_opaque(found)
     original = Accumulator.put_light
 
-    def put_light(self, position, colours, polarized, active, u):
+    def put_light(self, c, colours, polarized, active, u):
         cell = mi.UInt32(0)
-        for x in (*(position - dr.floor(position)), *u):
+        for x in (*(c.position - dr.floor(c.position)), *u):
             cell = 4 * cell + mi.UInt32(4 * x)
         dr.scatter_reduce(dr.ReduceOp.Add, found, mi.UInt32(1), cell, active)
-        original(self, position, colours, polarized, active, u)
+        original(self, c, colours, polarized, active, u)
 
     monkeypatch.setattr(Accumulator, "put_light", put_light)
     bdpt = mi.load_dict({"type": "bdpt", "skip": "none", "max_depth": 4})

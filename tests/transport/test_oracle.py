@@ -561,6 +561,7 @@ class Nothing:
 
     alpha = False
     features = stokes = None
+    light_groups = 0
     rfilter = SimpleNamespace(is_box_filter=lambda: True)
 
     def colour(self, value, _):
@@ -659,6 +660,8 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         light_media=None,
         sds=None,
         cells=None,
+        light_groups=None,
+        light_group=lambda index, active: None,
         sensor_medium=None,
         scatters=True,
     )
