@@ -1319,8 +1319,8 @@ MUTANTS = (
     Mutant(
         "hard paths: photons start with the density of their aim",
         "transport/photons/photon_pass.py",
-        "unaimed = kernel.merges_hard or undersampled",
-        "unaimed = undersampled",
+        "unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED",
+        "unaimed = kept is Kept.UNDERSAMPLED",
         ("tests/images/test_hard_paths.py::test_images_are_those_without_merging[steel]",),
     ),
     Mutant(
@@ -1334,6 +1334,27 @@ MUTANTS = (
                 "[{'skip': 'none', 'stored_vertices': 3}]"
             ),
         ),
+    ),
+    Mutant(
+        "hard paths: photon subpaths without much use end",
+        "merging/hard_paths.py",
+        "return survived / state.survived, State(survived=survived)",
+        "return dr.select(survived < 1, 1e-9, 1.0), state",
+        ("tests/images/test_hard_paths.py::test_bounds_lose_no_light[near_pane-2.0-True]",),
+    ),
+    Mutant(
+        "hard paths: photons are not divided by the probability of being kept",
+        "transport/photons/photon_pass.py",
+        "flux = flux / probability",
+        "flux = flux * 1",
+        ("tests/images/test_hard_paths.py::test_bounds_lose_no_light[near_pane-0.2-False]",),
+    ),
+    Mutant(
+        "hard paths: queries are not divided by the probability of asking",
+        "merging/hard_paths.py",
+        "value = drawn.value / self.kept(kernel, z)",
+        "value = drawn.value",
+        ("tests/images/test_hard_paths.py::test_bounds_lose_no_light[through_a_lens-0.05-True]",),
     ),
     Mutant(
         "merging: photons of other cells in the same bucket count",

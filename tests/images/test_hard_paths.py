@@ -17,6 +17,7 @@ from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import hard_paths, passes
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import light_path, mis
+from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
     IOR,
     SIZE,
@@ -173,22 +174,55 @@ def test_variants(variant):
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
 
 
-def test_bounds_lose_little_light(monkeypatch):
-    """Rationale: photons and camera vertices are left out by bounds that hold for reverse densities of a
-    quarter of a diffuse surface's. A floor of glossy metal has smaller ones.
+def small_lamp(half, height, **more):
+    """Under glass and a square lamp."""
+    to_world = transform().look_at(origin=[0.8, 0, height], target=[0.8, 0, 0], up=[0, 1, 0]).scale(half)
+    emitter = {"type": "area", "radiance": 10.0}
+    lamp = {"type": "rectangle", "to_world": to_world, "bsdf": matte(0.0), "emitter": emitter}
+    return under_glass(lamp, plate=rough(0.02), **more)
 
-    Expected: without these bounds, with the same seeds, the merged light of both floors is the same within
-    1 % (twice the standard error of what draws of other photons change).
+
+def near_pane():
+    """A pane below a lamp, close to the camera: its pixels are smaller than the floor's by a factor of 6."""
+    described = small_lamp(0.3, 3.4)
+    described["plate"]["to_world"] = transform().translate([0, 0, 2.5]).scale([4, 4, 0.05])
+    return described
+
+
+def through_a_lens():
+    """t = 0 is an alternative of the camera's side."""
+    return small_lamp(0.1, 3.4, kind="thinlens")
+
+
+@pytest.mark.parametrize(
+    "described, slack, ended",
+    [
+        (near_pane, hard_paths.SLACK, True),
+        (near_pane, 0.2, True),
+        (near_pane, 0.2, False),
+        (through_a_lens, 0.05, True),
+    ],
+)
+def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
+    """Rationale: what bounds leave out still has its weight, so that it would be missing: a quarter of the
+    merged light remained (15 % of the image was missing) under a pane so close to the camera that discs at
+    the floor are 36 times larger. A small ``slack`` leaves out many. Of the roulettes that of photon subpaths
+    acts first; if they are not ``ended``, that of photons acts, and through a lens that of camera vertices.
+
+    Expected: without bounds, with the same seeds, the same merged light within 8 % (a few standard errors of
+    the roulette).
     """
-    for floor in (matte(), {"type": "roughconductor", "alpha": 0.3}):
-        described = mi.load_dict(under_glass(ball(), plate=rough(0.02), floor=floor))
-        found = []
-        for slack in (4.0, 1e30):
-            monkeypatch.setattr(hard_paths, "SLACK", slack)
-            _, layers = strategy_images(described, 32, 6, max_depth=6, merging_radius=1.0)
-            found.append(layers["weighted.merged"].mean((1, 2)))
-        assert abs((found[1] - found[0]).mean()) < 0.01 * found[1].mean()
-        assert found[1].mean() > 0
+    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    if not ended:
+        never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
+        monkeypatch.setattr(hard_paths.HardMerging, "survival", never)
+    built, found = mi.load_dict(described()), []
+    for least in (slack, 1e30):
+        monkeypatch.setattr(hard_paths, "SLACK", least)
+        _, layers = strategy_images(built, 32, 8, merging_radius=1.0, skip="none")
+        found.append(layers["weighted.merged"].mean())
+    assert found[0] == pytest.approx(found[1], rel=0.08)
+    assert found[1] > 0
 
 
 @pytest.mark.parametrize("kind", ["roughdielectric", "principled"])
@@ -204,9 +238,10 @@ def test_the_limit_of_small_roughness(kind, monkeypatch):
     assert np.median(found / expected) == pytest.approx(1, abs=0.03)
 
 
-def test_no_photon_far_from_what_is_sharp(monkeypatch):
+def test_few_photons_far_from_what_is_sharp(monkeypatch):
     """Rationale: scenes with one thing of rough glass somewhere must not pay for it. Expected: where it lies
-    behind a room of matte walls, and no light reaches it, no photon is kept and no vertex is merged.
+    behind a room of matte walls, and no light reaches it, 1 % of photon subpaths leave a photon (corners,
+    where connections are few), and no vertex is merged.
     """
     monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
     described = mi.cornell_box() | {
@@ -216,7 +251,9 @@ def test_no_photon_far_from_what_is_sharp(monkeypatch):
     described = mi.load_dict(described)
     method = internals.bdpt(max_depth=6, merging=True, skip="none")
     mi.render(described, integrator=method, spp=16)
-    assert method.statistics["merging"] == {"photons": 0, "merges": 0}
+    merging = method.statistics["merging"]
+    assert merging["merges"] == 0
+    assert merging["photons"] < 0.02 * photon_pass.FEWEST_PHOTONS
     a, b = (images(described, 16, 1, merging=m, skip="none") for m in (True, False))
     np.testing.assert_allclose(a, b, **ROUNDING)
 

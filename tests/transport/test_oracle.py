@@ -795,8 +795,8 @@ def record_hard_merges(world: World, monkeypatch):
     is_merged, merged = kind.is_merged, kind.merged
     world.merged = {}
 
-    def recorded_mask(self, kernel_, z, walk):
-        mask[0] = is_merged(self, kernel_, z, walk)
+    def recorded_mask(self, kernel_, z, walk, stream):
+        mask[0] = is_merged(self, kernel_, z, walk, stream)
         return mask[0]
 
     def recorded_merge(self, kernel_, z, *more):

@@ -3,13 +3,16 @@
 A path is hard if merges sample it better than all other strategies together, see `mis`: SDS paths, and paths
 through lobes so narrow that connections rarely succeed. The weights need no flags of delta events.
 
-Photons and camera vertices of other paths would cost time for nothing. Bounds from one side leave out most:
+Photons and camera vertices of other paths would cost time for nothing. Two bounds from one side leave out
+most, without bias:
 
-* A merge needs B times the connections of both of its own edges, each of which one side knows. Exact.
-* It needs B times all older alternatives of either side, ``d_vc`` times the density ``pdf_rev_w`` of the
-  reverse direction. That is known with the BSDF alone; on a diffuse surface it is the cosine over pi. `SLACK`
-  allows for others. Merges at smaller densities are lost, as are those of photon subpaths that ended by the
-  same bound.
+* A merge needs B times the connections of both of its own edges, each of which one side knows.
+* Where it has less than B times all older alternatives of its side, ``d_vc`` times the density ``pdf_rev_w``
+  of the reverse direction, it has little of the weight. That density is known with the other side alone; on a
+  diffuse surface it is the cosine over pi, and elsewhere, or if the path has further merges, the path may be
+  hard all the same. So photons, photon subpaths and camera vertices play Russian roulette, with the ratio to
+  that of a diffuse surface. Where one side plays, the estimate of a merge on a hard path is then at most
+  about that at a diffuse surface: its density, and with it its BSDF, is as small as the probability.
 
 Photons may be aimed, but weights take the emitter's own density of first directions: weights may be any
 function of the path, and S and V then differ by densities that every strategy knows.
@@ -22,17 +25,19 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..sampling.points import Stream
+from ..sampling.points import Purpose, Stream, sequential
 from ..transport import mis
 from ..transport.contribution import Contribution
 from ..transport.inputs import Kernel
-from ..transport.sds import begun
+from ..transport.sds import State, begun
 from ..transport.walk import Vertex, newest_coefficient
 from .merging import Merging, sample
 
-# Least reverse density for which no photon is left out, relative to that of a diffuse surface: 1 / SLACK
-# (experiments, "Nearly specular light").
-SLACK = 4.0
+# Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.
+SLACK = 2.0
+
+# Index of the series of hashed numbers, of a camera vertex, that play this roulette; merges use the first.
+_OF_QUERIES = 3
 
 
 @dataclass
@@ -59,28 +64,28 @@ class HardMerging(Merging):
     def longest(self, kernel):
         return kernel.last_merged
 
-    def goes_on(self, state, partial, p):
-        return self._may_be_hard(partial.d_vc, p)
-
-    def _may_be_hard(self, d_vc: mis.PartialSum, p: mi.Point3f) -> mi.Bool:
-        """Mask: older alternatives are few enough; ``d_vc`` before the edge to a diffuse surface."""
-        if mis.is_absent(d_vc):
-            return mi.Bool(True)
-        return mis.HARD * d_vc <= SLACK * dr.pi * self.weighed(p)
+    def survival(self, state, partial, p):
+        # Whichever is larger, since it may go on to where pixels are larger.
+        eta = dr.maximum(self.weighed(p), self.weighed_in(self.radius.median))
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, eta))
+        return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: Kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
-        possible &= mis.exceeds(self.weighed(vertex.si.p), connection)
-        return possible & self._may_be_hard(
-            kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos), vertex.si.p
-        )
+        return possible & mis.exceeds(self.weighed(vertex.si.p), connection)
+
+    def kept(self, kernel: Kernel, vertex, survived=1.0):
+        d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
+        return dr.minimum(_probability(d_vc, self.weighed(vertex.si.p)) / survived, 1)
 
     def _connection(self, kernel: Kernel, z: Vertex) -> mis.PartialSum:
         newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
         return kernel.heuristic.scale(z.partial.d_vcm, newest)
 
-    def is_merged(self, kernel, z, walk):
-        return self.photons.exist & self.may_merge(kernel, z, self._connection(kernel, z))
+    def is_merged(self, kernel, z, walk, stream):
+        word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
+        asks = self.may_merge(kernel, z, self._connection(kernel, z))
+        return self.photons.exist & asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
@@ -90,5 +95,16 @@ class HardMerging(Merging):
         h = kernel.heuristic
         weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera)
         active = drawn.active & ~(weight == 0)
-        c = Contribution(drawn.value, weight, y.edges + 1, z.edges, active, None, "merge")
+        value = drawn.value / self.kept(kernel, z)
+        c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")
         return replace(c, light_group=kernel.light_group(y.emitter, active))
+
+
+def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:
+    """Probability with which a ``merge`` of this partial sum is sampled beside older alternatives ``d_vc``.
+
+    ``d_vc`` before the edge to it.
+    """
+    if mis.is_absent(d_vc):
+        return mi.Float(1)
+    return dr.minimum(SLACK * dr.pi * merge / (mis.HARD * d_vc), 1)

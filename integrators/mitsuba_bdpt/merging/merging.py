@@ -69,6 +69,10 @@ class Merging(SdsStrategy):
         """`eta` with its coefficient, as in weights."""
         return self.kappa * self.eta(p)
 
+    def weighed_in(self, radius: mi.Float) -> mi.Float:
+        """The same in a disc of this ``radius``."""
+        return self.kappa * self.count * dr.pi * dr.square(radius)
+
     def begin_light(self, kernel, walk):
         return begun(walk, State(isolated=mi.Bool(True)), kernel.heuristic.zero())
 
@@ -81,7 +85,7 @@ class Merging(SdsStrategy):
         """Most edges of a merged path."""
         return kernel.max_depth
 
-    def is_merged(self, kernel: Kernel, z: Vertex, walk) -> mi.Bool:
+    def is_merged(self, kernel: Kernel, z: Vertex, walk, stream: Stream) -> mi.Bool:
         """Mask: the camera vertex ``z`` looks for photons."""
         return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
 
@@ -99,7 +103,7 @@ class Merging(SdsStrategy):
         # A separate branch: few lanes are on such a path.
         total, lost, merges = dr.if_stmt(
             (z, total, counters.non_finite, counters.merges),
-            self.is_merged(kernel, z, walk),
+            self.is_merged(kernel, z, walk, stream),
             merged,
             lambda z, total, lost, merges: (total, lost, merges),
             label="merges",

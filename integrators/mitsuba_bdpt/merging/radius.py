@@ -60,6 +60,11 @@ class Radius:
         return dr.maximum(of_pixels, offset_at(dr.max(dr.abs(p))))
 
     @property
+    def median(self) -> mi.Float:
+        """The radius at the median distance of what camera rays meet first."""
+        return self.high / _HIGHEST
+
+    @property
     def steepest(self) -> mi.Float:
         """Upper bound of the change of the radius per distance."""
         return dr.maximum(self.angle, _STEEPEST_ROUNDING)

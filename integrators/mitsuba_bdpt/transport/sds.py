@@ -24,12 +24,14 @@ class State:
 
     ``isolated``: no edge is connectible; ``only_delta``, on light subpaths with guiding: all events were
     delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
-    (s = 0 by the guide, or by the BSDF) over its own.
+    (s = 0 by the guide, or by the BSDF) over its own; ``survived``, on photon subpaths of hard paths: the
+    probability with which `SdsStrategy.survival` let it go on.
     """
 
     isolated: mi.Bool | None = None
     only_delta: mi.Bool | None = None
     guided: mi.Float | None = None
+    survived: mi.Float | None = None
 
 
 @dataclass
@@ -49,7 +51,8 @@ class SdsStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``hard``: it samples hard paths, and `weighed` and `may_merge` are defined.
+    subpaths use, or None; ``hard``: it samples hard paths, and `weighed`, `may_merge`, `kept` and `survival`
+    are defined.
     """
 
     counters: tuple[str, ...] = ()
@@ -61,15 +64,22 @@ class SdsStrategy:
         raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
 
     def may_merge(self, kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
-        """Mask: a hard path may be merged at ``vertex``, as far as its side knows.
+        """Mask: a merge at ``vertex`` may count, as far as its side knows.
 
         ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
         """
         raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
 
-    def goes_on(self, state: State | None, partial: mis.Partial, p: mi.Point3f) -> mi.Bool:
-        """Mask: a photon subpath may have further photons; ``partial`` after the event at ``p``."""
-        return mi.Bool(True) if state is None or state.isolated is None else state.isolated
+    def kept(self, kernel, vertex, survived: mi.Float | float) -> mi.Float:
+        """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
+        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+
+    def survival(self, state: State, partial: mis.Partial, p: mi.Point3f) -> tuple[mi.Float, State]:
+        """Probability with which a photon subpath goes on, and its new ``state``.
+
+        ``partial`` after the event at ``p``.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
 
     def begin_light(self, kernel, walk):
         """The light subpath ``walk`` with its `State`, on its first edge."""

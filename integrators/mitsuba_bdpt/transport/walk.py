@@ -378,15 +378,18 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     # BSDFs take a non-finite shading frame (vertex normals) for a wrong side, which is black.
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
-    if side.isolated and side.sds is not None:
-        active &= side.sds.goes_on(sds, partial, si.p)
+    useful = None
+    if sds is not None and sds.survived is not None and side.sds is not None:
+        useful, sds = side.sds.survival(sds, partial, si.p)
+    elif side.isolated and sds is not None:
+        active &= sds.isolated
     if side.only_delta:
         active &= step.delta
     if side.only_specular:
         specular = step.delta | is_narrow(step.pdf_fwd_w, step.pdf_rev_w)
         active &= specular if vertex.volume is None else specular & ~vertex.volume
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
-    throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, passes, stream)
+    throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, stream, useful)
     active &= goes_on
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
@@ -410,14 +413,16 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     return _traced(kernel, after, ray, passes)
 
 
-def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, passes, stream):
+def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, stream, useful):
     """Russian roulette of a subpath: its throughput, and whether it goes on.
 
-    With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`.
-    Weights ignore it.
+    With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`;
+    ``useful``: times this probability or None, see `SdsStrategy.survival`. Weights ignore it.
     """
     u = kernel.points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
-    playing = walk.edges >= kernel.rr_depth if passes is None else walk.edges > kernel.rr_depth
+    playing = walk.edges >= kernel.rr_depth if kernel.space is None else walk.edges > kernel.rr_depth
+    if useful is not None:
+        survive, playing = useful * dr.select(playing, survive, 1), mi.Bool(True)
     return dr.select(playing, throughput / survive, throughput), ~playing | (u < survive)
 
 

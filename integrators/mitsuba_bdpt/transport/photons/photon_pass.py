@@ -99,9 +99,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
 
     def visit(y, counters, walk):
         older, more = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm), ()
+        flux = y.throughput
         if sds is not None and sds.hard:
             older, connection = y.partial.d_vc, _connection(kernel, y)
             more, keep = (connection, y.partial.d_vm, y.partial.d_vn), sds.may_merge(kernel, y, connection)
+            probability = sds.kept(kernel, y, walk.sds.survived)
+            keep &= kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event) < probability
+            flux = flux / probability
         elif undersampled:
             keep = has_lobe(kernel, y)
         else:
@@ -116,7 +120,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
             older = dr.select(finite, mi.Float(older), dr.nan)
             more = _connection(kernel, y), walk.sds.only_delta & ~e.delta
         distance = dr.norm(y.si.p - y.previous)
-        fields = y.si.p, -walk.d, y.si.n, y.throughput, older, aimed, distance, y.edges, lanes, e.index
+        fields = y.si.p, -walk.d, y.si.n, flux, older, aimed, distance, y.edges, lanes, e.index
         found = type(out)(*fields, *more)
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         dr.scatter(out, found, place, keep & (place < most))
@@ -154,6 +158,8 @@ def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
     if kept is Kept.UNDERSAMPLED:
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
+    elif sds is not None and sds.hard:
+        walk = replace(walk, sds=State(survived=mi.Float(1)))
     elif kept.estimates:  # s = 0 samples the others
         walk = replace(walk, active=walk.active & e.delta)
     return e, aimed, finite, walk
