@@ -387,8 +387,8 @@ MUTANTS = (
     Mutant(
         "film: splats a pixel off",
         "image/accumulator.py",
-        "self.light.splat(position, [*colours, *polarized], active, u)",
-        "self.light.splat(position + 1, [*colours, *polarized], active, u)",
+        "self.light.splat(c.position, [*colours, *polarized], active, u, row)",
+        "self.light.splat(c.position + 1, [*colours, *polarized], active, u, row)",
         ("tests/images/test_known_failures.py::test_borders_of_a_uniform_furnace",),
     ),
     Mutant(
@@ -542,8 +542,8 @@ MUTANTS = (
     Mutant(
         "film: sums of a pixel lie side by side",
         "image/accumulator.py",
-        "self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride)",
-        "self._strips, self._down = strips, dr.opaque(mi.UInt32, self._stride - 1)",
+        "self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride)",
+        "self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride - 1)",
         ("tests/image/test_films.py::test_many_samples_of_a_pixel",),
     ),
     Mutant(
@@ -1664,8 +1664,8 @@ MUTANTS = (
     Mutant(
         "joined light subpaths: roulette has the number of the even draw",
         "transport/connections.py",
-        "return _Drawn(value, size_of(value), end, left, one(some)",
-        "return _Drawn(value, size_of(value), end, u_even, one(some)",
+        "found = _Drawn(value, size_of(value), end, left, one(some)",
+        "found = _Drawn(value, size_of(value), end, u_even, one(some)",
         ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[1.0-5.0]",),
     ),
     Mutant(
