@@ -5,10 +5,8 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.image.replicates import Replicates
 from mitsuba_bdpt.run import schedule
-from mitsuba_bdpt.sensors.kinds import prepare
 
 
 def scene(rfilter="box", width=12, sampler="independent"):
@@ -135,13 +133,12 @@ def test_schedule_of_replicates():
     """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass
     of all with one sample for the scale of roulette; without `variance` one part.
     """
-    target = scene()
-    settings, camera = bdpt().settings, prepare(target.sensors()[0], ShapeErrors(target), target)
-    steps = schedule.schedule(camera, 19, settings, True)
+    settings = bdpt().settings
+    steps = schedule.schedule(19, 19, settings, True)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
     assert all(s.done == 0 and s.size == s.of for s in steps[2:])
-    assert [s.replicate for s in schedule.schedule(camera, 19, bdpt(layers="").settings, True)] == [0, 0]
+    assert [s.replicate for s in schedule.schedule(19, 19, bdpt(layers="").settings, True)] == [0, 0]
 
 
 def test_launches_on_a_gpu(monkeypatch):
@@ -150,9 +147,9 @@ def test_launches_on_a_gpu(monkeypatch):
     """
     settings = bdpt(layers="").settings
     camera = SimpleNamespace(region=SimpleNamespace(size=(1024, 1024)))
-    assert schedule.pass_sizes(camera, 64, settings, False) == [2] * 32
+    assert schedule.pass_sizes(64, schedule.longest_pass(camera, settings), False) == [2] * 32
     monkeypatch.setattr(schedule.dr, "backend_v", lambda _: schedule.dr.JitBackend.CUDA)
-    assert schedule.pass_sizes(camera, 64, settings, False) == [16] * 4
+    assert schedule.pass_sizes(64, schedule.longest_pass(camera, settings), False) == [16] * 4
 
 
 def test_interrupted_before_there_is_a_spread():

@@ -28,6 +28,10 @@ SAMPLES_PER_PHOTON, SAMPLES_PER_HARD_PHOTON = 8, 16
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
+# Samples per pixel of a pass that merges hard paths, and least samples of a pass: photons and queries of a pass
+# both grow with its samples, and merges with their product (experiments, "Hard paths").
+_HARD_SAMPLES, _LEAST_SAMPLES = 16, 1 << 16
+
 # Bits of the edges and of the subpath's index in the sort key of photons.
 _EDGES_BITS, _LANE_BITS = 12, 32
 
@@ -61,6 +65,11 @@ class Passes:
         self._radius, self._aim, self._pixels = settings.internals.merging_radius, aim, pixels
         self._kind = HardMerging if hard else Merging
         self._samples_per_photon = SAMPLES_PER_HARD_PHOTON if hard else SAMPLES_PER_PHOTON
+
+    @property
+    def best_pass(self) -> int:
+        """Samples per pixel of a pass, 0 for as many as a launch has."""
+        return max(_HARD_SAMPLES, _LEAST_SAMPLES // self._pixels) if self._kind.hard else 0
 
     def trace(
         self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None

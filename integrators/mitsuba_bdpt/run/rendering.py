@@ -105,7 +105,8 @@ class Render:
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
         border = self.prepared.camera.region.border
-        longest = longest_pass(self.prepared.camera, settings)
+        best = self.merging.best_pass if self.merging else 0
+        self._longest = longest = longest_pass(self.prepared.camera, settings, best)
         parts = Parts(strip_count(longest), min(longest, spp), names)
         self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
@@ -228,7 +229,7 @@ class Render:
             wanted = long and not known and (self._plays_roulette() or self._lost() is not None)
             self._small_first = bool(wanted)
         earlier = sum(self.passes)
-        for step in schedule(self.prepared.camera, self.spp, self.settings, self._small_first):
+        for step in schedule(self.spp, self._longest, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
             skipped = min(earlier, step.size)
             done, earlier = done + skipped, earlier - skipped

@@ -32,8 +32,11 @@ def _most_samples() -> int:
     return LAUNCH_SAMPLES_CUDA if dr.backend_v(mi.Float) == dr.JitBackend.CUDA else LAUNCH_SAMPLES
 
 
-def longest_pass(camera: Sensor, settings: Settings) -> int:
-    """Return the samples per pixel of a whole pass; the same for renders of any length."""
+def longest_pass(camera: Sensor, settings: Settings, best: int = 0) -> int:
+    """Return the samples per pixel of a whole pass; the same for renders of any length.
+
+    ``best``: as many if the user does not say, 0 for as many as a launch has.
+    """
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels has to fit into four launches, see `batches`.
@@ -41,12 +44,12 @@ def longest_pass(camera: Sensor, settings: Settings) -> int:
     most = min(max(4 * limit // width, 1), max(STRIP, whole))
     if settings.merging:  # photons, radius and wavelengths are those of a pass
         most = min(most, STRIP)
-    return min(settings.spp_per_pass or whole, most)
+    return min(settings.spp_per_pass or min(whole, best or whole), most)
 
 
-def pass_sizes(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[int]:
-    """Return the samples per pixel of each pass; the first has 1 if ``small_first``."""
-    size, sizes = longest_pass(camera, settings), []
+def pass_sizes(spp: int, longest: int, small_first: bool) -> list[int]:
+    """Return the samples per pixel of each pass, ``longest`` at most; the first has 1 if ``small_first``."""
+    size, sizes = longest, []
     if small_first and spp > 1:
         sizes, spp = [1], spp - 1
     return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
@@ -67,15 +70,15 @@ class Step:
     last: bool
 
 
-def schedule(camera: Sensor, spp: int, settings: Settings, small_first: bool) -> list[Step]:
-    """Return all passes of a render; ``small_first``: see `pass_sizes`."""
+def schedule(spp: int, longest: int, settings: Settings, small_first: bool) -> list[Step]:
+    """Return all passes of a render; ``longest``, ``small_first``: see `pass_sizes`."""
     parts = [spp]
     if settings.variance:
         parts = _replicates(spp, bool(settings.target_error))
     steps = []
     for replicate, part in enumerate(parts):
         done = 0
-        for size in pass_sizes(camera, part, settings, small_first and replicate == 0):
+        for size in pass_sizes(part, longest, small_first and replicate == 0):
             steps.append(Step(replicate, done, size, part, done + size == part))
             done += size
     return steps
