@@ -28,8 +28,8 @@ SAMPLES_PER_PHOTON, SAMPLES_PER_HARD_PHOTON = 8, 16
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Samples per pixel of a pass that merges hard paths, and least samples of a pass: photons and queries of a pass
-# both grow with its samples, and merges with their product (experiments, "Hard paths").
+# Samples per pixel of a pass that merges hard paths, and least samples of a pass: its photons and its queries
+# grow with them, and merges with their product (experiments, "Hard paths").
 _HARD_SAMPLES, _LEAST_SAMPLES = 16, 1 << 16
 
 # Bits of the edges and of the subpath's index in the sort key of photons.
