@@ -233,8 +233,8 @@ def test_edits_during_a_render_are_seen(monkeypatch):
     Expected: it is looked for anew when that one is rendered again."""
     looks = []
 
-    def look(prepared, plan, max_depth):
-        looks.append(max_depth)
+    def look(prepared, plan, *others):
+        looks.append(plan)
         return lost_light.LostLight({})
 
     monkeypatch.setattr(lost_light, "estimate", look)

@@ -96,6 +96,7 @@ PARAMETER_SETS = (
         "guiding": "never",
         "layers": "variance,denoised",
         "target_error": 0.01,
+        "light_groups": "key: lamp",
         "aovs": "a:albedo,b:depth",
         "spp_per_pass": 16,
         "timeout": 12.5,

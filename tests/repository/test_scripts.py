@@ -74,7 +74,7 @@ def by_user(monkeypatch, command, *arguments):
             "equal-time scenes/nowhere",
             "neither a scene file nor the name of one in",
         ),
-        ("equal-time room.xml -o a.jpg", "output='a.jpg' must end in .png"),
+        ("equal-time room.xml -o a.jpg", "output='a.jpg' must end in .pdf, .svg, .png"),
         ("equal-time room.xml --reference words.toml", "'words.toml' is not an EXR"),
         ("equal-time words.toml --reference flat.exr", "Parsing of XML"),
         ("equal-time room.xml --reference flat.exr -i nope bdpt", "nope"),
