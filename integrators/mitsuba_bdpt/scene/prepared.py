@@ -60,7 +60,7 @@ class PreparedScene:
         self.specular = any(f & delta & ~null and not f & smooth for f in flags)
         self.refracts = any(mi.has_flag(b.flags(), mi.BSDFFlags.Transmission) for b in found)
         sharp = _near_specular(scene, sensor, found, family)
-        self.near_specular = [b for b, _ in sharp]
+        self.near_specular: list[mi.BSDF] = [b for b, _ in sharp]
         self.narrowest = max((density for _, density in sharp), default=0.0)
         instances = sum(map(is_instance, scene.shapes()))  # each has a BSDF
         self.traits = bsdf.Traits.of(found, instances, [b for b, _ in family])
@@ -104,7 +104,9 @@ def _is_small(emitter: mi.Emitter, size: float) -> bool:
     return not width * height >= SMALL * size
 
 
-def _near_specular(scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family) -> list:
+def _near_specular(
+    scene: mi.Scene, sensor: mi.Sensor, found: list[mi.BSDF], family
+) -> list[tuple[mi.BSDF, float]]:
     """Those of the BSDFs ``found`` with a near-specular lobe, and its density.
 
     ``family``: `draws.family` of them.
