@@ -46,7 +46,8 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     expected = np.array(whole.render(target, seed=3, spp=SPP))
     start = stopped(bdpt(**parameters), misty(), 2, seed=3, spp=SPP)
     assert 0 < start.spp < SPP
-    replay = {"decisions": json.dumps(whole.statistics["decisions"])}
+    decided = whole.statistics["decisions"]
+    replay = {"decisions": json.dumps(decided)} if decided else {}
     for more, begun in (({}, {"start": start}), (replay, {})):
         again = bdpt(**parameters, **more)
         image = np.array(again.render(target, seed=3, spp=SPP, **begun))
