@@ -21,6 +21,11 @@ def number(x) -> float:
     return float(dr.slice(x) if dr.is_array_v(x) else x)
 
 
+def given_id(owner) -> str:
+    """Return the id of an object, empty if it has none or one that Mitsuba made up."""
+    return "" if owner.id().startswith("_unnamed_") else owner.id()
+
+
 def named(owner) -> str:
     """Identify an object in a message: by its id, its shape's id or its class name."""
     if owner.id():

@@ -30,7 +30,7 @@ from ..transport import mis
 from ..transport.contribution import Contribution
 from ..transport.inputs import Kernel
 from ..transport.sds import State, begun
-from ..transport.walk import Vertex, newest_coefficient
+from ..transport.walk import Vertex, newest_connection
 from .merging import Merging, sample
 
 # Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.
@@ -78,20 +78,16 @@ class HardMerging(Merging):
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
         return dr.minimum(_probability(d_vc, self.weighed(vertex.si.p)) / survived, 1)
 
-    def _connection(self, kernel: Kernel, z: Vertex) -> mis.PartialSum:
-        newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-        return kernel.heuristic.scale(z.partial.d_vcm, newest)
-
     def is_merged(self, kernel, z, walk, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
-        asks = self.may_merge(kernel, z, self._connection(kernel, z))
+        asks = self.may_merge(kernel, z, newest_connection(kernel, kernel.kappa.splat, z))
         return self.photons.exist & asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
         light = mis.Partial(0, y.older, y.d_vm, y.d_vn), y.connection, f.pdf_fwd_w
-        camera = z.partial, self._connection(kernel, z), f.pdf_rev_w
+        camera = z.partial, newest_connection(kernel, kernel.kappa.splat, z), f.pdf_rev_w
         h = kernel.heuristic
         weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera)
         active = drawn.active & ~(weight == 0)

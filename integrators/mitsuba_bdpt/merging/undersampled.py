@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from ..transport.inputs import Kernel
 from ..transport.near_specular import is_narrow
-from ..transport.walk import Vertex, has_lobe, newest_coefficient
+from ..transport.walk import Vertex, newest_connection
 from .merging import Merging, Sample
 
 # Expected samples per pixel below which light is undersampled: most pixels have none of it, the others at
@@ -44,10 +44,6 @@ class Undersampled:
         """Empty sums for a render of ``samples`` per pixel."""
         return Undersampled(dr.opaque(mi.Float, samples), dr.zeros(mi.Float64, len(KINDS)))
 
-    def looks(self, kernel: Kernel, z: Vertex) -> mi.Bool:
-        """Mask: the camera vertex ``z`` looks for photons."""
-        return has_lobe(kernel, z)
-
     def missing(
         self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, only_delta: mi.Bool
     ) -> mi.Bool:
@@ -75,8 +71,8 @@ class Undersampled:
         they are the expected number per camera sample.
         """
         h, photon, f = kernel.heuristic, found.photon, found.f
-        newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-        camera = h.combine(h.scale(z.partial.d_vcm, newest), h.scale(z.partial.d_vc, f.pdf_rev_w))
+        newest = newest_connection(kernel, kernel.kappa.splat, z)
+        camera = h.combine(newest, h.scale(z.partial.d_vc, f.pdf_rev_w))
         area = photon.connection + photon.older * f.pdf_fwd_w + camera
         # The render's light subpaths are not aimed.
         return self.samples * area * (found.number * photon.aim / merging.eta(z.si.p))

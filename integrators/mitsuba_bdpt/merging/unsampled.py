@@ -23,7 +23,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import Kept
 from ..transport.sds import State
-from ..transport.walk import is_sds_vertex, random_walk
+from ..transport.walk import has_lobe, is_sds_vertex, random_walk
 from .merging import Merging
 from .merging import sample as draw
 from .passes import sort
@@ -126,7 +126,7 @@ def _merged(
         if undersampled is None:
             there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
         else:
-            there = undersampled.looks(kernel, z)
+            there = has_lobe(kernel, z)
         only_delta = mi.Bool(False) if delta else walk.sds.only_delta
         arguments = z, only_delta, size
         size = dr.if_stmt(arguments, there, merge, lambda *arguments: arguments[2], label="unsampled light")

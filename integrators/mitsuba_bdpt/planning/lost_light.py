@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import components
-from ..host.introspection import all_shapes
+from ..host.introspection import all_shapes, given_id
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
@@ -160,8 +160,7 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    # Shapes without an id, and merged shapes, have none or one made up by Mitsuba.
-    through = tuple(s.id() for s in shapes if s.id() and not s.id().startswith("_unnamed_"))
+    through = tuple(filter(None, map(given_id, shapes)))
     if found.kinds is None or not colours:
         return LostLight(colours, through)
     never, absent, rare, few = np.array(found.kinds)
@@ -279,7 +278,7 @@ def _undersampled(what: str, lost: LostLight, samples: int, remedy: str) -> str:
 def called(emitter: mi.Emitter) -> str:
     """Name an emitter by its kind and nearest id."""
     kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
-    on_shape = shape is not None and shape.id() and not shape.id().startswith("_unnamed_")
+    on_shape = shape is not None and given_id(shape)
     if emitter.class_name() == "AreaLight":  # its id says little: a dictionary's key
         return (
             f"the area light on shape '{shape.id()}'" if on_shape else "an area light on a shape without id"

@@ -49,10 +49,10 @@ def longest_pass(camera: Sensor, settings: Settings, best: int = 0) -> int:
 
 def pass_sizes(spp: int, longest: int, small_first: bool) -> list[int]:
     """Return the samples per pixel of each pass, ``longest`` at most; the first has 1 if ``small_first``."""
-    size, sizes = longest, []
+    sizes = []
     if small_first and spp > 1:
         sizes, spp = [1], spp - 1
-    return sizes + [size] * (spp // size) + ([spp % size] if spp % size else [])
+    return sizes + [longest] * (spp // longest) + ([spp % longest] if spp % longest else [])
 
 
 @dataclass(frozen=True)

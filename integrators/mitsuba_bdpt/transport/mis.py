@@ -53,7 +53,7 @@ CLASSES = ("hit", "direct", "light", "inner")
 SATURATION = 1e37
 
 # B: a path is hard where merges are at least this many times as likely as all other strategies (experiments,
-# "Nearly specular light"). 0 merges all paths.
+# "Hard paths"). 0 merges all paths.
 HARD = 1.0
 
 

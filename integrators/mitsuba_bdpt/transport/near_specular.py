@@ -18,7 +18,7 @@ import numpy as np
 
 from ..geometry.directions import random_directions
 from ..geometry.mitsubas_choices import spread_points
-from ..host.introspection import number, own_parameters
+from ..host.introspection import given_id, number, own_parameters
 
 # Least density (1 / sr, at the axis of the lobe at normal incidence) of a near-specular lobe: that of alpha
 # .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
@@ -64,10 +64,7 @@ def names(shapes: Iterable[mi.Shape], bsdfs: Iterable[mi.BSDF]) -> list[str]:
     for shape in shapes:
         bsdf = shape.bsdf()
         if bsdf is not None and id(bsdf) in meant:
-            # Mitsuba makes up ids of objects without one.
-            found += [name for name in (shape.id(), bsdf.id()) if name and not name.startswith("_unnamed_")][
-                :1
-            ]
+            found += [name for name in map(given_id, (shape, bsdf)) if name][:1]
     return list(dict.fromkeys(found))
 
 

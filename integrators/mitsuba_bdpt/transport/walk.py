@@ -241,6 +241,12 @@ def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32)
     return choose(edges == 1, first, kernel.kappa.inner)
 
 
+def newest_connection(kernel: Kernel, first: mis.Coefficient, vertex: Vertex) -> mis.PartialSum:
+    """The newest alternative at ``vertex``: ``d_vcm`` times `newest_coefficient`."""
+    newest = newest_coefficient(kernel, first, vertex.edges)
+    return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
+
+
 def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
     """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
@@ -462,9 +468,7 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
     path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
     """
     connectible = mis.is_connectible(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
-    possible = vertex.hit & vertex.connectible() & ~connectible & (vertex.edges < kernel.max_depth)
-    if vertex.volume is not None:
-        possible &= ~vertex.volume
+    possible = has_lobe(kernel, vertex) & ~connectible
     isolated = None if walk.sds is None else walk.sds.isolated
     return possible if isolated is None else possible & isolated
 

@@ -13,7 +13,7 @@ from .. import mis, spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..sds import SdsStrategy, State
-from ..walk import has_lobe, is_sds_vertex, newest_coefficient, random_walk
+from ..walk import has_lobe, is_sds_vertex, newest_connection, random_walk
 from .aim import Aim
 from .photon import ConnectedPhoton, HardPhoton, Photon
 from .photon_guide import Guide
@@ -174,5 +174,4 @@ def _kind(kernel: Kernel, kept: Kept) -> type[Photon]:
 
 def _connection(kernel: Kernel, y) -> mis.PartialSum:
     """`ConnectedPhoton.connection` at ``y``."""
-    h, newest = kernel.heuristic, newest_coefficient(kernel, kernel.kappa.direct, y.edges)
-    return h.present(h.scale(y.partial.d_vcm, newest))
+    return kernel.heuristic.present(newest_connection(kernel, kernel.kappa.direct, y))
