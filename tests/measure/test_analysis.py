@@ -478,4 +478,4 @@ def test_a_report_is_written(results, tmp_path):
         report.run(options)
     (tmp_path / "notes.toml").write_text('nowhere = "why"\n')
     with pytest.raises(ValueError, match="'nowhere' is not among the scenes"):
-        report.page(results, {}, [], {"nowhere": "why"})
+        report.page(results, {}, [], {"nowhere": "why"}, "mine")

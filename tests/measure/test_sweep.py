@@ -26,6 +26,7 @@ from mitsuba_bdpt.measure import (
     metrics,
     probes,
     reference,
+    report,
     scenes,
     showing,
     sweep,
@@ -706,6 +707,7 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] of cornell_box must be as many as spp"),
         (("seeds = 2", "sedes = 2"), "sedes is not a key"),
         (('scenes = ["cornell_box"]', ""), "scenes is missing"),
+        (("seeds = 2", 'clock = "sun"'), r"clock='sun' must be one of \('wall', 'processor'\)"),
         (("[2, 4]", "[2.5]"), r"spp=\[2.5\] must be a list of whole numbers"),
         (("cornell_box", "nowhere"), "scene='nowhere'"),
         (('match = "seconds"', 'match = "energy"'), "match='energy'.*'seconds', 'spp'"),
@@ -744,8 +746,10 @@ def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "presets").glob("*.toml")), ids=lambda p: p.stem)
 def test_presets_are_read(path):
-    """Expected: every committed preset names scenes and integrators that exist."""
-    for method in read_preset(path, REPOSITORY).methods:
+    """Expected: every committed preset names scenes, except that for other people's, and integrators that
+    exist."""
+    named = ["cornell_box"] if path.stem == "public" else None
+    for method in read_preset(path, REPOSITORY, named).methods:
         mi.load_dict(dict(method.parameters))
 
 
@@ -772,13 +776,179 @@ def test_three_lines_are_a_preset(tmp_path):
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     found = [[m.name for m in Cells(REPOSITORY, preset, one).methods] for one in preset.subjects]
     assert found == [["bdpt", "path"], ["bdpt", "volpath"]]
-    assert {m.match for m in preset.methods[1:]} == {"seconds"} and preset.resolution == 128
+    assert {m.match for m in preset.methods[1:]} == {"seconds"}
+    assert {one.resolution for one in preset.subjects} == {128}
     assert [(one.spp, one.seeds) for one in preset.subjects] == [((4, 16), (5, 5))] * 2
     given = Project(tmp_path, {"mine": REPOSITORY.scene("cornell_box")})
     (subject,) = preset_of(Path("preset"), {"seeds": 3}, given).subjects
     assert subject.name == "cornell_box" and subject.spp == (4, 16, 64) and subject.seeds == (3, 3, 3)
     with pytest.raises(CommandError, match="preset: sedes is not a key of a preset"):
         preset_of(Path("preset"), {"sedes": 3}, given)
+
+
+SCENE = (ROOT / "scenes" / "cornell_box.xml").read_text()
+
+
+@pytest.fixture
+def others(tmp_path):
+    """A folder of other people's scenes: folders with a scene file each, one of which lacks a mesh."""
+    for name in ("attic", "broken", "cellar"):
+        (tmp_path / "theirs" / name).mkdir(parents=True)
+        (tmp_path / "theirs" / name / "scene_v3.xml").write_text(SCENE)
+    gone = '<shape type="ply"><string name="filename" value="gone.ply"/></shape></scene>'
+    (tmp_path / "theirs" / "broken" / "scene_v3.xml").write_text(SCENE.replace("</scene>", gone))
+    return tmp_path / "theirs"
+
+
+OPEN = 'resolution = 8\nmax_depth = 3\nseeds = 2\nspp = [2]\n[[integrator]]\ntype = "bdpt"\n'
+
+
+def test_a_folder_of_scenes_is_a_preset(tmp_path, others, monkeypatch):
+    """Rationale: scenes of exporters are all called scene_v3.xml, each in a folder of its own. Expected: a
+    pattern finds them all, under the names of the folders, from here, from the project's folder, or from the
+    home folder; a scene that cannot be loaded is left out with the reason and costs the others nothing."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for pattern in (f"{others}/*/scene_v3.xml", "theirs/*/*.xml", "~/theirs/*/scene_v?.xml"):
+        text = f'scenes = ["{pattern}"]\n{OPEN}'
+        preset = read_preset(preset_file(tmp_path, text), Project(tmp_path))
+        assert [one.name for one in preset.subjects] == ["attic", "cellar"]
+        assert preset.scenes == ("attic", "broken", "cellar")
+        (said,) = preset.left_out
+        assert said.startswith("broken: left out: ") and "gone.ply" in said
+    with pytest.raises(CommandError, match=r"scenes='theirs/\*.xml' matches no file"):
+        Project(tmp_path).matching("theirs/*.xml")
+    file = preset_file(tmp_path, f'scenes = ["theirs/broken/scene_v3.xml"]\n{OPEN}')
+    with pytest.raises(CommandError, match="no scene can be measured: broken: left out: .*gone.ply"):
+        read_preset(file, Project(tmp_path))
+    assert Project(tmp_path).scene(str(others / "attic" / "scene_v3.xml")).name == "attic"
+    for stem, name in (("scene", "attic"), ("Scene_v0.6", "attic"), ("scenery", "scenery"), ("room", "room")):
+        (others / "attic" / f"{stem}.xml").write_text(SCENE)
+        assert Project(tmp_path).scene(str(others / "attic" / f"{stem}.xml")).name == name
+
+
+def test_scenes_of_the_command_line(tmp_path, others, swept, capsys):
+    """Expected: a preset without scenes renders the files that --scenes names, and says so without them; rows
+    of an earlier run stay, and another run with the first scene renders nothing anew; a scene that cannot be
+    loaded is named first, and the exit status is 1."""
+    file = preset_file(tmp_path, OPEN)
+    output = tmp_path / "out"
+    with pytest.raises(CommandError, match="scenes is missing; list them, or name scene files by --scenes"):
+        swept(file, "-o", output)
+    named = "-o", output, "--reference-seconds", 0, "--scenes"
+    assert swept(file, *named, others / "attic" / "scene_v3.xml", others / "broken" / "scene_v3.xml") == 1
+    said = capsys.readouterr().out
+    assert said.startswith("broken: left out: ") and "2 rows\nfailed: broken: left out: " in said
+    assert swept(file, *named, others / "cellar" / "scene_v3.xml") == 0
+    before = sorted((output / "cells").iterdir())
+    assert swept(file, *named, others / "attic" / "scene_v3.xml") == 0
+    assert sorted((output / "cells").iterdir()) == before and len(before) == 4
+    found = list(csv.DictReader((output / "rows.csv").read_text().splitlines()))
+    assert [row["scene"] for row in found] == ["attic", "attic", "cellar", "cellar"]
+
+
+def test_widths_fit_the_film(tmp_path, others):
+    """Expected: of a film of 12 x 10 pixels, of which no width of 128 divides into tiles of whole pixels, the
+    nearest width that does, 120 with a height of 100; and a reason where there is none."""
+    for name, sides in (("attic", (12, 10)), ("cellar", (1009, 4))):
+        text = SCENE
+        for side in sides:
+            text = text.replace('value="$resolution"', f'value="{side}"', 1)
+        (others / name / "scene_v3.xml").write_text(text)
+    preset = preset_of(
+        Path("preset"), {"scenes": [f"{others}/[ac]*/scene_v3.xml"], "spp": [2]}, Project(tmp_path)
+    )
+    (subject,) = preset.subjects
+    assert subject.name == "attic" and subject.resolution == 120 and subject.scene.size(120) == (120, 100)
+    assert "1009 x 4 pixels, which divides into 4 x 4 tiles at no width near 128" in preset.left_out[0]
+
+
+def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
+    """Expected: a column with the median seconds of an integrator's first images, measured once, at the
+    smallest budget, in the report as a table; a scene without file has none."""
+    making.make(job(3))
+    text = PRESET.replace("seeds = 2", "seeds = 2\nfirst_image = 3")
+    values, asked = iter([1.0, 9.0, 3.0, 1.0, 2.0, 1.5] * 2), []
+
+    def first(wanted):
+        asked.append(wanted)
+        seconds = next(values)
+        return {"seconds": seconds, "cpu_seconds": 10 * seconds}
+
+    monkeypatch.setattr(probes, "first_image", first)
+    for _ in range(2):
+        assert swept(preset_file(folder, text), "-o", folder / "out") == 0
+    found = pyarrow.parquet.read_table(folder / "out" / "rows.parquet").to_pylist()
+    seconds = {row["method"]: row["seconds_first_image"] for row in found}
+    assert seconds == {"ours": 3.0, "path": 1.5} and len(asked) == 6
+    assert {(one["spp"], one["resolution"], one["max_depth"]) for one in asked} == {(2, 8, 3)}
+    text = report.first_images_table(analysis.Results(found, {}, {}))
+    assert "| `cornell_box` | 3 s | 1.5 s, 2x |" in text
+    text = PRESET.replace("seeds = 2", 'seeds = 2\nfirst_image = 3\nclock = "processor"')
+    assert swept(preset_file(folder, text), "-o", folder / "out") == 0
+    found = pyarrow.parquet.read_table(folder / "out" / "rows.parquet").to_pylist()
+    assert {row["seconds_first_image"] for row in found} == {30.0, 15.0}
+    given = Project(folder, {"mine": REPOSITORY.scene("cornell_box")})
+    with pytest.raises(CommandError, match="first_image=1 needs scene files"):
+        preset_of(Path("preset"), {"first_image": 1}, given)
+
+
+def test_a_first_image_without_kernel_cache():
+    """Expected: a process of its own renders the scene's file as asked, in seconds; the text of one that
+    fails is raised."""
+    wanted = {"file": str(ROOT / "scenes" / "cornell_box.xml"), "resolution": 8, "sampler": "independent"}
+    wanted |= {"parameters": {"type": "path"}, "max_depth": 3, "spp": 2}
+    found = probes.first_image(wanted)
+    assert 0 < found["seconds"] < PATIENCE and 0 < found["cpu_seconds"] < PATIENCE
+    with pytest.raises(RuntimeError, match="gone.xml"):
+        probes.first_image(wanted | {"file": "gone.xml"})
+
+
+def test_time_left_follows_from_work(monkeypatch, capsys):
+    """Expected: after a render of a quarter of the work in 10 s, 30 s are left, less where a limit is nearer;
+    lines at most each half a minute where there is no terminal, with the number of renders."""
+    clock = [0.0]
+    monkeypatch.setattr(showing.time, "monotonic", lambda: clock[0])
+    with showing.Renders() as made, showing.Renders(limit=25) as limited:
+        assert made.seconds_left() is None and limited.seconds_left() == 25
+        for shown in (made, limited):
+            shown.plan([4, 4, 8])
+            shown.begin("box")
+        clock[0] = 10
+        for shown in (made, limited):
+            shown.end("box", 4)
+        assert made.seconds_left() == 30 and limited.seconds_left() == 15
+        assert not capsys.readouterr().err
+        clock[0] = 31
+        made.end("pool", 8)
+        assert capsys.readouterr().err == "2 of 3 renders, 0:10 left: pool\n"
+        made.plan([12])
+        assert made.words("x").startswith("2 of 4 renders, 0:41 left")
+    assert [showing.clock(s) for s in (59.6, 61, 3600)] == ["1:00", "1:01", "1:00:00"]
+
+
+def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
+    """Expected: of 100 seconds the missing references of two scenes take 25 each at most, and the renders
+    what is left, half of all at least; --reference-seconds and no limit as they say."""
+    text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool"]')
+    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
+    asked = []
+    monkeypatch.setattr(sweep, "obtained", lambda job: asked.append(job.seconds))
+    for given, found in (((None, 100.0), 25), ((None, None), 600), ((7.0, 100.0), 7)):
+        sweep.Sweep(Project(tmp_path, {}), preset, tmp_path).prepare(*given)
+        assert asked[-2:] == [found, found]
+    limits, clock = [], [0.0]
+    monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(sweep.Sweep, "run", lambda self, progress, seconds: limits.append(seconds))
+    for spent, left in ((10.0, 90.0), (70.0, 50.0)):
+
+        def prepared(self, *_, spent=spent):
+            clock[0] += spent
+
+        monkeypatch.setattr(sweep.Sweep, "prepare", prepared)
+        monkeypatch.setattr(sweep.Sweep, "rows", lambda self: [])
+        asked = build_parser().parse_args(["sweep", "x", "--seconds", "100", "-o", str(tmp_path / "out")])
+        sweep.swept(REPOSITORY, str(preset_file(tmp_path, text)), asked)
+        assert limits[-1] == left
 
 
 def test_the_table_is_tidy(tmp_path):
@@ -845,13 +1015,13 @@ def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
 
     monkeypatch.setattr(sweep.Sweep, "_cell", rendered)
     made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-    made.run(showing.bar(), seconds=5.5)
+    made.run(showing.Renders(), seconds=5.5)
     assert [cell.seed for cell in found] == [1, 1, 1, 1, 2, 2]
     assert {cell.budget for cell in found[:4]} == {2, 4}
     text = "cornell_box, 2 of 8 renders, from seed 2 on; run it again with --seconds 2, about"
     assert made.cut == text
     made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-    made.run(showing.bar(), seconds=100)
+    made.run(showing.Renders(), seconds=100)
     assert len(found) == 6 + 8 and made.cut == ""
 
 

@@ -21,7 +21,7 @@ Needs the extra ``[measure]``. Within the package nothing but the commands impor
 * Scenes: `project` (the user's folder), `scenes` (any scene file, at any size).
 * Renders: `timing` (a render, and several sides in turns), `probes` (renders in new processes).
 * Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
-  made), `given` (images of the user's).
+  made).
 * Sweeps: `preset` (which renders), `sweep`, `results` (the record of a render, and the files of them).
 * Reports: `analysis` (figures, or why there are none), `tables`, `figures`, `report` (Markdown), `page`
   (HTML).

@@ -259,30 +259,3 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
         ),
         missing=missing_energy(ours.whole, theirs.whole),
     )
-
-
-class Apart(NamedTuple):
-    """A differing ``tile`` (row, column), None for the whole image, and its ``share``.
-
-    ``share``: relative difference to the second's mean, in the most significant channel; infinite where that
-    is black.
-    """
-
-    tile: tuple[int, int] | None
-    share: float
-
-
-def apart(ours: Means, theirs: Means, significance: float = SIGNIFICANCE) -> list[Apart]:
-    """Return the tiles that differ, the whole image last; none if unbiased."""
-    significance = number_of("significance", significance, 0, 1)
-    found, tiles = welch(ours.columns, theirs.columns), ours.tiles
-    p = found.p.reshape(-1, 3)
-    channels = p.argmin(axis=1)
-    places = []
-    for index in np.flatnonzero(p.min(axis=1) < _each(significance, found.p.size)):
-        column = 3 * int(index) + int(channels[index])
-        mean, gap = float(theirs.columns.mean[column]), float(found.value[column])
-        share = gap / mean if mean > 0 else math.copysign(math.inf, gap)
-        tile = (int(index) // tiles, int(index) % tiles) if index < tiles**2 else None
-        places.append(Apart(tile, share))
-    return places

@@ -242,6 +242,16 @@ def check_size(job: Job) -> None:
     )
 
 
+def check_film(scene: MeasuredScene, wanted: int) -> None:
+    """Load a scene; raises ``CommandError`` if it cannot be measured at about this width."""
+    if nearest_width(scene, wanted) is None:
+        width, height = scene.size()
+        raise CommandError(
+            f"scene={scene.name!r} has a film of {width} x {height} pixels, which divides into {TILES} x "
+            f"{TILES} tiles at no width near {wanted}; take another resolution"
+        )
+
+
 def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
     """Return the nearest width that a bias check can divide into tiles; None if far."""
     own_width, own_height = scene.size()

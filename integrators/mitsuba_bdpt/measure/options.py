@@ -116,7 +116,8 @@ class Sweep(Options):
     scenes: tuple[str, ...] | None = option(
         None,
         str,
-        "scenes of the preset to render; rows of others stay as they are; default: all",
+        "scenes of the preset to render, or scene files where it lists none; rows of others stay as they "
+        "are; default: all",
         nargs="+",
         metavar="SCENE",
     )
@@ -126,12 +127,17 @@ class Sweep(Options):
     scheduler: str | None = option(
         None, str, "address of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
     )
-    reference_seconds: float = _reference_seconds()
+    reference_seconds: float | None = option(
+        None,
+        SECONDS,
+        f"seconds that making a reference may take where there is none, per scene; default: "
+        f"{REFERENCE_SECONDS:g}; with --seconds half of these, shared by the scenes",
+        metavar="SECONDS",
+    )
     seconds: float | None = option(
         None,
         SECONDS,
-        "seconds of the renders, beside references; what does not fit is cut, later seeds first, and said; "
-        "default: no limit",
+        "seconds of everything; what does not fit is cut, later seeds first, and said; default: no limit",
         metavar="SECONDS",
     )
 

@@ -6,12 +6,15 @@ Three lines are enough::
     spp = [4, 16, 64, 256]
     seeds = 8
 
-`DEFAULTS` has the rest. All keys::
+`DEFAULTS` has the rest. Without ``scenes`` a preset is for those that the command names by ``--scenes``. All
+keys::
 
-    resolution = 128
-    scenes = ["cornell_box", "rooms/kitchen.xml"]   # names in PROJECT/scenes, or files seen from PROJECT
+    resolution = 128       # width; where it does not divide into tiles, the nearest that does
+    scenes = ["cornell_box", "rooms/*/scene.xml"]   # names in PROJECT/scenes, or files seen from PROJECT
     spp = [4, 16, 64]      # samples per pixel of the first integrator: the budgets
     seeds = [5, 16, 5]     # renders of each; one number for all
+    clock = "processor"    # the seconds that decide: "wall", the default, or "processor", on a busy machine
+    first_image = 3        # first images without kernel cache, each in a process of its own; default: 0
 
     [[integrator]]         # the first one sets the time
     type = "bdpt"
@@ -49,24 +52,27 @@ import hashlib
 import json
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import CommandError
+from ..errors import CommandError, message
 from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
 from ..host.introspection import versions
+from ..run.rendering import raise_interrupt
 from . import probes
 from .agreement import FEWEST_RUNS, TILES
+from .making import check_film, nearest_width
 from .options import RESOLUTION
 from .project import Project, depth_in
 from .reference import source_digest
 from .scenes import MeasuredScene
 
 MATCHES = ("seconds", "spp")
+CLOCKS = ("wall", "processor")
 
 
 @dataclass(frozen=True)
@@ -94,9 +100,10 @@ class Method:
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene of a preset: ``max_depth``, samples per pixel and seeds of each budget."""
+    """A scene of a preset: width, ``max_depth``, samples per pixel and seeds of each budget."""
 
     scene: MeasuredScene
+    resolution: int
     max_depth: int
     spp: tuple
     seeds: tuple
@@ -124,15 +131,28 @@ class More:
 
 @dataclass(frozen=True)
 class Preset:
+    """What is rendered.
+
+    ``clock``: one of `CLOCKS`, whose seconds decide. ``first_images``: processes that render the first image
+    of each scene and integrator. ``scenes``: names of all scenes of the preset, also of those that are not
+    rendered now; None where the command names them. ``left_out``: scenes that cannot be measured, with the
+    reason.
+    """
+
     subjects: tuple
     methods: tuple
-    resolution: int
     more: More | None
     probes: dict
+    clock: str
+    first_images: int
+    scenes: tuple[str, ...] | None
+    left_out: tuple[str, ...]
 
 
 DEFAULTS: dict[str, Any] = {
     "resolution": RESOLUTION,
+    "clock": CLOCKS[0],
+    "first_image": 0,
     "spp": [4, 16, 64],
     "seeds": FEWEST_RUNS,
     "integrator": [
@@ -144,38 +164,81 @@ DEFAULTS: dict[str, Any] = {
 """What a preset need not say: the package's integrator and Mitsuba's path tracer in equal time."""
 
 
-def read_preset(path: Path, project: Project) -> Preset:
+def read_preset(path: Path, project: Project, only: Sequence[str] | None = None) -> Preset:
     """Read a TOML file of a ``project``; raises ``CommandError`` naming file and key."""
-    return preset_of(path, read_toml(path), project)
+    return preset_of(path, read_toml(path), project, only)
 
 
-def preset_of(path: Path, given: Mapping[str, Any], project: Project) -> Preset:
+def preset_of(
+    path: Path, given: Mapping[str, Any], project: Project, only: Sequence[str] | None = None
+) -> Preset:
     """Return the preset of a dictionary; ``path`` names it in errors.
 
-    By default all scenes that the ``project`` has as dictionaries.
+    By default all scenes that the ``project`` has as dictionaries. ``only``: of the preset's scenes these,
+    without probes; or the scenes of a preset that names none. Loads these scenes.
     """
     data = DEFAULTS | ({"scenes": list(project.given)} if project.given else {}) | dict(given)
+    is_open = "scenes" not in data
+    if is_open and only:
+        data["scenes"] = list(only)
     keys = {"scenes", "spp", "seeds", "resolution", "integrator"}
-    _check_keys(path, data, keys, keys | {"max_depth", "scene", "more", "probes"}, "a preset")
-    for key in {"resolution", "max_depth"} & set(data):
+    others = {"max_depth", "clock", "first_image", "scene", "more", "probes"}
+    _check_keys(path, data, keys, keys | others, "a preset")
+    for key in {"resolution", "max_depth", *({"first_image"} if data["first_image"] else ())} & set(data):
         whole_of(path, key, data[key])
     if data["resolution"] % TILES:
         raise CommandError(f"{path}: resolution={data['resolution']} must be divisible by {TILES}")
-    scenes = [project.scene(name) for name in _names(path, "scenes", data["scenes"])]
+    scenes = [scene for name in _names(path, "scenes", data["scenes"]) for scene in project.matching(name)]
     names = [scene.name for scene in scenes]
-    if len(set(names)) < len(names):
-        raise CommandError(f"{path}: scenes={data['scenes']!r} names one twice")
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise CommandError(f"{path}: scenes={data['scenes']!r} names one twice: {twice[0]}")
     for name in table_of(path, "scene", data.get("scene", {})):
         if name not in names:
             raise CommandError(f"{path}: [scene.{name}] is not among the scenes {names}")
     methods = _methods(path, data["integrator"], names)
-    return Preset(
-        subjects=tuple(_subject(path, data, scene) for scene in scenes),
-        methods=methods,
-        resolution=data["resolution"],
-        more=_more(path, data["more"], names, methods) if "more" in data else None,
-        probes=_probes(path, data.get("probes", {})),
-    )
+    more = _more(path, data["more"], names, methods) if "more" in data else None
+    measured = _probes(path, data.get("probes", {}))
+    if only and not is_open:
+        scenes, measured = _chosen(scenes, only), {}
+    subjects, left_out = _subjects(path, data, scenes)
+    clock, first = _timing(path, data, project)
+    order = None if is_open else tuple(names)
+    return Preset(subjects, methods, more, measured, clock, first, order, left_out)
+
+
+def _timing(path, data, project) -> tuple[str, int]:
+    """Return the clock, and the number of processes for first images."""
+    clock, first = data["clock"], data["first_image"]
+    if clock not in CLOCKS:
+        raise CommandError(f"{path}: clock={clock!r} must be one of {CLOCKS}")
+    if first and project.given:
+        raise CommandError(f"{path}: first_image={first} needs scene files: other processes render them")
+    return clock, first
+
+
+def _chosen(scenes: list[MeasuredScene], names: Sequence[str]) -> list[MeasuredScene]:
+    """Return the scenes of these names; raises ``CommandError`` for others."""
+    known = [scene.name for scene in scenes]
+    for name in names:
+        if name not in known:
+            raise CommandError(f"--scenes {name}: not in the preset, which has {', '.join(known)}")
+    return [scene for scene in scenes if scene.name in names]
+
+
+def _subjects(path, data, scenes) -> tuple[tuple, tuple]:
+    """Return subjects of the scenes that can be measured, and messages about the others."""
+    found, left_out = [], []
+    for scene in scenes:
+        try:
+            check_film(scene, data["resolution"])
+        except Exception as error:  # one scene must not cost the others
+            raise_interrupt(error)
+            left_out.append(f"{scene.name}: left out: {' '.join(message(error).split())}")
+        else:
+            found.append(_subject(path, data, scene))
+    if not found:
+        raise CommandError(f"{path}: no scene can be measured: {'; '.join(left_out)}")
+    return tuple(found), tuple(left_out)
 
 
 def _names(path, key, value) -> list[str]:
@@ -209,7 +272,8 @@ def _check_keys(path, entry, needed, allowed, what):
     if unknown := sorted(set(entry) - allowed):
         raise CommandError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
     if missing := sorted(needed - set(entry)):
-        raise CommandError(f"{path}: {missing[0]} is missing")
+        more = "; list them, or name scene files by --scenes" if missing[0] == "scenes" else ""
+        raise CommandError(f"{path}: {missing[0]} is missing{more}")
 
 
 def _row(path, key, value) -> tuple:
@@ -232,7 +296,8 @@ def _subject(path, data, scene) -> Subject:
             raise CommandError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
     else:
         seeds = (whole_of(path, "seeds", seeds),) * len(spp)
-    return Subject(scene, depth_in(path, data, scene), spp, seeds)
+    width = nearest_width(scene, data["resolution"])
+    return Subject(scene, width, depth_in(path, data, scene), spp, seeds)
 
 
 def _method(path, entry, scenes) -> Method:
@@ -305,6 +370,7 @@ class Cell:
     scene_sha256: str
     resolution: int
     max_depth: int
+    clock: str
     method: str
     parameters: tuple
     sampler: str
@@ -349,8 +415,9 @@ class Cells:
         self.common = {
             "scene": subject.name,
             "scene_sha256": subject.scene.sha256,
-            "resolution": preset.resolution,
+            "resolution": subject.resolution,
             "max_depth": subject.max_depth,
+            "clock": preset.clock,
             "versions": tuple(software().items()),
             "machine": machine(),
         }

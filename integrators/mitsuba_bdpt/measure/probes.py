@@ -1,17 +1,19 @@
 """Costs of a render besides its samples: first image without kernel cache, memory.
 
-Each probe takes the project and the number of repetitions, and returns plain numbers. Each repetition is a
-process of its own.
+Each of `PROBES` takes the project and the number of repetitions, and returns plain numbers. Each repetition
+is a process of its own.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from .options import VARIANT
 from .project import Project
@@ -25,6 +27,21 @@ integrator = mi.load_dict({{'type': '%s', 'max_depth': 6}})
 loaded = time.perf_counter()
 image = mi.render(scene, integrator=integrator, spp=16); dr.eval(image); dr.sync_thread()
 print(time.perf_counter() - loaded)
+"""
+
+FIRST = f"""
+import json, sys, time
+import mitsuba_bdpt, mitsuba as mi, drjit as dr
+from pathlib import Path
+from mitsuba_bdpt.measure.scenes import SceneFile, integrator_of
+mi.set_variant({VARIANT!r})
+wanted = json.loads(sys.argv[1])
+scene = SceneFile("first", Path(wanted["file"])).load(wanted["resolution"], wanted["sampler"])
+integrator = integrator_of(wanted["parameters"], wanted["max_depth"])
+dr.sync_thread()
+wall, processor = time.perf_counter(), time.process_time()
+image = mi.render(scene, integrator=integrator, spp=wanted["spp"]); dr.eval(image); dr.sync_thread()
+print(time.perf_counter() - wall, time.process_time() - processor)
 """
 
 MEMORY = f"""
@@ -74,6 +91,14 @@ def coldstart(project: Project, rounds: int) -> dict[str, list[float]]:
         for name, values in seconds.items():
             values.append(cold(COLD % name)[-1])
     return seconds
+
+
+def first_image(wanted: Mapping[str, Any]) -> dict[str, float]:
+    """Return ``seconds`` and ``cpu_seconds`` from an empty kernel cache to the image of a loaded scene.
+
+    ``wanted``: the ``file``, ``resolution``, ``sampler``, ``max_depth``, ``parameters`` and ``spp``.
+    """
+    return dict(zip(("seconds", "cpu_seconds"), cold(FIRST, json.dumps(dict(wanted)))[-2:], strict=True))
 
 
 def memory(project: Project, rounds: int) -> dict[str, list[float]]:

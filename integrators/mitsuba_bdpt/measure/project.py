@@ -11,6 +11,8 @@ All folders are optional.
 
 from __future__ import annotations
 
+import glob
+import re
 import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,6 +22,9 @@ from typing import Any
 from ..errors import CommandError, did_you_mean
 from ..files.texts import read_toml, table_of, whole_of
 from .scenes import DictionaryScene, MeasuredScene, SceneFile
+
+PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
+"""Stems of scene files that are named by their folders: of exporters, one folder per scene."""
 
 LISTED = 30
 """Names of scenes that a message lists, at most."""
@@ -58,10 +63,25 @@ class Project:
             return self.given[name]
         for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
             if file.is_file():
-                return SceneFile(file.stem, file)
+                return SceneFile(name_of(file), file)
         raise CommandError(
             f"scene={name!r} is neither a scene file nor the name of one in {str(self.scenes)!r}; "
             f"give the path of an XML file{self._names_for(name)}"
+        )
+
+    def matching(self, name: str) -> list[MeasuredScene]:
+        """Return the scenes of a pattern like ``rooms/*/scene.xml``, sorted; else `scene` of that name.
+
+        A ``~`` is the home folder. Raises ``CommandError`` if there are none.
+        """
+        name = str(Path(name).expanduser()) if name.startswith("~") else name
+        if name in self.given or not glob.has_magic(name):
+            return [self.scene(name)]
+        for pattern in (name, str(self.root / name)):
+            if found := sorted(glob.glob(pattern, recursive=True)):
+                return [self.scene(file) for file in found]
+        raise CommandError(
+            f"scenes={name!r} matches no file; give the paths of XML files, e.g. 'rooms/*/scene.xml'"
         )
 
     def called(self, scene: MeasuredScene) -> str:
@@ -107,6 +127,11 @@ class Project:
     @staticmethod
     def _found(given: Path, named: Path) -> Path:
         return named if named.exists() and not given.exists() else given
+
+
+def name_of(file: Path) -> str:
+    """Return the name of a scene file: that of its folder where all files are called scene.xml or so."""
+    return file.resolve().parent.name if PLAIN.fullmatch(file.stem) else file.stem
 
 
 def depth_in(file: Path, preset: dict[str, Any], scene: MeasuredScene) -> int:

@@ -40,6 +40,7 @@ class Row(Measured):
     max_depth: int
     sampler: str
     match: str  # "spp" or "seconds": what is equal to the first integrator's
+    clock: NotRequired[str]  # "wall" or "processor": the seconds that decide; missing in older sweeps
     budget: int  # samples per pixel of the first integrator
     first: str  # the integrator that the others are compared with
     parameters: str  # of the plugin, as JSON
@@ -50,6 +51,7 @@ class Row(Measured):
     started: str
     seconds_compile: float
     seconds_pilot: float | None  # missing in older sweeps
+    seconds_first_image: NotRequired[float | None]  # median, without kernel cache; if the preset asks for it
     reference_sha256: str
     width: int
     height: int

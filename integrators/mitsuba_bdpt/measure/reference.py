@@ -1,8 +1,8 @@
 """Stored reference images, with an estimate of their own error.
 
-Files lie in the project's references/: EXR in half precision (single, if given by the user) with the image
-(R, G, B), half the difference of two halves of its samples (difference.R ...), a sample of its own error, and
-the provenance as JSON in the header, with the data of bias checks. `making` makes them.
+Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
+two halves of its samples (difference.R ...), a sample of its own error, and the provenance as JSON in the
+header, with the data of bias checks. `making` makes them.
 """
 
 from __future__ import annotations
@@ -50,11 +50,6 @@ class Reference:
         """Whether it contains light that only `merging` samples, slightly blurred."""
         made_by = self.provenance["integrator"]
         return not isinstance(made_by, str) and bool(made_by.get("merging"))
-
-    @property
-    def given(self) -> bool:
-        """Whether the user gave the image (`given`); its own error is then not stored."""
-        return "given" in self.provenance
 
     def share_of(self, image: np.ndarray, trim: float) -> float:
         """Return the share of its own error in ``rel_mse(image, self.image, trim)``."""
@@ -124,15 +119,13 @@ def read_reference(path: Path) -> Reference:
 def write(path: Path, reference: Reference):
     """Write a reference atomically."""
     brightest = float(reference.image.max())
-    if brightest > HALF_MAX and not reference.given:
+    if brightest > HALF_MAX:
         raise CommandError(
             f"{path.name}: radiance {brightest:g} does not fit into half precision; scale the lamps"
         )
     layers = {"": reference.image, "difference.": reference.difference}
     header = reference.provenance | {"rel_mse": reference.error, "means": kept_of(reference.means)}
-    # Given images keep their exact values.
-    dtype = np.float32 if reference.given else np.float16
-    write_layers(path, layers, {"provenance": json.dumps(header)}, dtype)
+    write_layers(path, layers, {"provenance": json.dumps(header)}, np.float16)
 
 
 def means_of(kept: Any) -> Means | None:

@@ -132,6 +132,28 @@ def budgets_table(results: Results) -> str:
     return by_scene(scenes, columns)
 
 
+def first_images_table(results: Results) -> str:
+    """Table of seconds from an empty kernel cache to the first image, introduced; empty if not measured."""
+    found: dict[tuple[str, str], float] = {}
+    for row in results.rows:
+        if (seconds := row.get("seconds_first_image")) is not None:
+            found[row["scene"], row["method"]] = seconds
+
+    def over(rival: str, scene: str) -> str:
+        ours, theirs = found.get((scene, results.methods[0])), found.get((scene, rival))
+        return "–" if ours is None or theirs is None else f"{theirs:.3g} s, {ratio(ours / theirs)}"
+
+    columns: dict[str, Callable[[str], object]] = {
+        results.methods[0]: lambda scene: f"{found[scene, results.methods[0]]:.3g} s",
+        **{f"{rival}, ratio to it": partial(over, rival) for rival in results.standard},
+    }
+    scenes = [scene for scene in results.scenes if (scene, results.methods[0]) in found]
+    if not scenes:
+        return ""
+    text = "Seconds from an empty kernel cache to the first image, at the fewest samples of the sweep:"
+    return f"{text}\n\n{by_scene(scenes, columns)}\n"
+
+
 def gaps_table(results: Results) -> str:
     """Table of raw over trimmed relMSE: how much of the error few values carry.
 
@@ -533,9 +555,21 @@ MARK = "Made by `mitsuba-bdpt report`"
 """What every report has in it."""
 
 
-def _introduction(results: Results) -> str:
+def title(results: Results, folder: Path) -> str:
+    """Return the title: of the only scene, else of the folder, which has the preset's name."""
+    name = results.scenes[0] if len(results.scenes) == 1 else folder.resolve().name
+    return name[:1].upper() + name[1:]
+
+
+def _clock(results: Results) -> str:
+    """Describe the seconds, where they are not those of the clock on the wall."""
+    processor = any(row.get("clock") == "processor" for row in results.rows)
+    return "Seconds are processor seconds, of all threads together.\n" if processor else ""
+
+
+def _introduction(results: Results, name: str) -> str:
     """Introduce the figures, with machine and software."""
-    return f"""# Benchmark
+    return f"""# {name}
 
 {MARK} from the data beside it. Machine and versions: {machine(results)}.
 
@@ -549,14 +583,16 @@ error is at least the one measured, ≤ where the first integrator's is, ~ where
 time follow from the seconds at the largest budget; seconds are those measured, so other budgets are compared
 as if errors fell with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly
 too narrow (it holds the median in 90 % of cases, not 95 %).
-"""
+{_clock(results)}"""
 
 
-def page(results: Results, made: dict[str, Reference], goals: list[Goal], notes: dict[str, str]) -> str:
-    """Return the page of all tables, as Markdown."""
+def page(
+    results: Results, made: dict[str, Reference], goals: list[Goal], notes: dict[str, str], name: str
+) -> str:
+    """Return the page of all tables, as Markdown, under a title."""
     if unknown := sorted(set(notes) - set(results.scenes)):
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
-    return f"""{_introduction(results)}
+    return f"""{_introduction(results, name)}
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
@@ -565,7 +601,8 @@ def page(results: Results, made: dict[str, Reference], goals: list[Goal], notes:
 By budget, over {stronger(results)} of those that pass the bias check, or of all where none does:
 
 {budgets_table(results)}
-How much of the error single values carry: raw over trimmed relMSE at {results.deciding} samples per pixel:
+{first_images_table(results)}How much of the error single values carry: raw over trimmed relMSE at
+{results.deciding} samples per pixel:
 
 {gaps_table(results)}
 ## Errors
@@ -609,6 +646,7 @@ class Report:
     made: dict[str, Reference]
     goals: list[Goal]
     notes: dict[str, str]
+    title: str
 
     @staticmethod
     def of(project: Project, folder: Path) -> Report:
@@ -618,11 +656,12 @@ class Report:
         kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
         for scene, text in kept["notes"].items():
             text_of(files["notes"], scene, text)
-        return Report(results, made, checked_goals(files["goals"], kept["goals"]), kept["notes"])
+        goals = checked_goals(files["goals"], kept["goals"])
+        return Report(results, made, goals, kept["notes"], title(results, folder))
 
     def text(self) -> str:
         """Return the page of all tables, as Markdown."""
-        return page(self.results, self.made, self.goals, self.notes)
+        return page(self.results, self.made, self.goals, self.notes, self.title)
 
     def draw(self, folder: Path) -> None:
         """Write the plots that the page shows."""

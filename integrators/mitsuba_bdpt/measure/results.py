@@ -7,9 +7,10 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -36,6 +37,11 @@ from .scenes import MeasuredScene, digest
 
 def cell_file(output: Path, cell: Cell) -> Path:
     return output / "cells" / f"{cell.key}.json"
+
+
+def first_image_file(output: Path, cell: Cell) -> Path:
+    """Return the file of the seconds of first images, by the cell of the smallest budget's first seed."""
+    return output / "first" / f"{cell.key}.json"
 
 
 def image_file(output: Path, cell: Cell) -> Path:
@@ -129,9 +135,17 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
         wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
     found = read_rows(output, cells, wanted.values())
     spreads = _spreads(output, cells, list(wanted.values()), found) if found else {}
+    first = {c.method: _first_image(output, c) for c in cells.of(min(cells.subject.spp), FIRST_SEED)}
     for row in found:
         row |= {"spread": spreads[row["key"]], "first": preset.methods[0].name}
+        row["seconds_first_image"] = first[row["method"]]
     return found
+
+
+def _first_image(output: Path, cell: Cell) -> float | None:
+    """Return the median seconds of an integrator's first images; None without."""
+    file = first_image_file(output, cell)
+    return float(np.median(read_json(file, "delete it, to render it anew"))) if file.exists() else None
 
 
 def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[Row]) -> dict[str, float | None]:
@@ -171,8 +185,8 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]
     return metrics.spread([_image(output, cell) for cell in group], load_reference(*cells.where()).image)
 
 
-def beside(table: list[Row], order: list[str], output: Path) -> list[Row]:
-    """Return ``table`` and stored rows of other scenes, in ``order``."""
+def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[Row]:
+    """Return ``table`` and stored rows of other scenes, in ``order``; None: as stored, new ones last."""
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     try:
         others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
@@ -180,6 +194,7 @@ def beside(table: list[Row], order: list[str], output: Path) -> list[Row]:
         raise CommandError(
             f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
         ) from error
+    order = order or list(dict.fromkeys(row["scene"] for row in [*others, *table]))
     found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
     return sorted(found, key=lambda row: order.index(row["scene"]))
 
@@ -191,6 +206,7 @@ COLUMNS: dict[str, Callable[[Row], object]] = {
     "sampler": lambda row: row["sampler"],
     "spp": lambda row: row["spp"],
     "seed": lambda row: row["seed"],
+    "clock": lambda row: row.get("clock", "wall"),
 }
 """First columns of rows.csv."""
 
@@ -200,6 +216,7 @@ NUMBERS = {
     "cpu_seconds": "cpu_seconds",
     "seconds_compile": "seconds_compile",
     "seconds_pilot": "seconds_pilot",
+    "seconds_first_image": "seconds_first_image",
     "rel_mse": "rel_mse",
     "rel_mse_trimmed": "rel_mse_trimmed",
     "reference_rel_mse": "reference_rel_mse",
@@ -280,6 +297,16 @@ def write_tables(table: list[Row], output: Path) -> None:
         )
 
 
+def decided(row: Mapping[str, Any]) -> float:
+    """Return the seconds of a record by its clock: wall or processor seconds."""
+    return row["cpu_seconds"] if row.get("clock") == "processor" else row["seconds"]
+
+
+def decisive(rows: list[Row]) -> list[Row]:
+    """Return the ``rows`` with the seconds by which they are compared."""
+    return [{**row, "seconds": decided(row)} for row in rows]
+
+
 def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
     """Return the results in a folder, and the references of its scenes by name.
 
@@ -287,7 +314,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     ``project``'s.
     """
     try:
-        rows = pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist()
+        rows = decisive(pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist())
     except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
         raise CommandError(
             f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
@@ -308,7 +335,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
                 f"{folder}: the errors in {scene} were taken against another reference; run "
                 f"{project.sweep_command(folder)}, which takes them anew"
             )
-    means = {scene: kept.means for scene, kept in made.items() if not kept.given}
+    means = {scene: kept.means for scene, kept in made.items()}
     if without := [scene for scene, kept in means.items() if kept is None]:
         raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
     file = folder / "probes.json"

@@ -1,13 +1,16 @@
-"""Progress bars of measurements on standard error.
+"""Progress of measurements on standard error: bars on a terminal.
 
-Silent elsewhere than on a terminal. Print before or after a bar, not inside.
+Elsewhere than on a terminal only long `Renders` are shown, by lines. Print before or after, not inside.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import sys
+import time
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from itertools import count
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -35,3 +38,74 @@ def amount(text: str, total: float) -> Generator[Callable[[float], None]]:
     with bar() as shown:
         task = shown.add_task(text, total=round(total))
         yield lambda done: shown.update(task, completed=min(round(done), round(total)))
+
+
+EVERY, SHARE = 30.0, 0.02
+"""Least time between two lines: seconds, and share of the time so far."""
+
+
+class Renders:
+    """Progress of many renders of different lengths, whose time left follows from their work.
+
+    The work of a render is any number in proportion to its seconds. ``limit``: of the seconds, if any.
+    """
+
+    def __init__(self, limit: float | None = None):
+        console = Console(stderr=True)
+        text = TextColumn("{task.description}", markup=False)  # names of integrators may contain brackets
+        self._is_bar = console.is_terminal
+        self._bar = Progress(text, BarColumn(), console=console, transient=True, disable=not self._is_bar)
+        self._task = self._bar.add_task("", total=0.0)
+        self._limit, self._began = limit, time.monotonic()
+        self._done, self._total, self._work, self._whole, self._spent = 0, 0, 0.0, 0.0, 0.0
+        self._since = self._printed = self._began
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def plan(self, works: Iterable[float]) -> None:
+        """Add renders of so much work each."""
+        found = list(works)
+        self._total, self._whole = self._total + len(found), self._whole + sum(found)
+
+    def begin(self, text: str) -> None:
+        """Show what is rendered next."""
+        self._since = time.monotonic()
+        self._show(text)
+
+    def end(self, text: str, work: float) -> None:
+        """Count a render, whose seconds are those since the last `begin` or `end`."""
+        now = time.monotonic()
+        self._spent, self._since = self._spent + now - self._since, now
+        self._done, self._work = self._done + 1, self._work + work
+        self._show(text)
+        if not self._is_bar and now - self._printed >= max(EVERY, SHARE * (now - self._began)):
+            self._printed = now
+            print(self.words(text), file=sys.stderr, flush=True)
+
+    def seconds_left(self) -> float | None:
+        """Return the estimated seconds until all is rendered or the limit is over; None before the first."""
+        rest = self._limit - (time.monotonic() - self._began) if self._limit is not None else None
+        if not self._work:
+            return rest
+        left = self._spent * (self._whole - self._work) / self._work
+        return max(left if rest is None else min(left, rest), 0.0)
+
+    def words(self, text: str) -> str:
+        """Return how many renders are done, and the time left."""
+        left = self.seconds_left()
+        said = f"{self._done} of {self._total} renders" + ("" if left is None else f", {clock(left)} left")
+        return f"{said}: {text}"
+
+    def _show(self, text: str) -> None:
+        self._bar.update(self._task, description=self.words(text), completed=self._work, total=self._whole)
+
+
+def clock(seconds: float) -> str:
+    """Format seconds as minutes, or as hours and minutes."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

@@ -30,24 +30,35 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from rich.progress import Progress, TaskID
 
 from .. import workers
 from ..errors import CommandError, message
 from ..files.images import check_output
 from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
-from . import analysis, probes, showing
+from . import analysis, probes
 from .estimates import seed_errors
 from .making import Job, check, obtained
-from .options import VARIANT
+from .options import REFERENCE_SECONDS, VARIANT
 from .options import Sweep as Asked
 from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
 from .record import Row
 from .reference import load_reference, make_command, too_few
-from .results import beside, cell_file, judge_of, read_rows, rows, store, write_tables
+from .results import (
+    beside,
+    cell_file,
+    decided,
+    decisive,
+    first_image_file,
+    judge_of,
+    read_rows,
+    rows,
+    store,
+    write_tables,
+)
 from .scenes import check_plugins, integrator_of
+from .showing import Renders
 from .timing import Timed, alternating, timed
 
 CALIBRATIONS = 3  # alternating renders that calibrate the samples for equal time
@@ -116,7 +127,8 @@ class Bench:
                     self.compile_seconds(one_of_both, largest)
                 both = [partial(self.timed, c, largest) for c in (first, cell)]
                 turns = alternating(both, CALIBRATIONS, is_warm=True)
-                write_json(kept, float(np.median([ours.seconds / theirs.seconds for ours, theirs in turns])))
+                seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
+                write_json(kept, float(np.median([ours / theirs for ours, theirs in seconds])))
             self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
         wanted = cell.budget * self._spp[cell.method]
         if cell.sampler == "independent":
@@ -208,25 +220,30 @@ class Sweep:
     """
 
     def __init__(self, project: Project, preset: Preset, output: Path):
-        self.project, self.preset, self.output, self.failed, self.cut = project, preset, output, [], ""
+        self.project, self.preset, self.output, self.cut = project, preset, output, ""
+        self.failed = list(preset.left_out)
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
-        self._progress, self._task = Progress(), TaskID(0)  # placeholders until `run`
+        self._progress = Renders()  # placeholder until `run`
 
-    def prepare(self, seconds: float):
+    def prepare(self, seconds: float | None = None, limit: float | None = None):
         """Check all cells, and make missing references, before rendering.
 
-        Each reference takes at most about ``seconds``. A scene without one is skipped, and recorded in
-        ``failed``.
+        Each reference takes at most about ``seconds``, by default `REFERENCE_SECONDS`, or equal shares of
+        half the ``limit``. A scene without one is skipped, and recorded in ``failed``.
         """
         wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
         for cells, missing in wanted:
             for method in {cell.method: cell for cell in missing}.values():
                 check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
-        jobs = [Job(*cells.where(), spp=max(cells.subject.spp), seconds=seconds) for cells, _ in wanted]
+        jobs = [Job(*cells.where(), spp=max(cells.subject.spp)) for cells, _ in wanted]
         for job in jobs:
             check(job)
+        if seconds is None:
+            lacking = sum(job.stored is None for job in jobs)
+            seconds = REFERENCE_SECONDS if limit is None else limit / 2 / max(lacking, 1)
+        jobs = [replace(job, seconds=seconds) for job in jobs]
         lost = []
         for (cells, _), job in zip(wanted, jobs, strict=True):
             try:
@@ -252,16 +269,15 @@ class Sweep:
                 self._note(f"{cells.subject.name}: no rows", error)
         return found
 
-    def run(self, progress: Progress, elsewhere=None, seconds: float | None = None):
+    def run(self, progress: Renders, elsewhere=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
 
         ``elsewhere``: a `workers.Cluster` and the preset's text, to render on a cluster. ``seconds``: limit,
         shared equally by the scenes; what does not fit is recorded in ``cut``.
         """
         scenes, todo = self.scenes, self._todo
-        probed = 0 if elsewhere else len(self.preset.probes)
         self._progress = progress
-        self._task = progress.add_task("", total=sum(map(len, todo)) + probed)
+        progress.plan(_work(cell) for missing in todo for cell in missing)
         if elsewhere:
             self._remote(*elsewhere, scenes, todo)
             return
@@ -271,6 +287,7 @@ class Sweep:
             return
         for cells, missing in zip(scenes, todo, strict=True):
             bench = Bench(cells, self.output)
+            self._first_images(cells)
             while missing := missing or self._more(cells):
                 for cell in missing:
                     self._cell(bench, cell)
@@ -282,6 +299,7 @@ class Sweep:
         total, done, cut = sum(map(len, self._todo)), 0, list[str]()
         for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
             bench, end = Bench(cells, self.output), started + seconds * (i + 1) / len(self.scenes)
+            self._first_images(cells)
             for j, cell in enumerate(sorted(missing, key=lambda cell: cell.seed)):
                 if time.monotonic() >= end:
                     cut.append(
@@ -295,11 +313,30 @@ class Sweep:
             wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
             self.cut = f"{'; '.join(cut)}; run it again with --seconds {wanted}, about"
 
+    def _first_images(self, cells: Cells):
+        """Render the missing first images of a scene, at its smallest budget."""
+        for cell in cells.of(min(cells.subject.spp), FIRST_SEED):
+            file = first_image_file(self.output, cell)
+            if not self.preset.first_images or file.exists():
+                continue
+            self._progress.begin(f"{cell.scene}, first image, {cell.method}")
+            wanted = {
+                "file": str(cells.subject.scene.file.resolve()),
+                "parameters": dict(cell.parameters),
+                "spp": cell.budget,
+                **{key: getattr(cell, key) for key in ("resolution", "sampler", "max_depth")},
+            }
+            try:
+                taken = [probes.first_image(wanted) for _ in range(self.preset.first_images)]
+                write_json(file, [decided(one | {"clock": cell.clock}) for one in taken])
+            except Exception as error:  # one render must not end the others
+                self._note(f"{cell.scene}, first image, {cell.method}", error)
+
     def _probes(self):
         file = self.output / "probes.json"
         kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
         for name, rounds in self.preset.probes.items():
-            self._progress.update(self._task, description=name)
+            self._progress.begin(name)
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
@@ -307,16 +344,15 @@ class Sweep:
                     write_json(file, kept)
             except Exception as error:  # a probe must not end the sweep
                 self.failed.append(f"{name}: {error}")
-            self._progress.advance(self._task)
 
     def _cell(self, bench: Bench, cell: Cell):
         """Render a cell in this process."""
-        self._progress.update(self._task, description=_description(cell))
+        self._progress.begin(_description(cell))
         try:
             self._store(bench.cells, cell, measure(bench, cell))
         except Exception as error:  # one cell must not end the others
             self._note(_description(cell), error)
-        self._progress.advance(self._task)
+        self._progress.end(_description(cell), _work(cell))
 
     def _store(self, cells: Cells, cell: Cell, result):
         if cells.where() not in self._judges:
@@ -345,7 +381,7 @@ class Sweep:
                         self.failed.append(f"{_description(cell)}: {result}")
                     else:
                         self._store(cells, cell, result)
-                    self._progress.update(self._task, description=_description(cell), advance=1)
+                    self._progress.end(_description(cell), _work(cell))
             todo = [[] for _ in scenes]
 
     def _more(self, cells: Cells) -> list[Cell]:
@@ -360,7 +396,7 @@ class Sweep:
             return []  # a failed cell
         try:
             names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.methods))
-            widths = analysis.widths(read_rows(self.output, cells, found), list(names))
+            widths = analysis.widths(decisive(read_rows(self.output, cells, found)), list(names))
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
@@ -370,8 +406,7 @@ class Sweep:
         if not self._tried.isdisjoint(keys := {c.key for c in missing}):
             return []  # a failed cell
         self._tried |= keys
-        total = self._progress.tasks[self._task].total or 0
-        self._progress.update(self._task, total=total + len(missing))
+        self._progress.plan(map(_work, missing))
         return missing
 
     def _is_there(self, cell: Cell) -> bool:
@@ -385,14 +420,9 @@ def _description(cell: Cell) -> str:
     return f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
 
 
-def chosen(preset: Preset, names) -> Preset:
-    """Return a preset of some scenes, without probes; ``CommandError`` if unknown."""
-    known = [subject.name for subject in preset.subjects]
-    for name in names:
-        if name not in known:
-            raise CommandError(f"--scenes {name}: not in the preset, which has {', '.join(known)}")
-    subjects = tuple(subject for subject in preset.subjects if subject.name in names)
-    return replace(preset, subjects=subjects, probes={})
+def _work(cell: Cell) -> float:
+    """Return what a render takes, in proportion: equal for all integrators at equal time."""
+    return float(cell.budget) * cell.resolution**2
 
 
 def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
@@ -444,47 +474,77 @@ def swept(
 ) -> tuple[list[Row], list[str]]:
     """Render the missing cells of a ``preset``; returns all rows, and failures.
 
-    ``preset``: a TOML file, its name, or its content as a dictionary.
+    ``preset``: a TOML file, its name, or its content as a dictionary. With ``seconds``, missing references
+    take half of these at most, unless ``reference_seconds`` says so, and the renders what is left.
     """
-    if options.scheduler and (project.given or isinstance(preset, Mapping)):
+    began = time.monotonic()
+    whole, output, text = _read(project, preset, options)
+    _check_cluster(project, preset, whole, options)
+    check_output(output / "rows.csv", ".csv")  # fail before rendering
+    for told in whole.left_out:
+        print(told, flush=True)
+    sweep = Sweep(project, whole, output)
+    sweep.prepare(options.reference_seconds, options.seconds)
+    left = None
+    if options.seconds is not None:
+        left = max(options.seconds - (time.monotonic() - began), options.seconds / 2)
+    with Renders(left) as progress:
+        if options.scheduler:
+            with workers.connected(options.scheduler) as cluster:
+                sweep.run(progress, (cluster, text))
+        else:
+            sweep.run(progress, seconds=left)
+    table = sweep.rows()
+    if options.scenes or whole.scenes is None:
+        table = beside(table, whole.scenes, output)
+    if table:
+        write_tables(table, output)
+    _tell(sweep, table)
+    return table, sweep.failed
+
+
+def _read(
+    project: Project, preset: str | Mapping[str, Any], options: Asked | Namespace
+) -> tuple[Preset, Path, str]:
+    """Return the preset that the ``options`` ask for, the folder of its rows, and its text."""
+    if isinstance(preset, Mapping):
+        whole, name, text = preset_of(Path("preset"), preset, project, options.scenes), "sweep", ""
+    else:
+        file = project.preset(preset)
+        whole, name = read_preset(file, project, options.scenes), file.stem
+        text = file.read_text()
+    return whole, options.output or project.root / "results" / name, text
+
+
+def _check_cluster(
+    project: Project, preset: str | Mapping[str, Any], whole: Preset, options: Asked | Namespace
+) -> None:
+    """Raise ``CommandError`` for what workers cannot render."""
+    if not options.scheduler:
+        return
+    if project.given or isinstance(preset, Mapping):
         what = f"scene={next(iter(project.given))!r}" if project.given else "the preset"
         raise CommandError(
             f"scheduler={options.scheduler} with {what}, a dictionary, is not possible: workers load files; "
             "write it into one"
         )
-    if options.scheduler and options.seconds is not None:
+    if whole.scenes is None:
+        raise CommandError(
+            f"scheduler={options.scheduler} needs a preset with scenes: workers read it; list them there"
+        )
+    if options.seconds is not None:
         raise CommandError(f"seconds={options.seconds:g} with scheduler={options.scheduler} is not possible")
-    if isinstance(preset, Mapping):
-        file, text = Path("sweep"), ""
-        whole = preset_of(Path("preset"), preset, project)
-    else:
-        file = project.preset(preset)
-        whole = read_preset(file, project)
-        text = file.read_text()
-    output = options.output or project.root / "results" / file.stem
-    part = chosen(whole, options.scenes) if options.scenes else whole
-    check_output(output / "rows.csv", ".csv")  # fail before rendering
-    sweep = Sweep(project, part, output)
-    sweep.prepare(options.reference_seconds)
-    with showing.bar() as progress:
-        if options.scheduler:
-            with workers.connected(options.scheduler) as cluster:
-                sweep.run(progress, (cluster, text))
-        else:
-            sweep.run(progress, seconds=options.seconds)
-    table = sweep.rows()
-    if options.scenes:
-        table = beside(table, [subject.name for subject in whole.subjects], output)
-    if table:
-        write_tables(table, output)
-    # What time did not allow first: the figures depend on it.
+
+
+def _tell(sweep: Sweep, table: list[Row]) -> None:
+    """Print what time did not allow, warnings, and the number of rows."""
+    # What was cut comes first: the figures depend on it.
     if sweep.cut:
         print(f"cut for lack of time: {sweep.cut}")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
-    print(f"{output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
-    return table, sweep.failed
+    print(f"{sweep.output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
 
 
 def run(options: Namespace) -> int:
