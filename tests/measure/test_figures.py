@@ -7,7 +7,8 @@ from argparse import Namespace
 import numpy as np
 import pytest
 from mitsuba_bdpt.errors import CommandError
-from mitsuba_bdpt.measure import figures
+from mitsuba_bdpt.files.images import write_layers
+from mitsuba_bdpt.measure import crops, figures, paper, pyramid
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results
 
@@ -65,6 +66,82 @@ def test_no_text_lies_over_another(monkeypatch, plot, columns):
     check_texts(figure)
 
 
+def block(count, height=48, width=32, title="a_caustic_with_a_long_name"):
+    """Images of a bright, noisy window at the bottom right, the noisier the earlier, and their reference."""
+    rng, target = np.random.default_rng(1), np.full((height, width, 3), 0.5)
+    columns = []
+    for i in range(count):
+        image = target + 0.01 * rng.standard_normal(target.shape)
+        image[-12:, -12:] += (count - i) * rng.exponential(0.5, (12, 12, 3))
+        columns.append(crops.judged(METHODS[i], 64, 1.234, image, target))
+    return crops.Block(title, tuple(columns), target)
+
+
+def saved(monkeypatch, module):
+    found = []
+    monkeypatch.setattr(
+        module, "save", lambda figure, path: (figure.draw_without_rendering(), found.append(figure))
+    )
+    return found
+
+
+@pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (2, 5)])
+def test_images_stand_side_by_side(monkeypatch, columns, count):
+    """Expected: of two scenes, one of them wide, a column per image and one of the reference: image, two
+    windows where the errors differ most, errors; all text readable, inside, none over another."""
+    found = saved(monkeypatch, crops)
+    crops.draw([block(count), block(count, 16, 64, "b")], None, columns)
+    (figure,) = found
+    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
+    check_texts(figure)
+    images = [axis for axis in figure.axes if axis.images]
+    assert len(images) == 2 * (3 * (count + 1) + count)
+    boxes = [axis.get_position() for axis in figure.axes]
+    for a, b in itertools.combinations(boxes, 2):
+        assert min(a.x1, b.x1) - max(a.x0, b.x0) < 1e-9 or min(a.y1, b.y1) - max(a.y0, b.y0) < 1e-9
+    assert all(a.x0 >= 0 and a.x1 <= 1 + 1e-9 and a.y0 >= -1e-9 and a.y1 <= 1 for a in boxes)
+
+
+def test_windows_lie_where_errors_differ():
+    """Expected: the first of two disjoint windows within the window of fireflies."""
+    made = block(2)
+    (left, top, side), (left2, top2, _) = crops.windows(made.columns[0].errors, made.columns[1].errors)
+    assert side == 5 and left >= 20 - 1 and top >= 36 - 1
+    assert abs(left - left2) >= side or abs(top - top2) >= side
+
+
+def test_crops_are_of_the_sweep(tmp_path):
+    """Expected: the images of the first seed at the deciding budget, rivals first, with their samples and
+    seconds; integrators without images are left out, and a scene without any is an error."""
+    rows = [row | {"key": f"{row['method']}{row['seed']}"} for row in results(("b",)).rows]
+    found = Results(rows, {"b": KNOWN}, {})
+    kept = Namespace(image=np.ones((8, 8, 3)))
+    with pytest.raises(CommandError, match="no image of b is there; run the sweep again"):
+        figures.cropped(tmp_path, found, kept, "b")
+    for method, value in (("bdpt", 1.5), ("path", 2.0)):
+        (tmp_path / "images" / "b").mkdir(parents=True, exist_ok=True)
+        write_layers(tmp_path / "images" / "b" / f"{method}0.exr", {"": np.full((8, 8, 3), value)}, {})
+    made = figures.cropped(tmp_path, found, kept, "b")
+    assert [one.caption for one in made.columns] == [
+        ("path", "64 spp, 0.64 s", "relMSE 0.99 (trimmed)"),
+        ("bdpt", "64 spp, 0.64 s", "relMSE 0.25 (trimmed)"),
+    ]
+    np.testing.assert_allclose(made.columns[1].errors, 0.25 / 1.01, rtol=1e-3)
+
+
+@pytest.mark.parametrize("columns", [1, 2])
+@pytest.mark.parametrize("longest", [3, 8])
+def test_pyramids_can_be_read(monkeypatch, columns, longest):
+    """Expected: as wide as its columns, with a title per strategy of 6 points or more, none over another."""
+    found = saved(monkeypatch, pyramid)
+    keys = [(k, s, k + 1 - s) for k in range(2, longest + 1) for s in range(k + 2)]
+    pyramid.draw({key: np.ones((9, 16, 3)) if key[2] else None for key in keys}, None, 0.0, columns)
+    (figure,) = found
+    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
+    check_texts(figure)
+    assert sum(bool(axis.get_title()) for axis in figure.axes) == len(keys)
+
+
 def test_a_single_panel_is_one_column_wide(monkeypatch):
     """Rationale: one scene drew its curves into the left quarter of a white page, and the legend of two
     columns was cut at the edge of one. Expected: 8.5 cm, all text inside."""
@@ -75,7 +152,7 @@ def test_a_single_panel_is_one_column_wide(monkeypatch):
 
 def check_texts(figure):
     """All text is inside of a figure, of 6 points or more, and none over another."""
-    texts = [t for t in figure.findobj(figures.plt.Text) if t.get_text().strip() and t.get_visible()]
+    texts = [t for t in figure.findobj(paper.plt.Text) if t.get_text().strip() and t.get_visible()]
     labels = [t for a in figure.axes for axis in (a.xaxis, a.yaxis) for t in hidden(axis)]
     texts = [t for t in texts if not any(t is label for label in labels)]
     boxes = {t.get_text() + str(i): t.get_window_extent() for i, t in enumerate(texts)}

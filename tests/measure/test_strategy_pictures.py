@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.measure import figures, pyramid
+from mitsuba_bdpt.measure import paper, pyramid
 from mitsuba_bdpt.measure.project import Project
 from repository import PROJECT
 
@@ -44,6 +44,9 @@ def test_pyramid(tmp_path, capsys):
         assert len(layers) == 12  # 3 + 4 + 5 of 1, 2 and 3 edges
         np.testing.assert_allclose(sum(layers), channels[channel], rtol=1e-4, atol=1e-5)
         assert f"unweighted.s2t2.{channel}" in channels
+    assert main(["pyramid", str(file), "-o", str(tmp_path / "a.pdf"), "--columns", "1", *options]) == 0
+    assert (tmp_path / "a.exr").stat().st_size == output.stat().st_size
+    assert (tmp_path / "a_unweighted.pdf").read_bytes().startswith(b"%PDF")
     for name in said:
         picture = matplotlib.image.imread(name)[..., :3]
         height, width = picture.shape[:2]
@@ -99,11 +102,11 @@ def test_strategies_stand_where_they_belong(tmp_path):
     pyramid.draw(found, tmp_path / "a.png", 0.0)
     picture = matplotlib.image.imread(tmp_path / "a.png")[..., :3]
     height, width = picture.shape[:2]
-    panel = (width - 0.5 * figures.DPI) / 5
+    panel = (width - 0.5 * paper.DPI) / 5
     for row, (k, lit) in enumerate(((2, 1), (3, 3))):
         y = int((row + 0.6) * height / 2)
         for s in range(k + 2):
-            x = int(0.5 * figures.DPI + panel * (s + (3 - k) / 2 + 0.5))
+            x = int(0.5 * paper.DPI + panel * (s + (3 - k) / 2 + 0.5))
             assert (picture[y, x].max() < 0.9) == (s == lit), (k, s)
 
 

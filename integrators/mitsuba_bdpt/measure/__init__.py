@@ -23,10 +23,10 @@ Needs the extra ``[measure]``. Within the package nothing but the commands impor
 * Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
   made).
 * Sweeps: `preset` (which renders), `sweep`, `results` (the record of a render, and the files of them).
-* Reports: `analysis` (figures, or why there are none), `tables`, `figures`, `report` (Markdown), `page`
-  (HTML).
+* Reports: `analysis` (figures, or why there are none), `tables`, `figures` (plots), `crops` (images side by
+  side), `paper` (widths and formats for print), `report` (Markdown), `page` (HTML).
 * A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.
-* Progress bars: `showing`.
+* Progress and time left: `showing`.
 """
 
 from .api import (

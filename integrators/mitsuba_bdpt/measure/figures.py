@@ -11,17 +11,14 @@ from argparse import Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ..errors import CommandError
-from ..files.images import check_output
-from ..files.whole import replacing
+from ..files.images import read_layers
+from . import crops
 from .analysis import (
     ALONE,
     INDEPENDENT,
@@ -35,9 +32,10 @@ from .analysis import (
     Results,
 )
 from .estimates import Bound, seed_errors
-from .options import FIGURE_FORMATS
+from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
 from .record import Error
+from .reference import Reference
 from .results import load
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
@@ -66,31 +64,9 @@ RAYS = {
     "shadow_inner": ("visibility, s ≥ 2, t ≥ 2", "#CC79A7", "\\\\"),
 }
 
-WIDTHS = {1: 8.5 / 2.54, 2: 17.8 / 2.54}
-"""Inches, by columns of a page."""
-
 PANELS = {1: 2, 2: 4}
 """Scenes side by side, at most."""
 
-DPI = 200  # of PNG
-PAPER = {
-    "font.size": 7,
-    "axes.titlesize": 7,
-    "axes.labelsize": 7,
-    "xtick.labelsize": 6,
-    "ytick.labelsize": 6,
-    "legend.fontsize": 6.5,
-    "legend.frameon": False,
-    "axes.linewidth": 0.5,
-    "grid.linewidth": 0.3,
-    "lines.linewidth": 1.0,
-    "lines.markersize": 3.2,
-    "xtick.major.width": 0.5,
-    "ytick.major.width": 0.5,
-    "pdf.fonttype": 42,
-    "svg.fonttype": "path",
-    "svg.hashsalt": "mitsuba-bdpt",
-}
 DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
@@ -300,23 +276,6 @@ def _rays_per_sample(results: Results, scene: str, kind: str) -> float:
     return float(np.median(counts)) if counts else 0.0
 
 
-def save(figure, path: Path) -> None:
-    """Write a figure in the format of the file's ending, the same bytes for the same figure."""
-    kind = path.suffix[1:].lower()
-    none = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=DPI, format=kind, metadata=none[kind])
-    plt.close(figure)
-
-
-def check_figure(output: Path) -> None:
-    """Raise ``CommandError`` now if a figure cannot be written, or not in the format of the file's ending."""
-    if output.suffix.lower() not in FIGURE_FORMATS:
-        raise CommandError(f"output={str(output)!r} must end in {', '.join(FIGURE_FORMATS)}")
-    check_output(output, output.suffix.lower())
-
-
 PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
     "samples": lambda results, path, columns, scenes: convergence(results, "spp", path, columns, scenes),
     "seconds": lambda results, path, columns, scenes: convergence(results, "seconds", path, columns, scenes),
@@ -325,7 +284,22 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
     ),
     "rays": rays,
 }
-"""What the command `figure` draws."""
+"""What the command `figure` draws, beside the images of ``crops``."""
+
+
+def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
+    """Return the images of a scene's first seed at the deciding budget, rivals first, and the reference."""
+    columns: list[crops.Column] = []
+    for method in [*results.rivals, results.methods[0]]:
+        rows = results.of(scene, method, results.deciding)
+        file = folder / "images" / scene / f"{rows[0]['key']}.exr" if rows else None
+        if file is None or not file.exists():
+            continue
+        (image,), _ = read_layers(file, "")
+        columns.append(crops.judged(method, rows[0]["spp"], rows[0]["seconds"], image, kept.image))
+    if not columns:
+        raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
+    return crops.Block(scene, tuple(columns), kept.image)
 
 
 def run(options: Namespace) -> int:
@@ -334,12 +308,17 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     output = options.output or folder / f"{options.plot}.pdf"
     check_figure(output)
-    results, _ = load(project, folder)
+    results, made = load(project, folder)
     for scene in options.scenes or ():
         if scene not in results.scenes:
             raise CommandError(f"--scenes {scene}: not in the sweep, which has {', '.join(results.scenes)}")
     if options.plot == "efficiency" and not results.rivals:
         raise CommandError(f"{folder} has no other integrator than {results.methods[0]} to compare with")
-    PLOTS[options.plot](results, output, options.columns, options.scenes or results.scenes)
+    scenes = options.scenes or results.scenes
+    if options.plot == "crops":
+        blocks = [cropped(folder, results, made[scene], scene) for scene in scenes]
+        crops.draw(blocks, output, options.columns)
+    else:
+        PLOTS[options.plot](results, output, options.columns, scenes)
     print(output)
     return 0

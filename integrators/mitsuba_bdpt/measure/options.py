@@ -89,6 +89,11 @@ def _reference_seconds() -> Any:
     return option(REFERENCE_SECONDS, SECONDS, text, metavar="SECONDS")
 
 
+def _columns(default: int) -> Any:
+    text = "width, in columns of a page: 1 is 8.5 cm, 2 are 17.8 cm; default: %(default)s"
+    return option(default, Number(int, 1, 2), text)
+
+
 class Options:
     """Base of all options."""
 
@@ -158,12 +163,11 @@ class Figure(Options):
     )
     plot: str = option(
         "samples",
-        Choice(("samples", "seconds", "efficiency", "rays")),
-        "relMSE over samples or seconds, efficiencies, or rays by kind; default: %(default)s",
+        Choice(("samples", "seconds", "efficiency", "rays", "crops")),
+        "relMSE over samples or seconds, efficiencies, rays by kind, or images at equal time with magnified "
+        "windows and errors in false colours; default: %(default)s",
     )
-    columns: int = option(
-        1, Number(int, 1, 2), "width, in columns of a page: 1 is 8.5 cm, 2 are 17.8 cm; default: %(default)s"
-    )
+    columns: int = _columns(1)
     scenes: tuple[str, ...] | None = option(
         None, str, "scenes to draw; default: all", nargs="+", metavar="SCENE"
     )
@@ -220,6 +224,7 @@ class EqualTime(Options):
         "file to write, PDF, SVG or PNG by its ending; default: PROJECT/renders/equal_time_SCENE.png",
         short="-o",
     )
+    columns: int = _columns(2)
 
 
 @dataclass(frozen=True)
@@ -229,9 +234,11 @@ class Pyramid(Options):
     output: Path | None = option(
         None,
         Path,
-        "EXR file to write, PNGs come beside it; default: PROJECT/renders/pyramid_SCENE.exr",
+        "EXR file to write, with PNGs beside it; or pyramids as PDF, SVG or PNG by its ending, "
+        "with the EXR beside them; default: PROJECT/renders/pyramid_SCENE.exr",
         short="-o",
     )
+    columns: int = _columns(2)
     max_depth: int = option(5, WHOLE, "longest path in edges; default: %(default)s")
     spp: int = option(64, WHOLE, "samples per pixel; default: %(default)s")
     seed: int = option(0, SEED, "seed of the render; default: %(default)s")

@@ -5,7 +5,8 @@ camera vertices, brightened by 2^(k-1). Strategies that are impossible or bring 
 
 ``-o NAME.exr`` writes that file with the image and the layers ``weighted.s{S}t{T}.R`` ... and
 ``unweighted.s{S}t{T}.R`` ..., the image NAME.png, and the pyramids NAME_weighted.png, whose sum is the image,
-and NAME_unweighted.png, in which each panel is an estimate by itself.
+and NAME_unweighted.png, in which each panel is an estimate by itself; ``-o NAME.pdf`` the same with the
+pyramids as PDF.
 """
 
 from __future__ import annotations
@@ -14,27 +15,25 @@ import re
 from argparse import Namespace
 from pathlib import Path
 
-import matplotlib
+import matplotlib.pyplot as plt
 import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
 from ..files.images import check_channels, check_output, write_images
 from ..files.loading import choose_sensor
-from .figures import PAPER, WIDTHS, save
 from .metrics import tone_map
-from .options import VARIANT, Pyramid
+from .options import FIGURE_FORMATS, VARIANT, Pyramid
+from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
 from .scenes import MeasuredScene, integrator_of
 from .showing import amount
 
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-
 KINDS = ("weighted", "unweighted")
 
-WIDTH = WIDTHS[2]
-TITLE, EDGE = 0.2, 0.04  # inches over a panel, and under the last
+MARGIN = {1: 0.33, 2: 0.5}  # inches left of the panels, by columns of a page
+TITLE, EDGE = 0.17, 0.04  # inches over a panel, and under the last
+SHORT = 0.6  # inches of a panel below which its title has the numbers alone
 
 SHORTEST = 2  # edges: single ones show the emitters only
 
@@ -80,27 +79,31 @@ def panels(images: dict) -> dict:
     return found
 
 
-def draw(found: dict, path: Path, exposure: float):
+def draw(found: dict, path: Path, exposure: float, columns: int = 2):
     """Draw the pyramid: a row per path length k, the strategies s = 0 ... k + 1 from left to right.
 
     Rows are centred. Strategies that are impossible or bring no light are empty frames. Rows below the last
-    with light are left out.
+    with light are left out. As wide as so many ``columns`` of a page.
     """
     shape = next(image.shape for image in found.values() if image is not None)
     longest = max(k for (k, _, _), image in found.items() if image is not None)
     lengths = range(SHORTEST, longest + 1)
-    margin, panel = 0.5, (WIDTH - 0.5) / (longest + 2)  # inches
+    wide, margin = WIDTHS[columns], MARGIN[columns]  # inches
+    panel = (wide - margin) / (longest + 2)
     high = panel * shape[0] / shape[1] + TITLE
-    wide, tall = WIDTH, high * len(lengths) + EDGE
+    tall = high * len(lengths) + EDGE
     with plt.rc_context(PAPER):
         figure = plt.figure(figsize=(wide, tall))
+        if panel < SHORT:
+            figure.text(0.02 / wide, 1 - 0.02 / tall, "$s$, $t$:", va="top", fontsize=6)
         for row, k in enumerate(lengths):
             bottom = tall - (row + 1) * high
             for s in range(k + 2):
                 left = margin + panel * (s + (longest - k) / 2)
                 size = 0.97 * panel / wide, (high - TITLE) / tall
                 axis = figure.add_axes((left / wide, bottom / tall, *size))
-                axis.set_title(f"$s={s}$, $t={k + 1 - s}$", fontsize=min(7, 9 * panel), pad=2)
+                named = f"{s}, {k + 1 - s}" if panel < SHORT else f"$s={s}$, $t={k + 1 - s}$"
+                axis.set_title(named, fontsize=6 if panel < SHORT else 7, pad=2)
                 axis.set(xticks=[], yticks=[])
                 if (image := found.get((k, s, k + 1 - s))) is None:
                     for side in axis.spines.values():
@@ -120,16 +123,18 @@ def pictured(
     if options.max_depth < SHORTEST:
         raise CommandError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     file = project.scene(scene)
-    image = options.output or project.renders / f"pyramid_{file.name}.exr"
-    pictures = {kind: image.with_name(f"{image.stem}_{kind}.png") for kind in KINDS}
+    output = options.output or project.renders / f"pyramid_{file.name}.exr"
+    is_figure = output.suffix.lower() in FIGURE_FORMATS
+    image, ending = (output.with_suffix(".exr"), output.suffix) if is_figure else (output, ".png")
+    pictures = {kind: image.with_name(f"{image.stem}_{kind}{ending}") for kind in KINDS}
     check_output(image, ".exr")
     for path in pictures.values():
-        check_output(path, ".png")
+        check_figure(path)
     film, images = render(file, options)
     shown = {kind: panels(images[kind]) for kind in KINDS}
     write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
     for kind, path in pictures.items():
-        draw(shown[kind], path, options.exposure)
+        draw(shown[kind], path, options.exposure, options.columns)
     return pictures, images
 
 

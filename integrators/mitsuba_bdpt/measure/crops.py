@@ -1,0 +1,177 @@
+"""Images side by side for print: whole images, magnified windows, false colours of the errors."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
+from .paper import PAPER, WIDTHS, save
+
+WINDOW = 6  # side of a window: this fraction of the image's
+COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
+ERRORS = {"norm": LogNorm(1e-5, 10), "cmap": "viridis"}
+
+GAP, LINE = 0.03, 0.105  # inches between images, and per line of text
+SCALE = 0.38  # inches of the scale of errors, with its labels
+CHARACTER = 0.052  # inches
+SMALL = 6  # points
+
+
+@dataclass(frozen=True)
+class Column:
+    """An image with its ``caption``, a text per line, and its squared relative ``errors`` (height, width)."""
+
+    image: np.ndarray
+    caption: tuple[str, ...]
+    errors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Block:
+    """The images of a scene, and its reference ``target``."""
+
+    title: str
+    columns: tuple[Column, ...]
+    target: np.ndarray
+
+
+def judged(name: str, spp: int, seconds: float, image: np.ndarray, target: np.ndarray) -> Column:
+    """Return the column of a render, with its errors against ``target``."""
+    errors = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
+    figure = f"relMSE {rel_mse(image, target, TRIM):.2g} (trimmed)"
+    return Column(image, (name, f"{spp} spp, {seconds:.2g} s", figure), errors)
+
+
+def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
+    """Return two disjoint windows (left, top, side) of the largest differences of two images of errors.
+
+    Compares logarithms, so that no single pixel decides.
+    """
+    height, width = first.shape
+    side = max(4, min(height, width) // WINDOW)
+    difference = np.abs(np.log10(first + 1e-4) - np.log10(last + 1e-4))
+    sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+    score = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
+    chosen: list[tuple[int, int, int]] = []
+    for _ in COLOURS:
+        top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
+        chosen.append((left, top, side))
+        score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -1
+    return chosen
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Sizes of a block in inches: width and height of an image, lines of captions."""
+
+    width: float
+    height: float
+    captions: tuple[str, ...]
+    lines: int
+
+    @staticmethod
+    def of(block: Block, wide: float) -> _Layout:
+        count = len(block.columns) + 1
+        width = (wide - (count + 1) * GAP) / count
+        most = max(int(width / CHARACTER), 8)
+        captions = [*(column.caption for column in block.columns), ("reference",)]
+        wrapped = ["\n".join(textwrap.fill(line, most) for line in caption) for caption in captions]
+        lines = max(text.count("\n") for text in wrapped) + 1
+        return _Layout(width, width * block.target.shape[0] / block.target.shape[1], tuple(wrapped), lines)
+
+    @property
+    def window(self) -> float:
+        return (self.width - GAP) / 2
+
+    @property
+    def head(self) -> float:
+        """Title and captions."""
+        return LINE * (self.lines + 1.6)
+
+    @property
+    def whole(self) -> float:
+        return self.head + self.height + self.window + max(self.height, SCALE) + 3 * GAP
+
+
+def draw(blocks: Sequence[Block], file: Path, columns: int) -> None:
+    """Draw the ``blocks`` under each other, as wide as so many columns of a page.
+
+    In each, a column per image, the reference last: image, windows, errors in false colours.
+    """
+    wide = WIDTHS[columns]
+    layouts = [_Layout.of(block, wide) for block in blocks]
+    tall = sum(layout.whole for layout in layouts)
+    with plt.rc_context(PAPER):
+        figure = plt.figure(figsize=(wide, tall))
+        top = tall
+        for block, layout in zip(blocks, layouts, strict=True):
+            _block(figure, block, layout, top)
+            top -= layout.whole
+        save(figure, file)
+
+
+def _axis(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
+    """Add axes without ticks at a place in inches from the top left."""
+    wide, tall = figure.get_size_inches()
+    axis = figure.add_axes((left / wide, (top - height) / tall, width / wide, height / tall))
+    axis.set(xticks=[], yticks=[])
+    return axis
+
+
+def _block(figure: Figure, block: Block, layout: _Layout, top: float) -> None:
+    """Draw a block below the height ``top``."""
+    wide, tall = figure.get_size_inches()
+    chosen = windows(block.columns[0].errors, block.columns[-1].errors)
+    exposure = math.log2(0.9 / max(float(np.quantile(block.target.max(axis=-1), 0.95)), 1e-9))
+    figure.text(GAP / wide, (top - 0.2 * LINE) / tall, block.title, va="top", weight="bold")
+    images = [*(column.image for column in block.columns), block.target]
+    errors = [*(column.errors for column in block.columns), None]
+    for i, (image, error, caption) in enumerate(zip(images, errors, layout.captions, strict=True)):
+        left = GAP + i * (layout.width + GAP)
+        y = top - layout.head
+        figure.text(left / wide, (y + 0.3 * LINE) / tall, caption, fontsize=SMALL, va="bottom")
+        shown = tone_map(image, exposure)
+        axis = _axis(figure, left, y, layout.width, layout.height)
+        axis.imshow(shown, interpolation="nearest", aspect="auto")
+        axis.set_axis_off()
+        y -= layout.height + GAP
+        for j, ((x, up, side), colour) in enumerate(zip(chosen, COLOURS, strict=True)):
+            frame = {"edgecolor": colour, "facecolor": "none", "linewidth": 0.8}
+            axis.add_patch(Rectangle((x - 0.5, up - 0.5), side, side, **frame))
+            part = _axis(figure, left + j * (layout.window + GAP), y, layout.window, layout.window)
+            part.imshow(shown[up : up + side, x : x + side], interpolation="nearest", aspect="auto")
+            for spine in part.spines.values():
+                spine.set(color=colour, linewidth=0.8)
+        y -= layout.window + GAP
+        if error is None:
+            _bar(figure, left, y, layout)
+        else:
+            axis = _axis(figure, left, y, layout.width, layout.height)
+            axis.imshow(
+                np.maximum(error, ERRORS["norm"].vmin), interpolation="nearest", aspect="auto", **ERRORS
+            )
+            axis.set_axis_off()
+
+
+def _bar(figure: Figure, left: float, top: float, layout: _Layout) -> None:
+    """Draw the scale of the errors in the place below the reference."""
+    axis = _axis(figure, left + 0.08 * layout.width, top - GAP, 0.84 * layout.width, 0.07)
+    bar = figure.colorbar(ScalarMappable(**ERRORS), cax=axis, orientation="horizontal")
+    bar.set_label(
+        "squared relative error" if layout.width > 1 else "squared error", fontsize=SMALL, labelpad=0
+    )
+    bar.set_ticks([1e-4, 1e-2, 1])
+    bar.ax.tick_params(labelsize=SMALL, pad=1, length=2)
+    bar.ax.minorticks_off()
