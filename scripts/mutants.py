@@ -98,11 +98,11 @@ MUTANTS = (
         ("tests/image/test_aovs.py::test_features_are_those_of_aov[plain]",),
     ),
     Mutant(
-        "lost light: a pilot's share near the limit is said",
+        "lost light: one and a half hundredths are not said",
         "planning/lost_light.py",
-        "lost.is_worth_a_word(share / 2)",
-        "lost.is_worth_a_word(share)",
-        ("tests/planning/test_lost_light.py::test_a_share_near_the_limit_waits_for_the_image",),
+        "if all_of_it < WORTH_A_WORD:",
+        "if all_of_it < 1.5 * WORTH_A_WORD:",
+        ("tests/planning/test_lost_light.py::test_a_share_of_a_hundredth_is_said_before_the_first_pass",),
     ),
     Mutant(
         "near-specular lobes: a nested BSDF has none",
@@ -696,8 +696,15 @@ MUTANTS = (
     Mutant(
         "light subpaths: few without a decision, also where glass focuses light",
         "planning/budget.py",
-        "return prepared.specular or prepared.space is not None",
-        "return prepared.space is not None",
+        "return prepared.specular or bool(",
+        "return bool(",
+        ("tests/run/test_first_image.py::test_light_subpaths_without_a_decision",),
+    ),
+    Mutant(
+        "light subpaths: few without a decision, also where rough glass focuses light",
+        "planning/budget.py",
+        "or bool(prepared.near_specular) or",
+        "or",
         ("tests/run/test_first_image.py::test_light_subpaths_without_a_decision",),
     ),
     Mutant(

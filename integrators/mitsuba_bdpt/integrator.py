@@ -184,7 +184,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
             render.replay()
         planner = render.planner
         confidence = planner.confidence(render.passes) if table else 0.0
-        invalid, loss = planner.lost_by_pilots(), render.predicted_loss().removeprefix(UsageError.prefix)
+        invalid, loss = planner.lost_by_pilots(), render.explained_loss().removeprefix(UsageError.prefix)
         text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, loss)
         if spp is None and is_open(render.plan, self.settings):
             return (

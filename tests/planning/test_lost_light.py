@@ -267,14 +267,19 @@ def test_given_decisions_know_the_share(monkeypatch):
     assert begun == [(8, 1)] and len(warnings) == 1
 
 
-def test_a_share_near_the_limit_waits_for_the_image():
-    """Rationale: pilots have noise, and a warning where nothing is missing is noise. Expected: a share that a
-    pilot puts between a hundredth and two is said after the first pass, by the image itself.
+def test_a_share_of_a_hundredth_is_said_before_the_first_pass():
+    """Rationale: shares that a pilot put between a hundredth and two were said after the first pass, which
+    may be the whole render. Expected: a share above a hundredth is said by a pilot, one below is not, as
+    after the first pass.
     """
+    scene = scene_of(LAMPS["point"], block=BLOCK)
+    render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
     lost = lost_light.LostLight({0: np.array([0.02, 0.02, 0.02])})
-    assert lost_light.predicted_shares(lost, 1 - 0.02) == {0: pytest.approx(0.02)}
-    assert lost_light.predicted_shares(lost, 1.2 - 0.02) == {}
-    assert lost_light.shares(lost, 1 - 0.02) == {0: pytest.approx(0.02)}
+    for share, said in ((0.011, True), (0.009, False)):
+        mean = 0.02 / share - 0.02
+        for shares in (lost_light.predicted_shares(lost, mean), lost_light.shares(lost, mean)):
+            assert shares == {0: pytest.approx(share)}
+            assert bool(lost_light.in_words(render.prepared, render.plan, shares, lost, 16)) == said
 
 
 def test_red_light_on_a_blue_floor_is_no_loss():

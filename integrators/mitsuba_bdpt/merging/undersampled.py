@@ -17,16 +17,13 @@ from ..transport.near_specular import is_narrow
 from ..transport.walk import Vertex, newest_connection
 from .merging import Merging, Sample
 
-# Expected samples per pixel below which light is undersampled: most pixels have none of it, the others at
-# least ten times too much.
+# Expected samples per pixel below which light is undersampled: nine of ten pixels have none of it, the others
+# at least ten times too much.
 FEWEST = 0.1
 
-# Expected samples per pixel below which it is absent: its few samples are outliers of a render.
-ABSENT = 1 / 256
-
-# Bounds of kinds of light by expected samples per pixel: none, absent, undersampled, few (which a pilot takes
-# for outliers).
-KINDS = (0.0, ABSENT, FEWEST, 1.0)
+# Bounds of kinds of light by expected samples per pixel: none, undersampled, few (which a pilot takes for
+# outliers).
+KINDS = (0.0, FEWEST, 1.0)
 
 
 @dataclass

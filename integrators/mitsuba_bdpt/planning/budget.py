@@ -53,8 +53,8 @@ def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
 
 
 def focuses(prepared: PreparedScene) -> bool:
-    """Whether light may be focused: by glass, by mirrors, or into beams in media."""
-    return prepared.specular or prepared.space is not None
+    """Whether light may be focused: by glass, by mirrors, smooth or nearly so, or into beams in media."""
+    return prepared.specular or bool(prepared.near_specular) or prepared.space is not None
 
 
 def least_samples(prepared: PreparedScene) -> int:

@@ -27,7 +27,6 @@ from ..settings import Settings
 from ..transport import mis
 from ..transport.batch import Batch
 from ..transport.inputs import Kernel
-from ..transport.near_specular import names
 from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
 from .possible import SHORTEST, Start, unsampled_paths
@@ -38,10 +37,6 @@ SUBPATHS = 1 << 13
 
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
-
-# Share from which on a warning is given of light of which a few samples are expected: of less there are more,
-# and noise is no loss.
-RARE_WORTH_A_WORD = 0.125
 
 # Least density of a lobe (solid angle) that may leave light undersampled; the estimate is dear beside a short
 # render (see experiments, "Near-specular lobes").
@@ -54,6 +49,9 @@ PREVIEW = 64
 NAMED = 3
 
 SEED = 0x6C6F7374
+
+# Key under which dictionaries hold the BSDF of a shape, its id there.
+_KEY = "bsdf"
 
 _PLUGINS = {
     "PointLight": "point light",
@@ -68,16 +66,15 @@ _PLUGINS = {
 class LostLight:
     """Unsampled and undersampled light: mean over the film by emitter index.
 
-    ``through``: ids of the shapes through which most of it is seen, the brightest first. In scenes with
-    near-specular lobes ``never``: share of it of which no sample is expected; ``absent``: share of it of
-    which a render has outliers at most; ``few``: light of which more samples are expected, but few, over it;
-    ``sharp``: ids of the objects with such lobes through which it is seen; of all if it is seen through none.
+    ``through``: names of the shapes through which most of it is seen, the brightest first. In scenes with
+    near-specular lobes ``never``: share of it of which no sample is expected; ``few``: light of which more
+    samples are expected, but few, over it; ``sharp``: names of the objects with such lobes through which it
+    is seen; of all if it is seen through none.
     """
 
     colours: dict[int, np.ndarray]
     through: tuple[str, ...] = ()
     never: float = 1.0
-    absent: float = 1.0
     few: float = 0.0
     sharp: tuple[str, ...] = ()
 
@@ -94,9 +91,10 @@ class LostLight:
         """Mean over the colours, the measure of images in pilots."""
         return float(sum(colour.mean() for colour in self.colours.values()))
 
-    def is_worth_a_word(self, share: float) -> bool:
-        """Whether to warn of a ``share`` of the image's light."""
-        return self.absent * share >= WORTH_A_WORD or share >= RARE_WORTH_A_WORD
+    @property
+    def is_undersampled(self) -> bool:
+        """Whether a few samples are expected of most of it."""
+        return self.never < 0.5
 
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
@@ -160,15 +158,14 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    through = tuple(filter(None, map(given_id, shapes)))
+    through = _names(shapes)
     if found.kinds is None or not colours:
         return LostLight(colours, through)
-    never, absent, rare, few = np.array(found.kinds)
-    size = max(never + absent + rare, np.finfo(np.float32).tiny)
-    sharp = names(shapes, prepared.near_specular)
-    sharp = sharp or names(all_shapes(prepared.scene), prepared.near_specular)[:NAMED]
-    parts = (float(part / size) for part in (never, never + absent, few))
-    return LostLight(colours, through, *parts, tuple(sharp))
+    never, rare, few = np.array(found.kinds)
+    size = max(never + rare, np.finfo(np.float32).tiny)
+    meant = {id(bsdf) for bsdf in prepared.near_specular}
+    seen, others = ([s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene)))
+    return LostLight(colours, through, float(never / size), float(few / size), _names(seen or others)[:NAMED])
 
 
 def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
@@ -200,6 +197,24 @@ def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
     return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0] for i in order[:NAMED]]
 
 
+def _names(shapes: Iterable[mi.Shape]) -> tuple[str, ...]:
+    """Names of the ``shapes`` that have one, once each."""
+    return tuple(dict.fromkeys(filter(None, map(_called_shape, shapes))))
+
+
+def _called_shape(shape: mi.Shape) -> str:
+    """Name a shape by its id and that of its BSDF; empty if neither has one."""
+    bsdf = shape.bsdf()
+    name = "" if bsdf is None else given_id(bsdf)
+    if given_id(shape):
+        return f"'{shape.id()}'" + (f" (BSDF '{name}')" if name not in ("", _KEY) else "")
+    if not name:
+        return ""
+    if shape.class_name() == "Mesh":
+        return f"meshes without id (BSDF '{name}'; Mitsuba merges meshes of a BSDF unless optimize=False)"
+    return f"a {shape.class_name().lower()} without id (BSDF '{name}')"
+
+
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     """Warn of emitters whose unsampled light cannot be estimated."""
     emitters = prepared.scene.emitters()
@@ -217,18 +232,13 @@ def shares(lost: LostLight, mean: float) -> dict[int, float]:
     ``mean`` of the image's brightest colour, which includes light that is not absent.
     """
     size = sum(lost.radiance.values())
-    whole = max(mean + lost.absent * size, size)
+    whole = max(mean + lost.never * size, size)
     return {i: radiance / whole for i, radiance in lost.radiance.items()}
 
 
 def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
-    """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light.
-
-    Empty if half of them is not worth a word: a pilot's estimate may be twice too large.
-    """
+    """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light."""
     share = lost.intensity / (mean + (1 + lost.few) * lost.intensity)
-    if not lost.is_worth_a_word(share / 2):
-        return {}
     whole = sum(lost.radiance.values())
     return {i: share * radiance / whole for i, radiance in lost.radiance.items()}
 
@@ -241,37 +251,56 @@ def in_words(
     ``shares`` of the image's light by emitter index, in a render of ``samples`` per pixel.
     """
     all_of_it = sum(shares.values())
-    if not lost.is_worth_a_word(all_of_it):
+    if all_of_it < WORTH_A_WORD:
         return ""
-    emitters = prepared.scene.emitters()
-    order = sorted(shares, key=shares.get, reverse=True)
-    lamps = [emitters[i] for i in order if shares[i] >= WORTH_A_WORD * all_of_it][:NAMED]
-    what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
     share = "nearly all" if all_of_it > 0.99 else f"about {100 * all_of_it:.0f} %"
-    if lost.never < 0.5:
+    return _in_words(prepared, plan, shares, lost, samples, f"{share} of the image's light")
+
+
+def explained(prepared: PreparedScene, plan: Plan, lost: LostLight, samples: int, mean: float | None) -> str:
+    """`in_words` of undersampled light of any share; its radiance if the image's ``mean`` is not known."""
+    if not lost.is_undersampled:
+        return ""
+    shares = lost.radiance if mean is None else predicted_shares(lost, mean)
+    all_of_it = sum(shares.values())
+    share = f"light of mean radiance {all_of_it:.2g}"
+    if mean is not None:
+        share = f"{max(100 * all_of_it, 0.01):.2g} % of the image's light"
+    return _in_words(prepared, plan, shares, lost, samples, share)
+
+
+def _in_words(
+    prepared: PreparedScene, plan: Plan, parts: dict[int, float], lost: LostLight, samples: int, share: str
+) -> str:
+    """`in_words` of this ``share``; ``parts`` of it by emitter index."""
+    emitters = prepared.scene.emitters()
+    order = sorted(parts, key=parts.__getitem__, reverse=True)
+    least = WORTH_A_WORD * sum(parts.values())
+    lamps = [emitters[i] for i in order if parts[i] >= least][:NAMED]
+    what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
+    if lost.is_undersampled:
         remedy = _remedy(prepared, lamps)
         if not plan.splat and prepared.camera.connectible:
             remedy = f"leave light_paths and decisions to the integrator, {remedy}"
-        rest = _undersampled(what, lost, samples, remedy)
-        return f"bdpt: undersampled, {share} of the image's light: {rest}"
+        return f"bdpt: undersampled, {share}: {_undersampled(what, lost, samples, remedy)}"
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
-        what += f" on what is seen through {' and '.join(map(repr, lost.through)) or 'them'}"
+        what += f" on what is seen through {' and '.join(lost.through) or 'them'}"
     elif not prepared.camera.connectible:
         why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
         why = "the render does without light tracing (t=1)"
         remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
-    return f"bdpt: not sampled, {share} of the image's light: {what} ({why}); {remedy}"
+    return f"bdpt: not sampled, {share}: {what} ({why}); {remedy}"
 
 
 def _undersampled(what: str, lost: LostLight, samples: int, remedy: str) -> str:
     """The rest of the warning about light of which a few samples are expected."""
-    objects = " and ".join(map(repr, lost.sharp))
+    objects = " and ".join(lost.sharp)
     off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
     why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
-    rougher = f"or make {objects or 'these surfaces'} rougher"
+    rougher = f"or make the {'surface' if len(lost.sharp) == 1 else 'surfaces'} rougher"
     return f"{what} through or {off} connections rarely sample ({why}); {remedy}, {rougher}"
 
 

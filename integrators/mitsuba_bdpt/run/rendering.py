@@ -390,12 +390,28 @@ class Render:
 
         Empty if there is none, or if no decision has estimated the image's mean.
         """
-        made = self.planner.decided.decisions
-        lost = self._lost() if made and made[-1].mean > 0 else None
+        mean = self._predicted_mean()
+        lost = None if mean is None else self._lost()
         if lost is None:
             return ""
-        shares = lost_light.predicted_shares(lost, made[-1].mean)
+        shares = lost_light.predicted_shares(lost, mean)
         return lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+
+    def explained_loss(self) -> str:
+        """Return `predicted_loss`, or what is undersampled though there is no warning."""
+        if text := self.predicted_loss():
+            return text
+        undersampled = lost_light.is_undersampling_possible(self.prepared, self.settings)
+        lost = self._lost() if undersampled else None
+        if lost is None:
+            return ""
+        mean = self._predicted_mean()
+        return lost_light.explained(self.prepared, self.plan, lost, self._samples(), mean)
+
+    def _predicted_mean(self) -> float | None:
+        """Return the image's mean as the last decision has estimated it, None if none has."""
+        made = self.planner.decided.decisions
+        return made[-1].mean if made and made[-1].mean > 0 else None
 
     def _samples(self) -> int:
         """Samples per pixel of the whole render, or of a snapshot, as far as is known.

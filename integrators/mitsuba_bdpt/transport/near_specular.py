@@ -18,7 +18,7 @@ import numpy as np
 
 from ..geometry.directions import random_directions
 from ..geometry.mitsubas_choices import spread_points
-from ..host.introspection import given_id, number, own_parameters
+from ..host.introspection import number, own_parameters
 
 # Least density (1 / sr, at the axis of the lobe at normal incidence) of a near-specular lobe: that of alpha
 # .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
@@ -56,16 +56,6 @@ def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> lis
 def is_narrow(pdf_fwd_w, pdf_rev_w):
     """Mask: near-specular scattering, by its densities from both sides, so that both subpaths agree."""
     return dr.minimum(pdf_fwd_w, pdf_rev_w) >= NARROW
-
-
-def names(shapes: Iterable[mi.Shape], bsdfs: Iterable[mi.BSDF]) -> list[str]:
-    """Ids of the ``shapes`` with one of ``bsdfs``, or of the BSDF, once each; those without are left out."""
-    meant, found = {id(bsdf) for bsdf in bsdfs}, []
-    for shape in shapes:
-        bsdf = shape.bsdf()
-        if bsdf is not None and id(bsdf) in meant:
-            found += [name for name in map(given_id, (shape, bsdf)) if name][:1]
-    return list(dict.fromkeys(found))
 
 
 def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:
