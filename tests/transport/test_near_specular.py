@@ -7,7 +7,7 @@ import pytest
 from mitsuba_bdpt.host.introspection import all_shapes
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import draws, near_specular
-from mitsuba_bdpt.transport.near_specular import NARROW, names
+from mitsuba_bdpt.transport.near_specular import NARROW
 
 T = mi.ScalarTransform4f
 
@@ -218,7 +218,9 @@ def scene_of(**bsdfs):
 
 
 def found(scene):
-    return names(all_shapes(scene), PreparedScene(scene, scene.sensors()[0]).near_specular)
+    """Ids of the shapes whose BSDF is near-specular."""
+    sharp = PreparedScene(scene, scene.sensors()[0]).near_specular
+    return [shape.id() for shape in all_shapes(scene) if any(shape.bsdf() is bsdf for bsdf in sharp)]
 
 
 def test_edits_are_seen():
