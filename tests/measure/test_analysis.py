@@ -255,7 +255,7 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
 def test_tables_say_what_the_rows_say(results):
     text = report.efficiency_table(results)
     assert cells(text, "`box`") == [
-        *("2x (2–2)", "2x (2–2)", "0.8x (0.8–0.8)", "0.8x (0.8–0.8)", "3x (3–3)", "–"),
+        *("2x (2–2)", "2x (2–2)", "0.8x (0.8–0.8)", "0.8x (0.8–0.8)", "3x (3–3)", "none found"),
     ]
     dark = cells(text, "`dark`")
     assert dark[:2] == ["≥ 2x (2–2)"] * 2 and dark[5].startswith("path: 9.8 % of the energy is missing")
@@ -428,6 +428,39 @@ def test_the_goals_of_the_project_can_be_measured(results):
     file = ROOT / "docs" / "reports" / "benchmark" / "goals.toml"
     goals = report.checked_goals(file, tomllib.loads(file.read_text()))
     assert report.goals_table(results, goals).count("\n") == len(goals) + 2
+
+
+def test_a_sweep_that_was_cut_has_figures():
+    """Rationale: a sweep without time for a second render of the largest budget reported "fewer than two
+    renders" in every cell. Expected: figures are of the largest budget of two renders of each integrator,
+    also where one integrator has a single render at any budget; of all where there are no pairs."""
+    small, large = ([*runs("bdpt", 2, budget=n), *runs("path", 2, budget=n)] for n in (16, 64))
+    assert Results([*small, *large[:3]], {}, {}).deciding == 16
+    assert Results([*small, *large], {}, {}).deciding == 64
+    assert Results([*small, *large, row("bdpt skip=none", 1, budget=16)], {}, {}).deciding == 64
+    assert Results([*large[:1], *large[2:3], row(budget=4)], {}, {}).deciding == 64
+
+
+def test_cells_are_numbers_where_nothing_is_wrong():
+    """Rationale: cells of errors, energy and bias were dashes, or said "fewer than 8 renders". Expected: of
+    three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % / sqrt(3);
+    a squared bias within its noise; no verdict of so few; a single render is called so."""
+    rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), spread=0.02) for i in (1, 2, 3)]
+    found = Results(rows, {"box": KNOWN}, {})
+    energy = found.surplus("box", "bdpt")
+    assert (energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
+    line = report.errors_table(found).splitlines()[2]
+    assert "| 2.00e-02 |" in line and line.endswith("| +2 % ± 2.5 |") and "–" not in line.split("|")[9]
+    checks = report.checks_table(found, MADE, {})
+    assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
+    alone = report.errors_table(Results(rows[:1], {"box": KNOWN}, {})).splitlines()[2]
+    assert alone.endswith("| fewer than three renders | fewer than two renders |")
+
+
+def test_a_report_has_the_name_of_its_scene_or_preset(results, tmp_path):
+    """Expected: of a single scene its name, of several that of the folder, which is the preset's."""
+    assert report.title(Results(runs("bdpt", 2), {}, {}), tmp_path) == "Box"
+    assert report.title(results, tmp_path / "rooms") == "Rooms"
 
 
 def test_parts_of_the_readme_are_replaced():

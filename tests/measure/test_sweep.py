@@ -1004,7 +1004,8 @@ def test_the_table_is_tidy(tmp_path):
 def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
     """Expected: eight renders of a second each, of which 5.5 s allow six: all budgets of the first seed, then
     of the second; the cut ones are named with the option that has time for them, two more seconds, and a
-    second run renders them."""
+    second run renders them. Two seeds of the smallest budget are rendered even without time: figures need
+    pairs."""
     preset = read_preset(preset_file(tmp_path), REPOSITORY)
     found, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
@@ -1018,11 +1019,15 @@ def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
     made.run(showing.Renders(), seconds=5.5)
     assert [cell.seed for cell in found] == [1, 1, 1, 1, 2, 2]
     assert {cell.budget for cell in found[:4]} == {2, 4}
-    text = "cornell_box, 2 of 8 renders, from seed 2 on; run it again with --seconds 2, about"
+    text = "cornell_box, 2 of 8 renders, from 4 spp of seed 2 on; run it again with --seconds 2, about"
     assert made.cut == text
     made = sweep.Sweep(REPOSITORY, preset, tmp_path)
     made.run(showing.Renders(), seconds=100)
     assert len(found) == 6 + 8 and made.cut == ""
+    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
+    made.run(showing.Renders(), seconds=0)
+    assert [(cell.seed, cell.budget) for cell in found[14:]] == [(1, 2), (1, 2), (2, 2), (2, 2)]
+    assert made.cut.startswith("cornell_box, 4 of 8 renders, from 4 spp of seed 1 on")
 
 
 def keys(folder, text=PRESET):

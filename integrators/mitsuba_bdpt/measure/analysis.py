@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError
-from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means
+from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means, missing_energy
 from .estimates import Bound, RelativeError, bound_of_ratio, mean_differs, relative_error, seed_errors, unlike
 from .metrics import CONFIDENCE, Estimate, number_of, values_of
 from .record import Error, Row
@@ -236,6 +237,14 @@ def geometric_mean(values: Iterable[float]) -> float:
     return math.exp(float(np.mean(np.log(list(values)))))
 
 
+def _paired_budgets(counts: Iterable[Counter[int]]) -> set[int]:
+    """Return a scene's budgets of two renders each, of integrators with so many at any budget; else all."""
+    found = list(counts)
+    budgets = set[int]().union(*found)
+    several = [of for of in found if max(of.values()) > 1]
+    return {n for n in budgets if all(of[n] > 1 for of in several)} or budgets
+
+
 @dataclass(frozen=True)
 class Results:
     """Rows of a sweep, tile means of its references by scene, and results of probes."""
@@ -287,11 +296,14 @@ class Results:
 
     @cached_property
     def deciding(self) -> int:
-        """The budget of comparisons: `DECIDING`, or the largest that every scene has."""
-        budgets: dict[str, set[int]] = {scene: set() for scene in self.scenes}
+        """The budget of comparisons: `DECIDING`, or the largest that every scene has.
+
+        With two renders of each integrator, where a sweep of so many was cut for lack of time.
+        """
+        counts: dict[str, dict[str, Counter[int]]] = {scene: {} for scene in self.scenes}
         for row in self.rows:
-            budgets[row["scene"]].add(row["budget"])
-        common = set[int].intersection(*budgets.values())
+            counts[row["scene"]].setdefault(row["method"], Counter())[row["budget"]] += 1
+        common = set[int].intersection(*(_paired_budgets(of.values()) for of in counts.values()))
         return DECIDING if DECIDING in common or not common else max(common)
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[Row]:
@@ -317,6 +329,21 @@ class Results:
     def lacks(self, scene: str, method: str) -> str:
         """Describe the energy that an integrator lacks in a scene; empty if the bias check finds nothing."""
         return self._lacks(scene, method)
+
+    def surplus(self, scene: str, method: str) -> Estimate:
+        """Return the relative difference of the mean from the reference's, with its 95 % interval.
+
+        At the deciding budget, or the largest of two renders or more.
+        """
+        rows = self.of(scene, method)
+        counts = Counter(row["budget"] for row in rows)
+        several = [n for n, count in counts.items() if count > 1]
+        if not several or scene not in self.references:
+            raise Refused("fewer than two renders")
+        budget = self.deciding if counts[self.deciding] > 1 else max(several)
+        columns = [row["tile_means"] for row in select(rows, budget=budget)]
+        share = missing_energy(Means.of(columns, fewest=2).whole, self.references[scene].whole)
+        return Estimate(-share.value, -share.high, -share.low)
 
     def differs(self, scene: str, method: str, budget: int | None = None) -> bool:
         """Return whether the mean of an integrator differs from the reference.

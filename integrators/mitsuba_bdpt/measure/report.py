@@ -82,13 +82,13 @@ def _lacking(results: Results, rivals: Sequence[str], scene: str) -> str:
     found = {rival: results.lacks(scene, rival) for rival in rivals}
     several = len(rivals) > 1 and len(set(found.values())) > 1
     said = [f"{rival}: {text}" if several else text for rival, text in found.items() if text]
-    return "; ".join(dict.fromkeys(said)) or "–"
+    return "; ".join(dict.fromkeys(said)) or "none found"
 
 
 def errors_table(results: Results) -> str:
     """Table of relMSE at the deciding budget: a row per scene and integrator, with its bias."""
     head = ["scene", "integrator", "samples per pixel", "seconds", "renders"]
-    head += ["relMSE, trimmed", "relMSE, raw", "variance", "squared bias", "bias"]
+    head += ["relMSE, trimmed", "relMSE, raw", "variance", "squared bias", "energy"]
     lines: list[list[str]] = []
     for scene in results.scenes:
         for method in results.methods:
@@ -99,37 +99,53 @@ def errors_table(results: Results) -> str:
                         *(f"`{scene}`", method, f"{np.median([row['spp'] for row in rows]):.0f}"),
                         *(f"{np.median([row['seconds'] for row in rows]):.3g}", str(len(rows))),
                         *(relative(trimmed), relative(raw)),
-                        "–" if raw.variance is None else f"{raw.variance:.2e}",
-                        _squared(raw.squared_bias) if raw.bound else "–",
-                        results.lacks(scene, method) or "–",
+                        "one render" if raw.variance is None else f"{raw.variance:.2e}",
+                        _squared(raw.squared_bias),
+                        results.lacks(scene, method) or said(_energy, results, scene, method),
                     ]
                 )
     return table(head, lines)
 
 
 def _squared(found: Estimate | None) -> str:
-    return "–" if found is None else f"{found.value:.2e} ({found.low:.2e}–{found.high:.2e})"
+    few = "fewer than three renders"
+    return few if found is None else f"{found.value:.2e} ({found.low:.2e} to {found.high:.2e})"
+
+
+def _energy(results: Results, scene: str, method: str) -> str:
+    found = results.surplus(scene, method)
+    return f"{100 * found.value:+.2g} % ± {50 * (found.high - found.low):.2g}"
 
 
 KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
 
 
 def budgets_table(results: Results) -> str:
-    """Table of the efficiency over the strongest of `Results.standard`, by budget."""
+    """Efficiency over the strongest of `Results.standard`, by budget: a table per set of budgets."""
 
-    def figure(scene: str, error: Error, budget: int) -> str:
-        try:
-            return ranged(results.against_path(scene, error, budget))
-        except Refused:
-            return "–"
+    def figure(error: Error, budget: int, scene: str) -> Summary:
+        return results.against_path(scene, error, budget)
 
-    columns = {
-        f"{budget} spp, {kind}": partial(figure, error=error, budget=budget)
-        for budget in sorted({row["budget"] for row in results.rows})
-        for error, kind in KINDS.items()
-    }
-    scenes = [scene for scene in results.scenes if any(f(scene) != "–" for f in columns.values())]
-    return by_scene(scenes, columns)
+    groups: dict[tuple[int, ...], list[str]] = {}
+    for scene in results.scenes:
+        found: list[int] = []
+        for budget in sorted({row["budget"] for row in results.of(scene, results.methods[0])}):
+            try:
+                figure("rel_mse", budget, scene)
+            except Refused:  # a single render, or none, or an exact one
+                continue
+            found.append(budget)
+        if found:
+            groups.setdefault(tuple(found), []).append(scene)
+    tables: list[str] = []
+    for budgets, scenes in groups.items():
+        columns: dict[str, Callable[[str], object]] = {
+            f"{budget} spp, {kind}": partial(figure, error, budget)
+            for budget in budgets
+            for error, kind in KINDS.items()
+        }
+        tables.append(by_scene(scenes, columns))
+    return "\n".join(tables)
 
 
 def first_images_table(results: Results) -> str:
@@ -185,7 +201,10 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         return cost(results.of(scene, method, results.deciding), theirs)
 
     def bias(scene: str) -> str:
-        verdict = said(lambda: _verdict(results.bias(scene, ours), made[scene].merged))
+        try:
+            verdict = _verdict(results.bias(scene, ours), made[scene].merged)
+        except Refused as few:
+            verdict = f"energy {said(_energy, results, scene, ours)} ({few}: no verdict)"
         return f"{verdict}, by {_maker(made[scene])}"
 
     columns: dict[str, Callable[[str], object]] = {
@@ -245,7 +264,7 @@ def choices_table(results: Results) -> str:
 
     def left_out(scene: str) -> str:
         skipped = [s for row in rows(scene)[:1] for s in json.loads(row["statistics"]).get("skipped", [])]
-        return ", ".join(s["class"] for s in skipped if s["level"] == "not worth its cost here") or "–"
+        return ", ".join(s["class"] for s in skipped if s["level"] == "not worth its cost here") or "nothing"
 
     columns: dict[str, Callable[[str], object]] = {
         "chosen (number of renders)": chosen,
@@ -609,7 +628,9 @@ By budget, over {stronger(results)} of those that pass the bias check, or of all
 
 At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds; of few
 seeds with rare bright values it is too narrow). Variance and squared bias add up to the raw error where the
-mean of the renders differs from the reference.
+mean of the renders differs from the reference; elsewhere the squared bias is 0 within its noise, and may be
+negative. Energy: that of the image over the reference's, as a difference with its 95 % interval, or what is
+missing by the bias check.
 
 {errors_table(results)}
 ## What was skipped

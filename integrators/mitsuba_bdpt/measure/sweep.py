@@ -294,21 +294,26 @@ class Sweep:
                 missing = []
 
     def _limited(self, seconds: float):
-        """Render seed by seed, all budgets of each, until the ``seconds`` are over."""
+        """Render seed by seed, all budgets of each, until the ``seconds`` are over.
+
+        Two seeds of the smallest budget are rendered in any case: with fewer there is no figure.
+        """
         started = time.monotonic()
         total, done, cut = sum(map(len, self._todo)), 0, list[str]()
         for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
             bench, end = Bench(cells, self.output), started + seconds * (i + 1) / len(self.scenes)
             self._first_images(cells)
-            for j, cell in enumerate(sorted(missing, key=lambda cell: cell.seed)):
-                if time.monotonic() >= end:
-                    cut.append(
-                        f"{cells.subject.name}, {len(missing) - j} of {len(missing)} renders, from seed "
-                        f"{cell.seed} on"
-                    )
-                    break
-                self._cell(bench, cell)
-                done += 1
+            late = list[Cell]()
+            for cell in sorted(missing, key=lambda cell: cell.seed):
+                is_least = cell.budget == min(cells.subject.spp) and cell.seed < FIRST_SEED + 2
+                if time.monotonic() >= end and not is_least:
+                    late.append(cell)
+                else:
+                    self._cell(bench, cell)
+                    done += 1
+            if late:
+                which = f"from {late[0].budget} spp of seed {late[0].seed} on"
+                cut.append(f"{cells.subject.name}, {len(late)} of {len(missing)} renders, {which}")
         if cut:
             wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
             self.cut = f"{'; '.join(cut)}; run it again with --seconds {wanted}, about"
