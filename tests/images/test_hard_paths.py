@@ -304,13 +304,22 @@ def test_stored_vertices_keep_their_merges():
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(("plate", "expected"), [(rough(0.01), [16] * 3), (None, [48])])
-def test_passes_are_short_where_hard_paths_are_merged(plate, expected, monkeypatch):
+@pytest.mark.parametrize(
+    ("plate", "parameters", "expected"),
+    [
+        (rough(0.01), {"skip": "none"}, [16] * 3),
+        (None, {"skip": "none"}, [48]),
+        (None, {"light_paths": 0}, [16] * 3),
+    ],
+    ids=["rough", "ideal", "ideal, no light subpaths"],
+)
+def test_passes_are_short_where_many_paths_are_merged(plate, parameters, expected, monkeypatch):
     """Rationale: merges grow with the product of a pass's photons and queries: at 256 samples per pixel a
-    prism took 19 times as long with merging as without. Expected: passes of 16 samples per pixel (here of any
-    number of samples); of ideal glass, and in all other renders, as long as before.
+    prism took 19 times as long with merging as without, and `glass_caustics` at 64 without light subpaths
+    9.5 times. Expected: passes of 16 samples per pixel (here of any number of samples) where hard paths are
+    merged, or without light subpaths; of ideal glass with them as long as before.
     """
     monkeypatch.setattr(passes, "_LEAST_SAMPLES", 1)
-    integrator = internals.bdpt(max_depth=5, skip="none", **MERGED)
+    integrator = internals.bdpt(max_depth=5, **parameters, **MERGED)
     mi.render(mi.load_dict(under_glass(point(), plate=plate)), integrator=integrator, spp=48)
     assert integrator.statistics["passes"] == expected

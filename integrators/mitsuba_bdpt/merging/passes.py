@@ -28,9 +28,9 @@ SAMPLES_PER_PHOTON, SAMPLES_PER_HARD_PHOTON = 8, 16
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Samples per pixel of a pass that merges hard paths, and least samples of a pass: its photons and its queries
+# Samples per pixel of a pass that merges many paths, and least samples of a pass: its photons and its queries
 # grow with them, and merges with their product (experiments, "Hard paths").
-_HARD_SAMPLES, _LEAST_SAMPLES = 16, 1 << 16
+_SHORT_PASS, _LEAST_SAMPLES = 16, 1 << 16
 
 # Bits of the edges and of the subpath's index in the sort key of photons.
 _EDGES_BITS, _LANE_BITS = 12, 32
@@ -61,6 +61,8 @@ class Passes:
     def __init__(
         self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, aim: Aim, pixels: int, hard: bool
     ):
+        # Without light subpaths most camera vertices are merged.
+        self._many = hard or settings.light_paths == 0
         self._footprints = Footprints.of(scene, sensor)
         self._radius, self._aim, self._pixels = settings.internals.merging_radius, aim, pixels
         self._kind = HardMerging if hard else Merging
@@ -69,7 +71,7 @@ class Passes:
     @property
     def best_pass(self) -> int:
         """Samples per pixel of a pass, 0 for as many as a launch has."""
-        return max(_HARD_SAMPLES, _LEAST_SAMPLES // self._pixels) if self._kind.hard else 0
+        return max(_SHORT_PASS, _LEAST_SAMPLES // self._pixels) if self._many else 0
 
     def trace(
         self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None
