@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from numbers import Integral, Real
 
 import drjit as dr
@@ -17,7 +18,7 @@ from .host.introspection import named
 from .image import denoising, features, film_limits
 from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
-from .image.layers import film_layers
+from .image.layers import film_layers, partitions
 from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
@@ -231,8 +232,8 @@ def check_not_frozen():
         )
 
 
-def check_film(sensor, settings: Settings, groups: int = 0):
-    """Check the film against the requested layers; returns its colours.
+def check_film(sensor, settings: Settings, groups: Sequence[str] = ()):
+    """Check the film against the requested layers, of light ``groups`` too; returns its colours.
 
     Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
     or too large.
@@ -254,7 +255,8 @@ def check_film(sensor, settings: Settings, groups: int = 0):
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
     stokes = POLARIZED if settings.stokes else 0
-    channels = Channels.of(film, len(colour.names), count, stokes, groups)
+    parts = [len(layers) for layers in partitions(settings, groups)]
+    channels = Channels.of(film, len(colour.names), count, stokes, parts)
     film_limits.check_film(film, channels, settings.variance)
     film_limits.check_strategies(film, settings.strategy_depth, settings.merge_images)
     return colour

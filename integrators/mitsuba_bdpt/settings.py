@@ -179,6 +179,12 @@ class Settings:
         ``key: lamp1, lamp2; sky: envmap`` by ids of emitters or their shapes (``*`` for any characters),
         ``auto`` each emitter by itself, from the ninth on together.""",
     )
+    path_layers: bool = _parameter(
+        False,
+        "true or false",
+        """Adds layers of the light by its path, whose sum is the image: ``emission`` (visible emitters),
+        ``direct``, ``indirect``, and ``caustic`` (direct light by way of specular surfaces).""",
+    )
     target_error: float = _parameter(
         0.0,
         "the relMSE to stop at, or 0 for none",

@@ -97,6 +97,7 @@ PARAMETER_SETS = (
         "layers": "variance,denoised",
         "target_error": 0.01,
         "light_groups": "key: lamp",
+        "path_layers": True,
         "aovs": "a:albedo,b:depth",
         "spp_per_pass": 16,
         "timeout": 12.5,

@@ -285,6 +285,7 @@ def test_stored_vertices_keep_their_merges():
         edges=mi.UInt32(1),
         hit=mi.Bool(True),
         volume=None,
+        layer=None,
         connectible=lambda: mi.Bool(True),
     )
     kernel = SimpleNamespace(
@@ -292,6 +293,7 @@ def test_stored_vertices_keep_their_merges():
         merges_hard=True,
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
+        path_layers=None,
         space=None,
         plan=SimpleNamespace(joined=1),
         last_stored=mi.UInt32(9),

@@ -1,13 +1,12 @@
 """Light groups: layers of the image by emitter."""
 
-import json
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 import variants
 from internals import bdpt
+from layered import JOINED, LAMPS, check_sum, layers, scene
 from media_parts import fog
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
@@ -17,86 +16,12 @@ from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 
-T = mi.ScalarTransform4f
-
-# Radiance, or intensity, of each emitter.
-LAMPS = {"panel": (5, 1, 1), "globe": (0, 3, 1), "bulb": (0, 0, 4), "sky": (0.1, 0.1, 0.1)}
 GROUPS = "low: globe, b*; high: panel"
-# One connection to one of four light subpaths in each lane.
-JOINED = json.dumps(
-    [
-        {"pass": 0, "light_paths": 1 / 16, "connections": "one", "joined": 4}
-        | {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
-    ]
-)
 OF_GROUPS = {"low": ("globe", "bulb"), "high": ("panel",), "rest": ("sky",)}
-
-
-def scene(lit=tuple(LAMPS), medium=None, rfilter="gaussian", **crop):
-    """A floor, a wall and a ball of glass under four emitters, black but those in ``lit`` (names, or their
-    radiances)."""
-
-    def light(name):
-        colours = lit if isinstance(lit, dict) else LAMPS
-        return {"type": "rgb", "value": [float(x) * (name in lit) for x in colours[name]]}
-
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": rfilter}}
-    film |= {"pixel_format": "rgb", "component_format": "float32"} | crop
-    view = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
-    view |= {"film": film, "sampler": {"type": "independent", "sample_count": 8}}
-    placed = T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.5)
-    if medium is not None:
-        view["medium"] = medium
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": view,
-            "floor": {
-                "type": "rectangle",
-                "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3),
-            },
-            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(3)},
-            "ball": {"type": "sphere", "radius": 0.6, "bsdf": {"type": "dielectric"}},
-            "panel": {
-                "type": "rectangle",
-                "to_world": placed,
-                "light": {"type": "area", "radiance": light("panel")},
-            },
-            "globe": {
-                "type": "sphere",
-                "radius": 0.3,
-                "center": [1.5, 0, 0],
-                "light": {"type": "area", "radiance": light("globe")},
-            },
-            "bulb": {"type": "point", "position": [-1.5, 1, 1], "intensity": light("bulb")},
-            "sky": {"type": "constant", "radiance": light("sky")},
-        },
-        optimize=False,
-    )
 
 
 def integrator(**parameters):
     return bdpt(**{"max_depth": 4, "light_groups": GROUPS} | parameters)
-
-
-def layers(integrator, target, spp=8, seed=3):
-    """The image (height, width, colours), and that of each light group, by name."""
-    image = np.array(integrator.render(target, spp=spp, seed=seed), dtype=np.float64)
-    names = integrator.aov_names()
-    first = image.shape[-1] - len(names)
-    found = {}
-    for i, name in enumerate(names):
-        if name.startswith("groups."):
-            group = name.split(".")[1]
-            found.setdefault(group, []).append(image[..., first + i])
-    return image[..., :first], {group: np.stack(channels, axis=-1) for group, channels in found.items()}
-
-
-def check_sum(image, groups):
-    """The layers add up to the image up to the rounding of single precision (2^-24 for each of some ten
-    additions, relative to the brightest pixel, whose filtered samples a pixel may share)."""
-    assert sum(group.max() > 0 for group in groups.values()) > 1
-    np.testing.assert_allclose(sum(groups.values()), image, rtol=2e-6, atol=2e-6 * image.max())
 
 
 @pytest.mark.parametrize(

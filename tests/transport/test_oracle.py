@@ -43,11 +43,13 @@ from mitsuba_bdpt.transport import (
     kernel,
     light_path,
     mis,
+    near_specular,
     subpaths,
     techniques,
 )
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer, Shared
+from mitsuba_bdpt.transport.path_layers import CAUSTIC, DIRECT, INDIRECT, NAMES, PathLayers
 from mitsuba_bdpt.transport.photons import photon_pass
 
 from instruments import oracle
@@ -242,7 +244,8 @@ class World:
         others = 0.2 * np.random.default_rng(9).normal(size=(2, k + 1, n, 4, 4))
         others[..., 0, 0] = 1
         self.matrices, self.backwards = others
-        self.values = {}  # of each s
+        self.values, self.layers = {}, {}  # of each s
+        self.path_layers: PathLayers | None = None
         self.demands = []  # masks that must hold
         self.scene, self.merged = Scene(self), {}
 
@@ -561,7 +564,7 @@ class Nothing:
 
     alpha = False
     features = stokes = None
-    light_groups = 0
+    layers = 0
     rfilter = SimpleNamespace(is_box_filter=lambda: True)
 
     def colour(self, value, _):
@@ -662,6 +665,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
         cells=None,
         light_groups=None,
         light_group=lambda index, active: None,
+        path_layers=world.path_layers,
         sensor_medium=None,
         scatters=True,
     )
@@ -678,7 +682,7 @@ def kernel_weights(world: World, kappa: Coefficients, name: str, monkeypatch, me
             s, edges = edges_of(*arguments)
             if edges == k:
                 result[s] = out.weight
-                world.values[s] = out.value
+                world.values[s], world.layers[s] = out.value, out.path_layer
                 world.demands.append((out.s == s) & (out.t == k + 1 - s))
             return out
 
@@ -971,6 +975,59 @@ def test_kernel_with_merges_on_hard_paths(name, classes, lens, least, monkeypatc
         total += (explicit.hard & sure).sum()
         assert explicit.near.mean() < 0.02
     assert total > 100
+
+
+def layers_of(paths, narrow: bool) -> np.ndarray:
+    """Path layers by definition, of each path: by its rough events, and those beyond the first one."""
+    specular = paths.delta[:, 1 : paths.k].copy()
+    if narrow:
+        densities = np.minimum(paths.to_camera, paths.to_light)[:, 1 : paths.k]
+        specular |= densities >= near_specular.NARROW
+    found = []
+    for events in specular:  # from the emitter to the camera
+        (rough,) = np.nonzero(~events)
+        lit = "direct" if 0 in rough else "caustic"
+        name = ("emission", lit, "indirect")[min(len(rough), 2)]
+        found.append(NAMES.index(name))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("narrow", [False, True])
+@pytest.mark.parametrize("kind", ["", "merging", "hard"])
+def test_strategies_agree_on_path_layers(kind, narrow, monkeypatch):
+    """Rationale: each strategy knows the events of two halves of a path, and makes one or two by connecting
+    them. Paths and photons as above, half of the vertices delta, the others near-specular at half of the
+    densities (``narrow``). Expected: every strategy that samples a path, merges too, states the layer that
+    follows from its definition."""
+    from mitsuba_bdpt.merging.hard_paths import HardMerging
+    from mitsuba_bdpt.merging.merging import Merging
+    from mitsuba_bdpt.merging.radius import Radius
+
+    monkeypatch.setattr(near_specular, "NARROW", 0.3)
+    monkeypatch.setattr(mis, "HARD", 0.0)
+    rng, met = np.random.default_rng(4), np.zeros((len(NAMES), 2), dtype=int)
+    for k in {"": (1, 2, 3, 4, 5), "merging": (4,), "hard": (3,)}[kind]:
+        world, merges = World(rng, 800, k, True, delta=0.5), None
+        world.path_layers = PathLayers(narrow)
+        if kind:
+            radius = Radius(mi.Point3f(0.0), *(mi.Float(x) for x in (0.0, 1e-3, 2.5e-4, 2e-3)))
+            aim, made = (UnaimedAt(no_sky=False), HardMerging) if kind == "hard" else (Unaimed(), Merging)
+            merges = made(radius, mi.Float(1e4), mi.Float(0.3), aim)
+        with monkeypatch.context() as patch:
+            kernel_weights(world, COEFFICIENTS["odd"], "balance", patch, merges)
+        expected, paths = layers_of(world.paths, narrow), world.paths
+        used = oracle.Explicit(paths, COEFFICIENTS["odd"]).used
+        found = [(f"s={s}", layer, used[:, s]) for s, layer in world.layers.items()]
+        assert len(found) == k + 2
+        for m, c in world.merged.items():
+            # Where the event is delta on a BSDF with other lobes, a merge samples another path.
+            found.append((f"merge at {m}", c.path_layer, c.active.numpy() & ~paths.delta[:, m]))
+        for strategy, layer, sampled in found:
+            layer = np.broadcast_to(layer.numpy(), len(expected))
+            np.testing.assert_array_equal(layer[sampled], expected[sampled], err_msg=f"{k}, {strategy}")
+            met[:, int(strategy.startswith("merge"))] += np.bincount(layer[sampled], minlength=len(NAMES))
+    merged = {"": (), "merging": (CAUSTIC,), "hard": (DIRECT, INDIRECT, CAUSTIC)}[kind]
+    assert (met[:, 0] > 20).all() and (met[merged, 1] > 20).all()
 
 
 # -- layer 3: densities of real scenes ---------------------------------------------------------------

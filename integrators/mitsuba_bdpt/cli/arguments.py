@@ -1,6 +1,6 @@
 """The command ``python -m mitsuba_bdpt`` (also installed as ``mitsuba-bdpt``).
 
-``render`` renders a scene file; ``explain`` describes such a render; ``mix`` weights light groups anew;
+``render`` renders a scene file; ``explain`` describes such a render; ``mix`` weights its layers anew;
 ``doctor`` checks the installation; `measuring` declares the commands that measure. Mitsuba is imported inside
 `main`, because `doctor` has to run where that import fails.
 """
@@ -111,7 +111,7 @@ def build_parser() -> argparse.ArgumentParser:
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
     add_mix_arguments(
-        add_command("mix", "weight the light groups of a rendered image anew, without a render")
+        add_command("mix", "weight light groups or path layers of a rendered image anew, without a render")
     )
     measuring.add_commands(add_command)
     return parser
@@ -119,9 +119,12 @@ def build_parser() -> argparse.ArgumentParser:
 
 def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("image", type=Path, help="EXR file that was rendered with light_groups")
-    text = "factor of a group's light, or three for red, green and blue; 1 for groups that are left out"
-    add("weights", type=weight, nargs="+", metavar="GROUP=X[,Y,Z]", help=text)
+    add("image", type=Path, help="EXR file that was rendered with light_groups or path_layers")
+    text = (
+        "factor of the light of a group or path layer (of one kind at a time), or three for red, green and "
+        "blue; 1 for layers that are left out"
+    )
+    add("weights", type=weight, nargs="+", metavar="LAYER=X[,Y,Z]", help=text)
     text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
     add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")

@@ -1,4 +1,4 @@
-"""``python -m mitsuba_bdpt mix``: a new balance of light groups, without a render."""
+"""``python -m mitsuba_bdpt mix``: a new balance of light groups or path layers, without a render."""
 
 from __future__ import annotations
 

@@ -50,12 +50,12 @@ def whole(text: str) -> int:
 
 
 def weight(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse ``GROUP=X`` or ``GROUP=X,Y,Z``, the weight of a light group."""
+    """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer."""
     name, equals, values = text.partition("=")
     with contextlib.suppress(ValueError):
         if name.strip() and equals:
             return name.strip(), tuple(float(value) for value in values.split(","))
-    raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form GROUP=X or GROUP=X,Y,Z")
+    raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form LAYER=X or LAYER=X,Y,Z")
 
 
 def size(text: str) -> tuple[int, ...]:

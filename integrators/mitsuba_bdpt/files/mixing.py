@@ -1,4 +1,4 @@
-"""New balances of the light of an image, from its layers of light groups."""
+"""New balances of the light of an image, from its layers of light groups or paths."""
 
 from __future__ import annotations
 
@@ -10,38 +10,37 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, did_you_mean
-from ..image.layers import GROUP
+from ..image.layers import GROUP, PATH
 
 Weight = float | Sequence[float]
 
 
-def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitmap:
-    """Return the image with the light of each group multiplied by a weight.
+# Names of the partitions of an image, by the prefix of their layers.
+_KINDS = {GROUP: "light groups", PATH: "path layers"}
 
-    ``image``: rendered with ``light_groups``, an EXR file or ``film.bitmap()``. ``weights`` by the name of
-    the group: a number, or one for each colour; 1 for groups that are left out. The result has the image's
+# Layers of one partition: channels by the name of the layer and the colour.
+_Layers = dict[str, dict[str, np.ndarray]]
+
+
+def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitmap:
+    """Return the image with the light of each group, or of each path layer, multiplied by a weight.
+
+    ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
+    ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
+    for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too. The result has the image's
     colours, and its alpha if it has one, in single precision. Raises ``CommandError``.
     """
     name = "the image" if isinstance(image, mi.Bitmap) else repr(str(image))
     channels = _channels(image)
-    groups: dict[str, dict[str, np.ndarray]] = {}
-    for channel, values in channels.items():
-        if channel.startswith(GROUP):
-            group, _, colour = channel.removeprefix(GROUP).rpartition(".")
-            groups.setdefault(group, {})[colour] = values
-    if not groups:
-        raise CommandError(f"{name} has no layers of light groups; render it with light_groups=auto, say")
-    colours = list(next(iter(groups.values())))
+    layers, own = _chosen(name, _partitions(channels), weights)
+    colours = list(next(iter(layers.values())))
     if set(colours) == set("RGB"):  # files have them in another order
         colours = list("RGB")
-    factors = {group: np.ones(len(colours)) for group in groups}
-    for group, weight in weights.items():
-        if group not in groups:
-            there = ", ".join(groups)
-            raise CommandError(f"{name} has no group {group!r}; {did_you_mean(group, groups)}Groups: {there}")
-        factors[group] = _factors(group, weight, colours)
+    factors = {layer: np.ones(len(colours)) for layer in layers}
+    for layer, weight in own.items():
+        factors[layer] = _factors(layer, weight, colours)
     mixed = [
-        sum(factors[group][i] * layer[colour] for group, layer in groups.items())
+        sum(factors[layer][i] * values[colour] for layer, values in layers.items())
         for i, colour in enumerate(colours)
     ]
     has_alpha = "A" in channels
@@ -49,6 +48,60 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     if colours != list("RGB"):
         return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, colours + ["A"] * has_alpha)
     return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB)
+
+
+def _partitions(channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
+    """Return the layers of each partition of an image, by prefix."""
+    found: dict[str, _Layers] = {}
+    for channel, values in channels.items():
+        for prefix in _KINDS:
+            if channel.startswith(prefix):
+                layer, _, colour = channel.removeprefix(prefix).rpartition(".")
+                found.setdefault(prefix, {}).setdefault(layer, {})[colour] = values
+    return found
+
+
+def _chosen(
+    image: str, partitions: dict[str, _Layers], weights: Mapping[str, Weight]
+) -> tuple[_Layers, dict[str, Weight]]:
+    """Return the partition to which all names of ``weights`` belong, and its weights by layer."""
+    if not partitions:
+        raise CommandError(
+            f"{image} has no layers of light groups or paths; render it with light_groups=auto or "
+            "path_layers=true"
+        )
+    chosen, own = next(iter(partitions)), {}
+    for number, (name, weight) in enumerate(weights.items()):
+        prefix, layer = _found(image, partitions, name)
+        if number and prefix != chosen:
+            raise CommandError(
+                f"{next(iter(weights))!r} is one of the {_KINDS[chosen]} and {name!r} one of the "
+                f"{_KINDS[prefix]}, which divide the same light; mix one kind at a time"
+            )
+        if layer in own:
+            raise CommandError(f"{layer} has two weights; give it one")
+        chosen, own[layer] = prefix, weight
+    return partitions[chosen], own
+
+
+def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, str]:
+    """Return the prefix of the partition and the layer of this ``name``."""
+    fitting = [
+        (prefix, layer)
+        for prefix, layers in partitions.items()
+        for layer in layers
+        if name in (layer, prefix + layer)
+    ]
+    if len(fitting) > 1:
+        either = " or ".join(prefix + layer for prefix, layer in fitting)
+        raise CommandError(f"{image} has a light group and a path layer {name!r}; write {either}")
+    if not fitting:
+        there = "; ".join(
+            f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
+        )
+        names = [layer for layers in partitions.values() for layer in layers]
+        raise CommandError(f"{image} has no layer {name!r}; {did_you_mean(name, names)}{there}")
+    return fitting[0]
 
 
 def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
@@ -66,14 +119,14 @@ def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
     return {channel.name: pixels[..., i] for i, channel in enumerate(image.struct_())}
 
 
-def _factors(group: str, weight: Weight, colours: list[str]) -> np.ndarray:
-    """Return a group's weight of each colour."""
+def _factors(layer: str, weight: Weight, colours: list[str]) -> np.ndarray:
+    """Return a layer's weight of each colour."""
     values = np.atleast_1d(np.asarray(weight, dtype=np.float64))
     if values.shape not in ((1,), (len(colours),)):
         raise CommandError(
-            f"{group}={weight!r} has {values.size} numbers; give one, or {len(colours)} for "
+            f"{layer}={weight!r} has {values.size} numbers; give one, or {len(colours)} for "
             f"{', '.join(colours)}"
         )
     if not all(math.isfinite(value) and value >= 0 for value in values):
-        raise CommandError(f"{group}={weight!r} must be 0 or greater, and finite")
+        raise CommandError(f"{layer}={weight!r} must be 0 or greater, and finite")
     return np.broadcast_to(values, len(colours))

@@ -8,8 +8,10 @@ block for both, as in Mitsuba's ``ptracer``, is biased for every filter but the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import accumulate
 from math import ceil
 from operator import add
 
@@ -21,7 +23,7 @@ from ..errors import UsageError
 from ..settings import Settings
 from . import denoising
 from .colour import POLARIZED
-from .layers import film_layers, image_count, strategies, strategy_count, strategy_index
+from .layers import film_layers, image_count, partitions, strategies, strategy_count, strategy_index
 from .replicates import Replicates, Spread
 from .taps import Taps
 
@@ -157,20 +159,27 @@ class Channels:
     """Order of the channels of a pixel's camera samples.
 
     ``colours``, ``alpha`` (0 or 1 channels), the filter's weight W, ``features``, ``stokes`` (channels
-    beside the colours), and the colours of each of the light ``groups``. Splats have colours and Stokes
-    channels only; those of each light group have sums of their own.
+    beside the colours), and the colours of each layer of the ``partitions`` of the image (their numbers of
+    layers, see `layers.partitions`). Splats have colours and Stokes channels only; those of each layer have
+    sums of their own.
     """
 
     colours: int
     alpha: int
     features: int
     stokes: int = 0
-    groups: int = 0
+    partitions: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, film, colours: int, features: int, stokes: int, groups: int = 0) -> Channels:
+    def of(cls, film, colours: int, features: int, stokes: int, partitions: Sequence[int] = ()) -> Channels:
         """Return the channels of a film with these numbers of channels of each kind."""
-        return cls(colours, int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), features, stokes, groups)
+        alpha = int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
+        return cls(colours, alpha, features, stokes, tuple(partitions))
+
+    @property
+    def layers(self) -> int:
+        """Number of layers of all partitions."""
+        return sum(self.partitions)
 
     @property
     def weight(self) -> int:
@@ -181,9 +190,9 @@ class Channels:
     def camera(self) -> int:
         """Number of channels of camera samples, padded to an even number."""
         count = self.weight + 1 + self.features + self.stokes
-        if not self.groups:
+        if not self.layers:
             return even(count)
-        return -(-(count + self.groups * self.colours) // PACKET) * PACKET
+        return -(-(count + self.layers * self.colours) // PACKET) * PACKET
 
     @property
     def light(self) -> int:
@@ -192,12 +201,17 @@ class Channels:
 
     @property
     def splats(self) -> int:
-        """Number of sums of splats: of each light group, or one."""
-        return max(self.groups, 1)
+        """Number of sums of splats: of each layer, or one."""
+        return max(self.layers, 1)
 
-    def sample(self, colours, alpha, features, stokes, groups) -> list:
+    @property
+    def splats_of_image(self) -> int:
+        """Number of sums of splats, the first ones, that add up to those of the image."""
+        return self.partitions[0] if self.partitions else 1
+
+    def sample(self, colours, alpha, features, stokes, layers) -> list:
         """Return the channels of a camera sample with filter weight 1."""
-        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes, *groups]
+        return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes, *layers]
 
 
 # Names of the blocks in `Snapshot.arrays`.
@@ -228,18 +242,18 @@ class Accumulator:
             len(colour.names),
             features.count if features else 0,
             POLARIZED if self.stokes else 0,
-            len(parts.light_groups),
+            [len(layers) for layers in partitions(settings, parts.light_groups)],
         )
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride)
         rows = self.size[1] if parts.strips == 1 else parts.strips * self._stride
         mode, channels = dr.ReduceMode.Local, self._channels.camera
-        if self.light_groups:
+        if self.layers:
             mode = reduce_mode(channels * self.size[0] * rows, parts.samples)
         self.camera = self._block(channels, mode, mi.ArrayXf, rows)
         # Double precision: one pixel may receive millions of splats of a small lamp.
-        rows = self._stride * self.light_groups if self.light_groups else None
+        rows = self._stride * self.layers if self.layers else None
         self.light = self._block(self._channels.light, dr.ReduceMode.Direct, mi.ArrayXd, rows)
         rows = image_count(self.depth, settings.merge_images) * self._stride
         self.strategies = self._block(6, dr.ReduceMode.Direct, mi.ArrayXd, rows) if self.depth else None
@@ -256,25 +270,31 @@ class Accumulator:
         return bool(self._channels.alpha)
 
     @property
-    def light_groups(self) -> int:
-        """Number of light groups that are kept."""
-        return self._channels.groups
+    def layers(self) -> int:
+        """Number of layers of all partitions that are kept."""
+        return self._channels.layers
+
+    def indices(self, layers: Sequence[mi.UInt32]) -> list[mi.UInt32]:
+        """Return the indices, among all layers, of a layer of each partition."""
+        firsts = accumulate(self._channels.partitions, initial=0)
+        return [first + layer for first, layer in zip(firsts, layers, strict=False)]
 
     def put_camera(self, position, values, active, strip):
         """Add a camera sample (sum over all strategies with t >= 2) with filter weight 1.
 
-        ``values``: colours, alpha, features, the channels of `Stokes` and the colours of light groups, if
-        kept; ``strip``: index of the sum to which it is added.
+        ``values``: colours, alpha, features, the channels of `Stokes` and the colours of layers, if kept;
+        ``strip``: index of the sum to which it is added.
         """
         self.camera.put(position, self._channels.sample(*values), active, strip * self._down)
 
     def put_light(self, c, colours, polarized, active, u):
-        """Add the splat ``c`` to the sum of its light group.
+        """Add the splat ``c`` to the sums of its layers.
 
         ``polarized``: channels of `Stokes`; ``u``: see `Block.splat`.
         """
-        row = 0 if c.light_group is None else c.light_group * self._down
-        self.light.splat(c.position, [*colours, *polarized], active, u, row)
+        rows = [layer * self._down for layer in self.indices(c.layers)]
+        for row in rows or [0]:
+            self.light.splat(c.position, [*colours, *polarized], active, u, row)
 
     def put_strategy(self, position, weighted, unweighted, c, active, u=None):
         """Add the contribution ``c`` to the image of its strategy; ``u`` of splats as in `put_light`."""
@@ -306,7 +326,7 @@ class Accumulator:
         sums = [b.data for b in blocks]
         if self._strips > 1:
             sums[0] = self.camera.totals(self._stride, self.size[1])
-        if self.light_groups:
+        if self.layers:
             sums[1] = self.light.strips(self._stride, self.size[1])
         before, passes = self._done
         if before:
@@ -371,28 +391,31 @@ class Accumulator:
             return [[mi.Float64(sums[next(numbers) :: width]) for _ in range(count)] for count in counts]
 
         c = self._channels
-        count = c.groups * c.colours
-        *of_camera, of_groups = parts(camera, c.camera, c.colours, c.alpha, 1, c.features, c.stokes, count)
+        count = c.layers * c.colours
+        *of_camera, of_layers = parts(camera, c.camera, c.colours, c.alpha, 1, c.features, c.stokes, count)
         colours, alpha, [weight], features, polarized = of_camera
         of_each, size = [light], self.size[1] * self.light.row
-        if c.groups:
-            of_each = [light[i * size : (i + 1) * size] for i in range(c.groups)]
+        if c.layers:
+            of_each = [light[i * size : (i + 1) * size] for i in range(c.layers)]
         each = [parts(sums, c.light, c.colours, c.stokes) for sums in of_each]
         splats, of_splats = (
-            [reduce(add, values) for values in zip(*kind, strict=True)] for kind in zip(*each, strict=True)
+            [reduce(add, values) for values in zip(*kind, strict=True)]
+            for kind in zip(*each[: c.splats_of_image], strict=True)
         )
-        groups = of_groups, [value for group, _ in each for value in group] if c.groups else []
-        return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats), groups)
+        layers = of_layers, [value for layer, _ in each for value in layer] if c.layers else []
+        return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats), layers)
 
     def mean(self):
         """Return the mean of the image so far, the scale of roulette.
 
         The largest mean of a colour in its unit; an unevaluated ``Float64`` of width 1.
         """
-        channels, blocks = self._channels, zip(self._done[0][:2], (self.camera, self.light), strict=True)
+        channels, (camera, light) = self._channels, self._done[0][:2]
+        if channels.layers:
+            light = light[: channels.splats_of_image * self.size[1] * self.light.row]
         camera, light = (
             [dr.sum(mi.Float64(sums[i :: block.channels])) for i in range(channels.colours)]
-            for sums, block in blocks
+            for sums, block in ((camera, self.camera), (light, self.light))
         )
         weight = dr.sum(mi.Float64(self._done[0][0][channels.weight :: self.camera.channels]))
         x, y = self._share
@@ -442,7 +465,7 @@ class Accumulator:
             layers += pixels.features
         if self.variance:
             layers += self._variance(sum(passes), pixels.weight)
-        layers += _added(*pixels.groups, to_film)
+        layers += _added(*pixels.layers, to_film)
         if self.strategies is not None:
             layers += self._strategy_layers(self.strategies, sums[2], to_film)
         stored = self.colour.stored(colours + pixels.alpha, pixels.weight, layers)
@@ -497,8 +520,8 @@ def _channels(image: np.ndarray) -> list[mi.Float64]:
 class _Pixels:
     """Sums of an image: channels, each an array over pixels in double precision.
 
-    ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats; ``groups``: colours of
-    light groups, of both.
+    ``light``: splats; ``polarized``: Stokes channels of camera samples and of splats; ``layers``: colours of
+    the partitions' layers, of both.
     """
 
     colours: list[mi.Float64]
@@ -507,4 +530,4 @@ class _Pixels:
     features: list[mi.Float64]
     light: list[mi.Float64]
     polarized: tuple[list[mi.Float64], list[mi.Float64]]
-    groups: tuple[list[mi.Float64], list[mi.Float64]]
+    layers: tuple[list[mi.Float64], list[mi.Float64]]

@@ -38,7 +38,7 @@ def check_film(film, channels: Channels, variance: bool):
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
-    if channels.groups:
+    if channels.partitions:
         needed += min(width * height * channels.camera * SINGLE * dr.thread_count(), COPIES_MEMORY)
     # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")

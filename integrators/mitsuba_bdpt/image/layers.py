@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from ..settings import Settings
+from ..transport.path_layers import NAMES
 from .colour import STOKES_NAMES
 from .features import feature_names
 
 # Layers of the denoised image.
 DENOISED = ("denoised.R", "denoised.G", "denoised.B")
 
-# Prefix of the layers of light groups.
-GROUP = "groups."
+# Prefixes of the layers of light groups and of paths: the two partitions of an image.
+GROUP, PATH = "groups.", "path."
 
 
 def strategies(depth: int):
@@ -39,6 +40,13 @@ def strategy_index(s, t):
     return (k - 1) * (k + 4) // 2 + s
 
 
+def partitions(settings: Settings, light_groups: Iterable[str]) -> list[list[str]]:
+    """Return the layers of each partition of the image, a set of layers that add up to it."""
+    of_groups = [f"{GROUP}{group}" for group in light_groups]
+    of_paths = [f"{PATH}{name}" for name in NAMES] if settings.path_layers else []
+    return [layers for layers in (of_groups, of_paths) if layers]
+
+
 def film_layers(
     settings: Settings, colours: Iterable[str] = "RGB", light_groups: Iterable[str] = ()
 ) -> list[str]:
@@ -47,7 +55,8 @@ def film_layers(
     names = [*(STOKES_NAMES if settings.stokes else ()), *feature_names(settings.aovs)]
     names += DENOISED if settings.denoise else ()
     names += [f"variance.{colour}" for colour in colours if settings.variance]
-    names += [f"{GROUP}{group}.{colour}" for group in light_groups for colour in colours]
+    parts = [layer for layers in partitions(settings, light_groups) for layer in layers]
+    names += [f"{layer}.{colour}" for layer in parts for colour in colours]
     of_strategies = [f"s{s}t{t}" for _, s, t in strategies(settings.strategy_depth)]
     of_strategies += ["merged"] * settings.merge_images
     return names + [

@@ -30,15 +30,15 @@ class Image:
 
     def begin(self):
         """Return the initial ``total``."""
-        if not self._film.light_groups:
+        if not self._film.layers:
             return dr.zeros(mi.Spectrum)
-        return _Total.begin(self._film.light_groups)
+        return _Total.begin(self._film.layers)
 
     def add(self, kernel, c, total, start, shared):
         """Add a contribution with t >= 2 to the ``total`` of a camera subpath."""
         if kernel.strategy_images:
             self._put_strategy(c, start.counted, shared)
-        return _plus(total, c.weighted(), c.light_group, c.active)
+        return self._plus(total, c.weighted(), c.layers, c.active)
 
     def connect(self, kernel, z, lane, stream, total, start):
         """Connect the camera vertex ``z`` to light vertices of its lane.
@@ -51,8 +51,17 @@ class Image:
                 return self.add(kernel, seen, total, start, lane.shared)
 
             return connections.connect_all(kernel, z, lane.path, stream, total, add)
-        found, counted, group = connections.connect_one(kernel, z, lane.path, stream)
-        return _plus(total, found, group), counted
+        found, counted, layers = connections.connect_one(kernel, z, lane.path, stream)
+        return self._plus(total, found, layers), counted
+
+    def _plus(self, total, value: mi.Spectrum, layers, active: mi.Bool | bool = True):
+        """Return ``total`` with ``value`` added; ``layers``: see `Contribution`."""
+        if not self._film.layers:
+            return total + value
+        for layer in self._film.indices(layers):
+            before = total.layers.read(layer, active)
+            total.layers.write(before + mi.unpolarized_spectrum(value), layer, active)
+        return replace(total, whole=total.whole + value)
 
     def splat(self, kernel, c, shared, stream) -> Counters:
         """Add a contribution with t <= 1; ``stream``: of its light subpath.
@@ -78,12 +87,12 @@ class Image:
             features, finite = film.features.sample(
                 kernel.points, sample.stream, start.position, sample.u_lens, shared.time, sample.covered
             )
-        groups = []
-        if film.light_groups:
-            groups = [
+        layers = []
+        if film.layers:
+            layers = [
                 number
-                for i in range(film.light_groups)
-                for number in film.colour(total.groups.read(mi.UInt32(i)) * shared.weight, shared.wavelengths)
+                for i in range(film.layers)
+                for number in film.colour(total.layers.read(mi.UInt32(i)) * shared.weight, shared.wavelengths)
             ]
             total = total.whole
         whole = polarization.scaled(total, shared.weight)
@@ -91,8 +100,8 @@ class Image:
         polarized = self._polarized(whole, shared, -start.ray.d)
         shown = dr.all(dr.isfinite(colours)) & _all_finite(polarized)
         alpha = _alpha(kernel, seen)
-        polarized, groups = ([dr.select(shown, v, 0) for v in values] for values in (polarized, groups))
-        values = dr.select(shown, colours, 0), alpha, features, polarized, groups
+        polarized, layers = ([dr.select(shown, v, 0) for v in values] for values in (polarized, layers))
+        values = dr.select(shown, colours, 0), alpha, features, polarized, layers
         film.put_camera(start.counted, values, sample.covered, sample.strip)
         return Counters(non_finite=one(sample.covered & ~finite) + one(sample.covered & ~shown))
 
@@ -110,27 +119,21 @@ class Image:
 
 @dataclass
 class _Total:
-    """Sum of a camera subpath's contributions: the ``whole``, and the intensity of each light group."""
+    """Sum of a camera subpath's contributions: the ``whole``, and the intensity in each layer.
+
+    ``layers``: of all partitions, see `Accumulator.indices`.
+    """
 
     whole: mi.Spectrum
-    groups: dr.Local
+    layers: dr.Local
 
     @staticmethod
     def begin(count: int) -> _Total:
-        """Zero, for ``count`` light groups."""
-        groups = dr.alloc_local(mi.UnpolarizedSpectrum, count)
+        """Zero, for ``count`` layers."""
+        layers = dr.alloc_local(mi.UnpolarizedSpectrum, count)
         for i in range(count):
-            groups.write(dr.zeros(mi.UnpolarizedSpectrum), mi.UInt32(i))
-        return _Total(dr.zeros(mi.Spectrum), groups)
-
-
-def _plus(total, value: mi.Spectrum, light_group, active: mi.Bool | bool = True):
-    """Return ``total`` with ``value`` added, a `_Total` if there are light groups."""
-    if light_group is None:
-        return total + value
-    before = total.groups.read(light_group, active)
-    total.groups.write(before + mi.unpolarized_spectrum(value), light_group, active)
-    return replace(total, whole=total.whole + value)
+            layers.write(dr.zeros(mi.UnpolarizedSpectrum), mi.UInt32(i))
+        return _Total(dr.zeros(mi.Spectrum), layers)
 
 
 def _of_filter(kernel, film, c, stream):

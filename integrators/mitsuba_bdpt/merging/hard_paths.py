@@ -31,7 +31,7 @@ from ..transport.contribution import Contribution
 from ..transport.inputs import Kernel
 from ..transport.sds import State, begun
 from ..transport.walk import Vertex, newest_connection
-from .merging import Merging, sample
+from .merging import Merging, sample, with_layers
 
 # Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.
 SLACK = 2.0
@@ -93,7 +93,7 @@ class HardMerging(Merging):
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
         c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")
-        return replace(c, light_group=kernel.light_group(y.emitter, active))
+        return with_layers(kernel, c, z, drawn)
 
 
 def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:

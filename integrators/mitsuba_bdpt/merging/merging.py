@@ -27,6 +27,7 @@ from ..sampling.reservoir import offer
 from ..transport import bsdf, mis, spectra
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
+from ..transport.path_layers import joined
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon, same_surface
 from ..transport.sds import SdsStrategy, State, begun
@@ -218,7 +219,16 @@ def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelengt
     camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
     weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
     c = Contribution(drawn.value, weight, photon.edges + 1, z.edges, drawn.active, shares, "merge")
-    return replace(c, light_group=kernel.light_group(photon.emitter, drawn.active))
+    return with_layers(kernel, c, z, drawn)
+
+
+def with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Contribution:
+    """The contribution ``c`` of ``drawn`` with its light group and path layer, if there are such layers."""
+    photon, path_layer = drawn.photon, None
+    if kernel.path_layers is not None:
+        of_camera = kernel.path_layers.evaluated(z.layer, drawn.f, None, adjoint=False)
+        path_layer = joined(of_camera, photon.layer)
+    return replace(c, light_group=kernel.light_group(photon.emitter, c.active), path_layer=path_layer)
 
 
 @dr.syntax

@@ -80,7 +80,7 @@ class Render:
         check_not_frozen()
         self.light_groups = LightGroups.of(scene, settings.light_groups)
         names = () if self.light_groups is None else self.light_groups.names
-        colour = check_film(sensor, settings, len(names))
+        colour = check_film(sensor, settings, names)
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
@@ -215,6 +215,8 @@ class Render:
             kernel.set_threshold(dr.opaque(mi.Float64, self.planner.threshold))
         if self.light_groups is not None:
             kernel.use_light_groups(self.light_groups)
+        if self.settings.path_layers:
+            kernel.use_path_layers(bool(self.prepared.near_specular))
         return kernel
 
     def _steps(self) -> Iterator[Step]:

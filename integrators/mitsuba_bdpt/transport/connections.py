@@ -17,12 +17,14 @@ from .contribution import (
     Counters,
     counted_in_media,
     drop_non_finite,
+    layers,
     one,
     roulette,
     size_of,
 )
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
+from .path_layers import INDIRECT
 from .sketches import Sketch, guess
 from .visibility import ShadowRay, guessed, seen
 from .walk import Vertex, hard_merges, is_lit, newest_coefficient, where_lit
@@ -59,7 +61,8 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
     weight, shares = h.weigh(*sides, merges=merges)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
-    return replace(c, light_group=y.light_group)
+    path_layer = None if kernel.path_layers is None else kernel.path_layers.connected(z, f_z, y, f_y)
+    return replace(c, light_group=y.light_group, path_layer=path_layer)
 
 
 @dr.syntax
@@ -90,10 +93,11 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
 
 def connect_one(
     kernel: Kernel, z: Vertex, path: LightPath, stream: Stream
-) -> tuple[mi.Spectrum, Counters, mi.UInt32 | None]:
+) -> tuple[mi.Spectrum, Counters, tuple[mi.UInt32, ...]]:
     """Connect ``z`` with one light vertex, drawn by weighted unshadowed contribution.
 
-    Estimates the sum over all vertices. Returns the weighted contribution, `Counters`, and its light group.
+    Estimates the sum over all vertices. Returns the weighted contribution, `Counters`, and its
+    `Contribution.layers`.
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
@@ -123,12 +127,12 @@ def connect_one(
     kernel.observer.drawn(end)
     if kernel.space is None:
         active &= ~rays.occluded(kernel.scene, ray, active, own)
-        return dr.select(active, value / survival, 0), counted, drawn.light_group
+        return dr.select(active, value / survival, 0), counted, drawn.layers
     shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
     estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
     c = drop_non_finite(seen(kernel, c, shadow_ray))
-    return c.weighted(), counted + c.counted, drawn.light_group
+    return c.weighted(), counted + c.counted, drawn.layers
 
 
 # Probability of a uniform draw, so that connections of approximate size 0 are drawn too.
@@ -145,7 +149,7 @@ class _Drawn:
     Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
     `ShapeErrors.small`), rescaled random number ``u``, number ``evaluated`` and nonzero, number ``lost`` as
     non-finite. In scenes with media, where the weight is known after the shadow ray, also ``unweighted``
-    value, ``sides`` (see `Contribution`) and ``size`` in the draw. ``light_group``: see `Contribution`.
+    value, ``sides`` (see `Contribution`) and ``size`` in the draw. ``layers``: see `Contribution`.
     """
 
     value: mi.Spectrum
@@ -158,7 +162,7 @@ class _Drawn:
     unweighted: mi.Spectrum | None = None
     sides: tuple | None = None
     size: mi.Float | None = None
-    light_group: mi.UInt32 | None = None
+    layers: tuple[mi.UInt32, ...] = ()
 
 
 @dr.syntax
@@ -172,6 +176,9 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     end = mi.UInt32(0) if small else mi.Point3f(z.si.p)
     nonzero, lost = mi.UInt32(0), mi.UInt32(0)
     kept = None
+    varies = kernel.path_layers is not None and kernel.path_layers.near_specular
+    # As wide as the lanes, see `Walk.begin`.
+    path_layer = dr.full(mi.UInt32, INDIRECT, dr.width(candidates)) if varies else None
     if kernel.space is not None:
         empty = kernel.heuristic.zero()
         kept = dr.zeros(mi.Spectrum), empty, empty, mi.Float(0)
@@ -185,13 +192,17 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         total, take, u = offer(total, size, u)
         value = dr.select(take, of_this, value)
         kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:], size), kept)
+        path_layer = None if path_layer is None else dr.select(take, c.path_layer, path_layer)
         # Stores the end of the shadow ray, not the slot: a lookup by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)
         nonzero += one(c.active)
         lost += c.counted.non_finite
         slot += 1
     # One light subpath: all vertices are of one emitter.
-    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost, light_group=path.light_group)
+    if kernel.path_layers is not None and not varies:
+        path_layer = mi.UInt32(INDIRECT)
+    own = layers(path.light_group, path_layer)
+    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost, layers=own)
     if kept is not None:
         unweighted, light_side, camera_side, size = kept
         sides = kernel.kappa.inner, light_side, camera_side
@@ -237,7 +248,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
     found = _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
-    return replace(found, light_group=y.light_group)
+    return replace(found, layers=c.layers)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:

@@ -115,7 +115,8 @@ class Contribution:
     for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
     the connected edge until `visibility.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
     ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
-    sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, None without such layers.
+    sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, ``path_layer`` of the path (see
+    `path_layers`), None without such layers.
     """
 
     value: mi.Spectrum
@@ -131,10 +132,21 @@ class Contribution:
     emission: Cell | None = None
     towards: mi.Vector3f | None = None
     light_group: mi.UInt32 | None = None
+    path_layer: mi.UInt32 | None = None
+
+    @property
+    def layers(self) -> tuple[mi.UInt32, ...]:
+        """Its layer in each partition of the image, in the order of the film."""
+        return layers(self.light_group, self.path_layer)
 
     def weighted(self) -> mi.Spectrum:
         """The weighted contribution to the image."""
         return dr.select(self.active, self.value * self.weight, 0)
+
+
+def layers(*layer: mi.UInt32 | None) -> tuple[mi.UInt32, ...]:
+    """The layers of a contribution in the partitions of the image that are in use."""
+    return tuple(index for index in layer if index is not None)
 
 
 def drop_non_finite(c: Contribution) -> Contribution:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -13,6 +13,7 @@ import mitsuba as mi
 from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
+from .path_layers import PathLayers
 from .plan import Plan
 from .sds import SdsStrategy
 
@@ -124,6 +125,8 @@ class Kernel:
         self.sds: SdsStrategy | None = None
         # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
         self.light_groups: LightGroups | None = None
+        # Path layers, likewise (`Contribution.path_layer`).
+        self.path_layers: PathLayers | None = None
         # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 
@@ -146,6 +149,12 @@ class Kernel:
     def use_light_groups(self, groups: LightGroups):
         """Let contributions store their light group."""
         self.light_groups, self.emitters = groups, self.emitters.with_indices()
+
+    def use_path_layers(self, near_specular: bool):
+        """Let contributions store their path layer; ``near_specular``: the scene has near-specular lobes."""
+        self.path_layers = PathLayers(near_specular)
+        if near_specular:
+            self.traits = replace(self.traits, reverse=True)
 
     def light_group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32 | None:
         """The light group of the emitter ``index``; None without such layers."""

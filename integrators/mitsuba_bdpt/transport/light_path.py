@@ -23,7 +23,7 @@ class StoredVertex:
     geometric cosine of incidence |n.wi|, the constant part of the adjoint factor |n.wo| / |n.wi| (in volumes
     both are 1); ``partial``: partial sums in the area measure; ``edges`` up to it, s - 1; ``anchor``: starts
     rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media; ``light_group``: see
-    `Contribution`.
+    `Contribution`; ``layer``: see `Vertex`, None where connections do not need it.
     """
 
     si: mi.SurfaceInteraction3f
@@ -34,6 +34,7 @@ class StoredVertex:
     edges: mi.UInt32
     medium: mi.UInt32 | None = None
     light_group: mi.UInt32 | None = None
+    layer: mi.UInt32 | None = None
 
     @property
     def volume(self) -> mi.Bool | None:
@@ -55,6 +56,7 @@ class StoredVertex:
             partial=vertex.partial,
             edges=vertex.edges,
             medium=None if vertex.volume is None else dr.select(vertex.volume, vertex.edge.medium, 0),
+            layer=vertex.layer,
         )
 
 
@@ -102,7 +104,7 @@ class LightPath:
     offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vn``, where hard
     paths are merged; ``s``: light vertices up to and including each; ``count``: number of stored vertices;
     ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
-    ``light_groups`` of each vertex if there are several.
+    ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -116,6 +118,7 @@ class LightPath:
     medium: dr.Local[mi.UInt32] | None = None
     light_group: mi.UInt32 | None = None
     light_groups: dr.Local[mi.UInt32] | None = None
+    layers: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
     sketches: Any = None  # `Sketches`, for draws by approximation
 
@@ -123,6 +126,7 @@ class LightPath:
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
     size, several = kernel.store_size, kernel.plan.joined > 1
+    layered = kernel.path_layers is not None and kernel.path_layers.near_specular
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
         throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
@@ -136,6 +140,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
         light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
         light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
+        layers=dr.alloc_local(mi.UInt32, size) if layered else None,
         sketches=Sketches.allocate(kernel, size) if several else None,
     )
 
@@ -161,6 +166,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         path.medium.write(y.medium, slot, keep)
     if path.light_groups is not None:
         path.light_groups.write(path.light_group, slot, keep)
+    if path.layers is not None:
+        path.layers.write(y.layer, slot, keep)
     if path.sketches is not None:
         newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
         path.sketches.write(Sketch.of(kernel, vertex, newest, keep, alone=True), slot, keep)
@@ -199,4 +206,5 @@ def read_light_vertex(
         edges=s - 1,
         medium=None if path.medium is None else path.medium.read(slot, active),
         light_group=path.light_group if groups is None else groups.read(slot, active),
+        layer=None if path.layers is None else path.layers.read(slot, active),
     )

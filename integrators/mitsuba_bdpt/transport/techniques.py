@@ -19,6 +19,7 @@ from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
+from .path_layers import EMISSION, joined
 from .sds import SdsStrategy
 from .visibility import ShadowRay, seen
 from .walk import (
@@ -77,6 +78,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     value = _known(z.throughput * radiance, *others)
     emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
     c = Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
+    c.path_layer = z.layer
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(emitters.index_of_hit(z.si, active), active)
     return c
@@ -136,6 +138,8 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(e.index, active)
+    if kernel.path_layers is not None:
+        c.path_layer = kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False)
     return seen(kernel, c, shadow_ray)
 
 
@@ -179,6 +183,8 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", connection.position, counted, sides)
     c = replace(c, towards=connection.d)
+    if kernel.path_layers is not None:
+        c.path_layer = mi.UInt32(EMISSION)
     return seen(kernel, c, ShadowRay(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
@@ -226,6 +232,9 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     medium = y.medium_towards(kernel, connection.d)
     shadow_ray = ShadowRay(ray, medium=medium, hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
+    if kernel.path_layers is not None:
+        of_light = kernel.path_layers.evaluated(y.layer, f, y.volume, adjoint=True)
+        c.path_layer = joined(mi.UInt32(EMISSION), of_light)
     return seen(kernel, c, shadow_ray.numbered(kernel, stream, y.event))
 
 
@@ -271,7 +280,10 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
         asked = active & emission.infinite & directly
         active &= ~(asked & hidden(kernel, z.surroundings, asked))
     ends = walk.edges + 1, mi.UInt32(0)
-    return Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
+    c = Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
+    if walk.layer is not None:
+        c.path_layer = joined(mi.UInt32(EMISSION), walk.layer)
+    return c
 
 
 def _reaching(walk: Walk, y: Vertex):

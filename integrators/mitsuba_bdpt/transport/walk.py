@@ -22,6 +22,7 @@ from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
+from .path_layers import EMISSION
 from .sds import SdsStrategy, State
 
 
@@ -36,6 +37,7 @@ class Walk:
     * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
       ``edge``: its state along an edge, None without media.
     * ``sds``: see `sds.State`, None without a further strategy for SDS paths.
+    * ``layer``: number of its events in `path_layers`, None without such layers.
 
     Constants along a subpath are in `Side`: Dr.Jit records a loop twice if its state contains them.
     """
@@ -53,6 +55,7 @@ class Walk:
     active: mi.Bool
     edge: Any = None  # a `media.flight.Edge`
     sds: State | None = None
+    layer: mi.UInt32 | None = None
 
     @staticmethod
     def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
@@ -70,6 +73,8 @@ class Walk:
             broken=mi.Bool(False),
             active=active,
             edge=edge,
+            # As wide as the lanes: Dr.Jit treats an index of local memory of width 1 as equal in all lanes.
+            layer=None if kernel.path_layers is None else dr.full(mi.UInt32, EMISSION, dr.width(pi)),
         )
 
     @property
@@ -99,7 +104,7 @@ class Vertex:
     geometric cosine of the edge to it; ``anchor``: starts rays; ``hit``: false in the environment;
     ``endpoint`` of its connection and the BSDF ``f`` towards it (a `bsdf.Evaluation`), where
     ``endpoint_active``, see `Side`; ``event``: index of its random numbers. In scenes with media ``volume``:
-    mask, in a medium; ``landing``: end of its edge; else None.
+    mask, in a medium; ``landing``: end of its edge; else None. ``layer``: that of `Walk` on arrival.
     """
 
     si: mi.SurfaceInteraction3f
@@ -123,6 +128,7 @@ class Vertex:
     # Set with guiding: `sds.State.guided` on arrival, and the guide.
     guided: mi.Float | None = None
     advice: Any = None  # an `sds.Advice`
+    layer: mi.UInt32 | None = None
 
     @property
     def edge(self) -> Any:
@@ -302,6 +308,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         volume=volume,
         landing=landing,
         guided=None if walk.sds is None else walk.sds.guided,
+        layer=walk.layer,
     )
 
 
@@ -399,6 +406,9 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     active &= goes_on
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
+    layer = walk.layer
+    if kernel.path_layers is not None:
+        layer = kernel.path_layers.sampled(layer, step, vertex.volume, side.adjoint)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
     after = Walk(
         pi=walk.pi,
@@ -413,6 +423,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
         broken=broken,
         active=active,
         sds=sds,
+        layer=layer,
     )
     if passes is not None:
         after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)

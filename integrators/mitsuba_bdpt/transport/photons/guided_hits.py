@@ -191,4 +191,7 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
     guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
-    return replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=State(guided=guided))
+    walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=State(guided=guided))
+    if kernel.path_layers is not None:
+        walk = replace(walk, layer=kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False))
+    return walk

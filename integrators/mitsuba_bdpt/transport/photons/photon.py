@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import drjit as dr
@@ -20,7 +20,8 @@ class Photon:
     throughput, not divided by the number of subpaths; ``older``: partial sum of all alternatives with fewer
     light vertices (area measure); ``aim``: the emitter's own density of the first direction over that of
     `Aim`; ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath;
-    ``emitter``: index in the scene.
+    ``emitter``: index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`, None
+    without such layers.
     """
 
     p: mi.Point3f
@@ -33,6 +34,7 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
     emitter: mi.UInt32
+    layer: mi.UInt32 | None = field(default=None, kw_only=True)
 
     @classmethod
     def types(cls) -> tuple[Any, ...]:
@@ -46,13 +48,25 @@ class Photon:
         )
 
     @classmethod
-    def zeros(cls, count: int) -> Self:
-        """Memory for ``count`` photons."""
-        return cls(*(dr.zeros(kind, count) for kind in cls.types()))
+    def zeros(cls, count: int, layered: bool = False) -> Self:
+        """Memory for ``count`` photons, ``layered`` with path layers."""
+        layer = dr.zeros(mi.UInt32, count) if layered else None
+        return cls(*(dr.zeros(kind, count) for kind in cls.types()), layer=layer)
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Self:
         """The photons at ``index``."""
-        return type(self)(*(dr.gather(type(field), field, index, active) for field in vars(self).values()))
+        present = self._present().items()
+        return replace(
+            self, **{name: dr.gather(type(values), values, index, active) for name, values in present}
+        )
+
+    def put(self, photon: Self, index: mi.UInt32, active: mi.Bool):
+        """Store ``photon`` at ``index``."""
+        dr.scatter(self._present(), photon._present(), index, active)
+
+    def _present(self) -> dict[str, Any]:
+        """Its fields by name; Dr.Jit scatters no None."""
+        return {name: values for name, values in vars(self).items() if values is not None}
 
 
 @dataclass

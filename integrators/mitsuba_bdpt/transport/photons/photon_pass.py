@@ -76,7 +76,7 @@ def trace(
     kernel.last_light = kernel.last_merged if kernel.merges_hard else kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        out = _kind(kernel, kept).zeros(capacity)
+        out = _kind(kernel, kept).zeros(capacity, kernel.path_layers is not None)
         traced = _traced(kernel, aim, count, kept, out)
         if traced.count <= capacity:
             return traced
@@ -121,9 +121,9 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
             more = _connection(kernel, y), walk.sds.only_delta & ~e.delta
         distance = dr.norm(y.si.p - y.previous)
         fields = y.si.p, -walk.d, y.si.n, flux, older, aimed, distance, y.edges, lanes, e.index
-        found = type(out)(*fields, *more)
+        found = type(out)(*fields, *more, layer=y.layer)
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
-        dr.scatter(out, found, place, keep & (place < most))
+        out.put(found, place, keep & (place < most))
         return counters + Counters(photons=one(keep))
 
     begun = walk.active

@@ -1,0 +1,82 @@
+"""Path layers: a partition of paths by their events, the same whichever strategy samples a path.
+
+An event is *specular* if a delta lobe was sampled, or if it is near-specular (`near_specular.is_narrow`, by
+the densities of both directions at the vertex); other events, and those in media, are *rough*. Null events,
+which pass straight on, are none. Of a path with
+
+* no rough event: ``emission`` (an emitter seen directly, in mirrors or through glass);
+* one rough event, and no event between it and the emitter: ``direct``;
+* one rough event, and specular ones alone between it and the emitter, one at least: ``caustic``;
+* several rough events: ``indirect``.
+
+Specular events between the camera and the first rough one do not matter.
+
+Each subpath carries a number, the layer of its events. On a camera subpath it is that of the path that ends
+if the next vertex is on an emitter. On a light subpath it is that of the path that ends on the sensor, but
+`_SPECULAR` after specular events alone.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from .bsdf import Evaluation, Step
+from .near_specular import is_narrow
+
+# Names of the layers, by number.
+NAMES = ("emission", "direct", "indirect", "caustic")
+EMISSION, DIRECT, INDIRECT, CAUSTIC = range(len(NAMES))
+
+# Of light subpaths: specular events alone, one at least.
+_SPECULAR = len(NAMES)
+
+
+class PathLayers:
+    """The layers of paths in a scene; ``near_specular``: it has near-specular lobes."""
+
+    def __init__(self, near_specular: bool):
+        self.near_specular = near_specular
+
+    def sampled(self, layer: mi.UInt32, step: Step, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
+        """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before.
+
+        ``volume``: the vertex is in a medium; None in scenes without media.
+        """
+        specular = step.delta | self._is_narrow(step, volume)
+        return dr.select(step.null, layer, _after(layer, specular, adjoint))
+
+    def evaluated(self, layer: mi.UInt32, f: Evaluation, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
+        """The same after an event whose directions were given, with evaluation ``f``."""
+        return _after(layer, self._is_narrow(f, volume), adjoint)
+
+    def connected(self, z, f_z: Evaluation, y, f_y: Evaluation) -> mi.UInt32:
+        """Layer of the path that connects the vertices ``z`` and ``y`` of a camera and a light subpath."""
+        if not self.near_specular:  # both events are rough
+            return mi.UInt32(INDIRECT)
+        of_camera = self.evaluated(z.layer, f_z, z.volume, adjoint=False)
+        return joined(of_camera, self.evaluated(y.layer, f_y, y.volume, adjoint=True))
+
+    def _is_narrow(self, event: Step | Evaluation, volume: mi.Bool | None) -> mi.Bool:
+        if not self.near_specular:
+            return mi.Bool(False)
+        narrow = is_narrow(event.pdf_fwd_w, event.pdf_rev_w)
+        return narrow if volume is None else narrow & ~volume
+
+
+def joined(of_camera: mi.UInt32, of_light: mi.UInt32) -> mi.UInt32:
+    """Layer of the path of a camera and a light subpath with these numbers, each after its last event."""
+    seen = dr.select(of_camera == EMISSION, of_light, INDIRECT)
+    specular = dr.select(of_camera == DIRECT, CAUSTIC, of_camera)
+    found = dr.select(of_light == _SPECULAR, specular, seen)
+    return dr.select(of_light == EMISSION, of_camera, found)
+
+
+def _after(layer: mi.UInt32, specular: mi.Bool, adjoint: bool) -> mi.UInt32:
+    """Number of a subpath after another event; ``adjoint``: of a light subpath."""
+    first = layer == EMISSION
+    rough = dr.select(first, mi.UInt32(DIRECT), INDIRECT)
+    if adjoint:
+        rough = dr.select(layer == _SPECULAR, CAUSTIC, rough)
+        return dr.select(specular, dr.select(first, _SPECULAR, layer), rough)
+    return dr.select(specular, dr.select(layer == DIRECT, CAUSTIC, layer), rough)

@@ -1,0 +1,296 @@
+"""Path layers: layers of the image by the events between emitter and camera."""
+
+from functools import cache
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+import welch
+from internals import bdpt
+from layered import JOINED, check_sum, layers, scene
+from media_parts import fog
+from mitsuba_bdpt.image import sink
+from mitsuba_bdpt.transport.near_specular import NARROW
+from mitsuba_bdpt.transport.path_layers import NAMES, PathLayers
+from sds_scenes import point, under_glass
+from snapshots import ROUNDING, stopped
+
+ROUGH_GLASS = {"type": "roughdielectric", "alpha": 0.1}
+POLISHED = {"type": "roughconductor", "alpha": 0.05}
+# Scenes by their surfaces: delta lobes, near-specular ones, and null events.
+SURFACES = {
+    "glass": {},
+    "near-specular": {"ball": ROUGH_GLASS, "wall": POLISHED},
+    "null": {
+        "ball": {"type": "thindielectric"},
+        "wall": {"type": "mask", "opacity": 0.7, "bsdf": {"type": "plastic"}},
+    },
+}
+
+
+def integrator(**parameters):
+    return bdpt(**{"max_depth": 5, "path_layers": True} | parameters)
+
+
+def divided(method, target, **more):
+    return layers(method, target, kind="path", **more)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "of_scene"),
+    [
+        ({"skip": "none", "connections": "one"}, {"crop_width": 6, "crop_offset_x": 1}),
+        ({"skip": "none", "connections": "all"}, SURFACES["near-specular"]),
+        ({"skip": "none", "connections": "one"}, SURFACES["near-specular"]),
+        ({"light_paths": 0}, SURFACES["near-specular"]),
+        ({}, {"rfilter": "box"}),
+        ({"merging": True}, {}),
+        ({"merging": True}, SURFACES["near-specular"]),
+        ({"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}, SURFACES["null"]),
+        ({"max_depth": 3, "layers": "strategies", "light_groups": "auto"}, {}),
+        ({"guiding": "always"}, {}),
+        ({"decisions": JOINED, "light_groups": "auto"}, SURFACES["near-specular"]),
+        ({"connections": "all"}, {"medium": fog()} | SURFACES["near-specular"]),
+    ],
+    ids=[
+        "one",
+        "all",
+        "drawn",
+        "path tracing",
+        "pilot",
+        "merging",
+        "hard paths",
+        "other layers",
+        "strategies",
+    ]
+    + ["guiding", "joined", "fog"],
+)
+def test_layers_add_up_to_the_image(parameters, of_scene):
+    """Expected: with what else a render may do, the layers add up, and so do light groups beside them."""
+    method, target = integrator(**parameters), scene(**of_scene)
+    image, found = divided(method, target)
+    assert tuple(found) == NAMES
+    check_sum(image, found)
+    if "light_groups" in parameters:
+        check_sum(*layers(method, target))
+
+
+def test_layers_change_nothing_else():
+    """Expected: the image, and the layers of light groups, are those of a render without path layers.
+    Tolerance: order of atomic additions."""
+    target = scene(**SURFACES["near-specular"])
+    image, _ = divided(integrator(skip="none", light_groups="auto"), target)
+    _, groups = layers(integrator(skip="none", light_groups="auto"), target)
+    expected, alone = layers(bdpt(max_depth=5, skip="none", light_groups="auto"), target)
+    np.testing.assert_allclose(image, expected, rtol=1e-5, atol=2e-6 * image.max())
+    for name, layer in alone.items():
+        np.testing.assert_allclose(groups[name], layer, rtol=1e-5, atol=2e-6 * image.max())
+
+
+def test_layers_of_bands_and_of_stokes_vectors():
+    """Expected: on a ``specfilm`` a layer has each band; in polarized variants layers add up to the intensity
+    of an image with Stokes vectors."""
+    mi.set_variant(variants.of("spectral"))
+    low, high = ({"type": "spectrum", "value": v} for v in ([(400, 1), (500, 1)], [(500, 1), (700, 1)]))
+    film = {"type": "specfilm", "width": 4, "height": 4, "low": low, "high": high}
+    box = mi.cornell_box()
+    box["sensor"]["film"] = film
+    method = integrator(light_groups="lamp: light")
+    image, found = divided(method, mi.load_dict(box))
+    assert method.aov_names()[2:] == [f"path.{name}.{band}" for name in NAMES for band in ("low", "high")]
+    check_sum(image, found)
+    mi.set_variant(variants.of("mono_polarized"))
+    box["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
+    image, found = divided(integrator(layers="stokes", light_groups="auto"), mi.load_dict(box))
+    check_sum(np.broadcast_to(image, (4, 4, 3)), found)
+
+
+def test_layers_of_rough_surfaces_are_those_of_path_lengths():
+    """Rationale: without specular surfaces ``emission`` is what Mitsuba's `path` renders up to depth 1,
+    ``direct`` what depth 2 adds, ``indirect`` the rest. Expected: the same by Welch's t-test of the means of
+    16 renders, ``direct`` within 5 %, and nothing in ``caustic``."""
+    target = scene(rfilter="box", ball={"type": "diffuse"})
+
+    def mitsubas(depth, seed):
+        other = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
+        return np.array(other.render(target, spp=32, seed=seed), dtype=np.float64).mean((0, 1))
+
+    expected, found = [], []
+    for seed in range(16):
+        upto = [mitsubas(depth, 3 * seed + depth) for depth in (1, 2, 5)]
+        expected.append(np.concatenate([upto[0], upto[1] - upto[0], upto[2] - upto[1]]))
+        _, parts = divided(integrator(skip="none"), target, spp=16, seed=seed)
+        assert not parts["caustic"].any()
+        found.append(np.concatenate([parts[name].mean((0, 1)) for name in NAMES[:3]]))
+    expected, found = np.array(expected), np.array(found)
+    welch.assert_agree(welch.welch(found, expected, labels=[f"{n} {c}" for n in NAMES[:3] for c in "RGB"]))
+    assert (np.abs(found.mean(0) / expected.mean(0) - 1)[3:6] < 0.05).all()
+
+
+@pytest.mark.parametrize("light_paths", [0, 1])
+def test_light_of_a_mirror_beside_a_floor(light_paths):
+    """Rationale: under an even sky a point of a floor at distance c from an upright mirror of height a and
+    width 2 b sees the sky in it with the form factor F of a rectangle perpendicular to the point's plane
+    (1 / pi)(atan(b / c) - (c / r) atan(b / r)), r^2 = a^2 + c^2. No light meets the floor twice.
+
+    Expected: ``caustic`` is albedo F, ``direct`` albedo (1 - F), the others 0. Tolerance: five standard
+    errors of 2^18 samples of a variance below 1/4, and the pixels' extent, 1e-4 of c.
+    """
+    a, b, c, albedo = 1.0, 2.0, 0.5, 0.5
+    mirror = mi.ScalarTransform4f().translate([-c, 0, 0]).rotate([0, 1, 0], 90)
+    eye = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
+    film |= {"rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    target = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": {"type": "perspective", "fov": 0.01, "to_world": eye, "film": film},
+            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)},
+            "mirror": {
+                "type": "rectangle",
+                "to_world": mirror.scale([a, b, 1]),
+                "bsdf": {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}},
+            },
+            "sky": {"type": "constant"},
+        }
+    )
+    method = integrator(skip="none", light_paths=light_paths)
+    _, found = divided(method, target, spp=2**14)
+    r = np.hypot(a, c)
+    factor = (np.arctan(b / c) - c / r * np.arctan(b / r)) / np.pi
+    expected = {"emission": 0, "direct": albedo * (1 - factor), "indirect": 0, "caustic": albedo * factor}
+    for name, layer in found.items():
+        assert layer.mean() == pytest.approx(expected[name], abs=5 * 0.5 / 512 + 1e-4), name
+
+
+def by_sampling(target, count, seed, depth):
+    """Means of path layers, (layers, colours), of ``count`` paths by BSDF sampling with Mitsuba's calls."""
+    rng = mi.PCG32(count, seed)
+    u = lambda: mi.Point2f(rng.next_float32(), rng.next_float32())  # noqa: E731
+    ray, weight = target.sensors()[0].sample_ray(mi.Float(0), mi.Float(0.5), u(), mi.Point2f(0.5))
+    throughput, rough, beyond = mi.Spectrum(weight), mi.UInt32(0), mi.Bool(False)
+    total, edges = [mi.Spectrum(0) for _ in NAMES], mi.UInt32(1)
+    context = mi.BSDFContext()
+    for _ in range(depth + 4):  # null events are edges for `path` too, but not for layers
+        si = target.ray_intersect(ray)
+        light = throughput * dr.select(edges <= depth, si.emitter(target).eval(si), 0)
+        of_one = dr.select(beyond, NAMES.index("caustic"), NAMES.index("direct"))
+        layer = dr.select(rough == 0, NAMES.index("emission"), NAMES.index("indirect"))
+        layer = dr.select(rough == 1, of_one, layer)
+        total = [t + dr.select(layer == i, light, 0) for i, t in enumerate(total)]
+        bsdf = si.bsdf()
+        bs, weight = bsdf.sample(context, si, rng.next_float32(), u(), si.is_valid())
+        turned = mi.SurfaceInteraction3f(si)
+        turned.wi = bs.wo
+        density = dr.minimum(bsdf.pdf(context, si, bs.wo), bsdf.pdf(context, turned, si.wi))
+        delta, null = (mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
+        specular = delta | (density >= NARROW)
+        beyond = dr.select(null, beyond, specular & (rough == 1))
+        rough += dr.select(specular | null, mi.UInt32(0), 1)
+        throughput = dr.select(si.is_valid(), throughput * weight, 0)
+        ray, edges = si.spawn_ray(si.to_world(bs.wo)), edges + 1
+        dr.eval(ray, throughput, rough, beyond, total, rng, edges)
+    return np.array([np.array(t).mean(1) for t in total])
+
+
+@cache
+def expected_layers(surfaces, seeds=12):
+    """`by_sampling` for each seed, in the scene of these surfaces."""
+    target = scene(lit=("panel", "globe", "sky"), rfilter="box", **SURFACES[surfaces])
+    return np.array([by_sampling(target, 2**15, seed, 4).ravel() for seed in range(seeds)])
+
+
+def means(target, spp, seeds=12, **parameters):
+    """Means of the layers' colours, (seeds, layers x colours)."""
+    method, found = integrator(max_depth=4, rr_depth=100, **parameters), []
+    for seed in range(seeds):
+        _, parts = divided(method, target, spp=spp, seed=seed)
+        found.append(np.concatenate([parts[name].mean((0, 1)) for name in NAMES]))
+    return np.array(found)
+
+
+LABELS = [f"{name} {colour}" for name in NAMES for colour in "RGB"]
+
+
+@pytest.mark.parametrize(
+    ("surfaces", "parameters"),
+    [
+        ("glass", {"skip": "none", "connections": "one"}),
+        ("glass", {"guiding": "always", "light_paths": 0}),
+        ("near-specular", {"skip": "none", "connections": "all"}),
+        ("near-specular", {"skip": "none", "connections": "one"}),
+        ("near-specular", {"decisions": JOINED}),
+        ("near-specular", {"light_paths": 0}),
+        ("null", {"skip": "none", "connections": "one"}),
+        ("null", {"light_paths": 0}),
+    ],
+    ids=["glass", "guiding", "all", "drawn", "joined", "path tracing", "null", "null by path tracing"],
+)
+def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
+    """Rationale: `by_sampling` counts rough events of paths that it samples from the camera, without any
+    connection. Expected: each layer's mean is the same whichever strategies are in use, by Welch's t-test of
+    the means of 12 renders; that of the image within 1 %."""
+    target = scene(lit=("panel", "globe", "sky"), rfilter="box", **SURFACES[surfaces])
+    expected, found = expected_layers(surfaces), means(target, 32, **parameters)
+    welch.assert_agree(welch.welch(found, expected, labels=LABELS), at_least=8)
+    assert found.mean(0).sum() == pytest.approx(expected.mean(0).sum(), rel=0.01)
+
+
+def test_layers_in_fog():
+    """Expected: with near-specular surfaces in fog, layers by all strategies have the means of those by path
+    tracing, by Welch's t-test of the means of 12 renders; ``indirect`` within 5 %."""
+    target = scene(lit=("panel", "globe", "sky"), medium=fog(), rfilter="box", **SURFACES["near-specular"])
+    found = means(target, 32, skip="none", connections="all")
+    expected = means(target, 64, light_paths=0)
+    welch.assert_agree(welch.welch(found, expected, labels=LABELS), at_least=8)
+    assert (np.abs(found.mean(0) / expected.mean(0) - 1)[6:9] < 0.05).all()
+
+
+@pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
+def test_merged_light_is_caustic(plate):
+    """Rationale: light of a point lamp that the camera sees on a floor under a plate has passed the plate
+    twice, which six edges allow once; smooth or nearly so, merges alone sample it. Expected: all of it is in
+    ``caustic``; with the rough plate, which also shows the lamp itself (``emission``) and whose lobes have
+    tails, less than a tenth is elsewhere."""
+    glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
+    glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
+    target = mi.load_dict(under_glass(point(), plate=glass))
+    image, found = divided(integrator(max_depth=6, merging=True), target, spp=16)
+    np.testing.assert_allclose(sum(found.values()), image, rtol=2e-6, atol=2e-6 * image.max())
+    share = {name: layer.mean() / image.mean() for name, layer in found.items()}
+    if plate == "dielectric":
+        assert share["caustic"] == pytest.approx(1, abs=1e-5)
+    else:
+        assert share["caustic"] > 0.6 and share["caustic"] + share["emission"] > 0.9
+
+
+def test_a_resumed_and_a_joined_render_keep_the_layers():
+    """Expected: a render that goes on from a snapshot has the layers of one in one piece; two renders of
+    different seeds, joined, have the mean of theirs. Tolerance: rounding."""
+    target = scene(rfilter="box")
+    method = integrator(skip="none", spp_per_pass=4, light_groups="auto")
+    whole = np.array(method.render(target, spp=8, seed=3))
+    start = stopped(method, target, 1, spp=8, seed=3)
+    resumed = np.array(method.render(target, spp=8, seed=3, start=start))
+    np.testing.assert_allclose(resumed, whole, **ROUNDING)
+    parts = [stopped(method, target, None, spp=8, seed=seed) for seed in (3, 4)]
+    joined = np.array(method.assemble(parts[0].joined(parts[1]), target), dtype=np.float64)
+    other = np.array(method.render(target, spp=8, seed=4))
+    np.testing.assert_allclose(joined, (resumed + other) / 2, **ROUNDING)
+
+
+def test_without_path_layers_nothing_is_recorded_for_them(monkeypatch):
+    """Rationale: a render without them is to record the same kernels. Expected: no number of events is
+    computed."""
+
+    def refuse(*_, **__):
+        raise AssertionError("recorded for path layers")
+
+    for name in ("sampled", "evaluated", "connected", "__init__"):
+        monkeypatch.setattr(PathLayers, name, refuse)
+    monkeypatch.setattr(sink._Total, "begin", refuse)
+    target = scene(**SURFACES["near-specular"])
+    image, found = divided(bdpt(max_depth=4, skip="none", merging=True), target, spp=1)
+    assert image.max() > 0 and not found
