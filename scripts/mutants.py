@@ -95,7 +95,7 @@ MUTANTS = (
         "image/accumulator.py",
         "zip(*each[: c.splats_of_image], strict=True)",
         "zip(*each, strict=True)",
-        ("tests/images/test_path_layers.py::test_layers_change_nothing_else",),
+        ("tests/images/test_path_layers.py::test_layers_change_nothing_else[all]",),
     ),
     Mutant(
         "light groups: a merge's group is that of the camera's side",

@@ -77,13 +77,14 @@ def test_layers_add_up_to_the_image(parameters, of_scene):
         check_sum(*layers(method, target))
 
 
-def test_layers_change_nothing_else():
+@pytest.mark.parametrize("parameters", [{"skip": "none"}, {"light_paths": 0}], ids=["all", "path tracing"])
+def test_layers_change_nothing_else(parameters):
     """Expected: the image, and the layers of light groups, are those of a render without path layers.
     Tolerance: order of atomic additions."""
-    target = scene(**SURFACES["near-specular"])
-    image, _ = divided(integrator(skip="none", light_groups="auto"), target)
-    _, groups = layers(integrator(skip="none", light_groups="auto"), target)
-    expected, alone = layers(bdpt(max_depth=5, skip="none", light_groups="auto"), target)
+    target, parameters = scene(**SURFACES["near-specular"]), parameters | {"light_groups": "auto"}
+    image, _ = divided(integrator(**parameters), target)
+    _, groups = layers(integrator(**parameters), target)
+    expected, alone = layers(bdpt(max_depth=5, **parameters), target)
     np.testing.assert_allclose(image, expected, rtol=1e-5, atol=2e-6 * image.max())
     for name, layer in alone.items():
         np.testing.assert_allclose(groups[name], layer, rtol=1e-5, atol=2e-6 * image.max())
