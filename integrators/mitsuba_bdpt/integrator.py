@@ -38,7 +38,7 @@ parameters that hold such values. Other warnings name BSDFs that reflect more li
 light that no strategy samples. Entries of ``statistics``: see `mitsuba_bdpt.Statistics`.
 
 Layers of the film, in this order: colours and alpha, Stokes vectors, features, denoised colours, variance,
-light groups, strategies.
+light groups, path layers, strategies.
 
 Scalar and Metal variants, derivatives, renders under ``dr.freeze``, and ``layers`` but ``variance`` on a
 ``specfilm`` raise an error. With participating media edges count as in ``volpath``, and the medium that an
