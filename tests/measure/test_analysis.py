@@ -20,6 +20,7 @@ from mitsuba_bdpt.measure.analysis import Refused, Results
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
+from mitsuba_bdpt.measure.results import load
 from mitsuba_bdpt.measure.scenes import digest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -444,7 +445,8 @@ def test_a_sweep_that_was_cut_has_figures():
 def test_cells_are_numbers_where_nothing_is_wrong():
     """Rationale: cells of errors, energy and bias were dashes, or said "fewer than 8 renders". Expected: of
     three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % / sqrt(3);
-    a squared bias within its noise; no verdict of so few; a single render is called so."""
+    a squared bias within its noise; no verdict of so few, or by a reference of few renders; a single one is
+    called so."""
     rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), spread=0.02) for i in (1, 2, 3)]
     found = Results(rows, {"box": KNOWN}, {})
     energy = found.surplus("box", "bdpt")
@@ -453,8 +455,26 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     assert "| 2.00e-02 |" in line and line.endswith("| +2 % ± 2.5 |") and "–" not in line.split("|")[9]
     checks = report.checks_table(found, MADE, {})
     assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
+    few = Results(rows, {}, {})
+    assert "| the reference has fewer than 8 renders, by `path` |" in report.checks_table(few, MADE, {})
+    assert "| the reference has fewer than 8 renders |" in report.errors_table(few)
     alone = report.errors_table(Results(rows[:1], {"box": KNOWN}, {})).splitlines()[2]
     assert alone.endswith("| fewer than three renders | fewer than two renders |")
+
+
+def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
+    """Rationale: a report of eight scenes was refused since the reference of one had six renders. Expected:
+    its rows are there, without a reference for bias checks."""
+    provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 64, "scene_sha256": "the scene"}
+    kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), None, provenance)
+    file = reference.reference_path(Project(tmp_path), "box", 8, 3)
+    reference.write(file, kept)
+    table = [r | {"reference_sha256": digest(file)} for r in runs("bdpt", 2)]
+    pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
+    found, made = load(Project(tmp_path), tmp_path)
+    assert found.scenes == ["box"] == list(made) and not found.references
+    with pytest.raises(Refused, match="the reference has fewer than 8 renders"):
+        found.bias("box", "bdpt")
 
 
 def test_a_report_has_the_name_of_its_scene_or_preset(results, tmp_path):
@@ -500,6 +520,18 @@ def test_a_report_is_written(results, tmp_path):
     assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet"]
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
+    for text, message in (
+        (
+            "<!-- report: nothing -->\n<!-- end -->\n",
+            "there is no part 'nothing'; there are goals, efficiency",
+        ),
+        ("# Mine\n", "TOP.md has no `<!-- report: NAME -->`"),
+    ):
+        readme.write_text(text)
+        with pytest.raises(CommandError, match=message):
+            report.run(options)
+    readme.write_text("<!-- report: errors -->\n<!-- end -->\n<!-- report: first images -->\n<!-- end -->\n")
+    assert report.run(options) == 0 and "| squared bias |" in readme.read_text()
     for name in ("efficiency", "seconds", "samples", "rays"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
         assert f"({name}.png)" in page

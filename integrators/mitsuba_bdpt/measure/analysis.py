@@ -314,7 +314,8 @@ class Results:
     def bias(self, scene: str, method: str) -> BiasCheck:
         """Return the bias check against the scene's reference."""
         if scene not in self.references:
-            raise Refused("not rendered")
+            there = self.of(scene, method)
+            raise Refused(FEW if there else "not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
     def probed(self, name: str) -> dict[str, list[float]]:
@@ -338,8 +339,10 @@ class Results:
         rows = self.of(scene, method)
         counts = Counter(row["budget"] for row in rows)
         several = [n for n, count in counts.items() if count > 1]
-        if not several or scene not in self.references:
+        if not several:
             raise Refused("fewer than two renders")
+        if scene not in self.references:
+            raise Refused(FEW)
         budget = self.deciding if counts[self.deciding] > 1 else max(several)
         columns = [row["tile_means"] for row in select(rows, budget=budget)]
         share = missing_energy(Means.of(columns, fewest=2).whole, self.references[scene].whole)
@@ -446,6 +449,7 @@ class Results:
 
 
 NOTHING = "all energy is missing"
+FEW = f"the reference has fewer than {FEWEST_RUNS} renders"
 
 
 def missing(check: BiasCheck) -> str:

@@ -2,13 +2,14 @@
 
 Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them. Goals
 and explanations are read from goals.toml and notes.toml, if present. Parts of another Markdown file between
-the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``goals``, ``efficiency`` or
-``gallery`` (of images in ../images/gallery).
+the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``goals``, ``efficiency``,
+``errors``, ``first images`` or ``gallery`` (of images in ../images/gallery).
 """
 
 from __future__ import annotations
 
 import json
+import re
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -204,7 +205,7 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         try:
             verdict = _verdict(results.bias(scene, ours), made[scene].merged)
         except Refused as few:
-            verdict = f"energy {said(_energy, results, scene, ours)} ({few}: no verdict)"
+            verdict = said(_without_verdict, results, scene, ours, few)
         return f"{verdict}, by {_maker(made[scene])}"
 
     columns: dict[str, Callable[[str], object]] = {
@@ -217,6 +218,10 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     }
     of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT, LIGHT_TRACER: LIGHT_TRACER}
     return by_scene(results.scenes, _rendered(results, columns, of))
+
+
+def _without_verdict(results: Results, scene: str, method: str, why: Refused) -> str:
+    return f"energy {_energy(results, scene, method)} ({why}: no verdict)"
 
 
 def _rendered(
@@ -702,13 +707,26 @@ def run(options: Namespace) -> int:
     write_text(folder / "README.md", found.text())
     found.draw(folder)
     if options.readme:
-        readme = options.readme.read_text()
-        for name, part in (
-            ("goals", goals_table(found.results, found.goals)),
-            ("efficiency", efficiency_table(found.results)),
-            ("gallery", gallery(found.results)),
-        ):
-            readme = replace_part(readme, name, part)
-        write_text(options.readme, readme)
+        write_text(options.readme, _filled(options.readme, found))
     print(folder / "README.md")
     return 0
+
+
+def _filled(file: Path, found: Report) -> str:
+    """Return the text of a Markdown file with its parts filled; ``CommandError`` if it has none."""
+    parts = {
+        "goals": lambda: goals_table(found.results, found.goals),
+        "efficiency": lambda: efficiency_table(found.results),
+        "errors": lambda: errors_table(found.results),
+        "first images": lambda: first_images_table(found.results),
+        "gallery": lambda: gallery(found.results),
+    }
+    text = file.read_text()
+    names = re.findall(r"<!-- report: (.*?) -->", text)
+    for name in names:
+        if name not in parts:
+            raise CommandError(f"{file}: there is no part {name!r}; there are {', '.join(parts)}")
+        text = replace_part(text, name, parts[name]())
+    if not names:
+        raise CommandError(f"{file} has no `<!-- report: NAME -->` with an `<!-- end -->`; add one")
+    return text

@@ -27,10 +27,8 @@ from .record import Errors, Row
 from .reference import (
     Reference,
     load_reference,
-    make_command,
     read_reference,
     reference_path,
-    too_few,
 )
 from .scenes import MeasuredScene, digest
 
@@ -335,16 +333,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
                 f"{folder}: the errors in {scene} were taken against another reference; run "
                 f"{project.sweep_command(folder)}, which takes them anew"
             )
-    means = {scene: kept.means for scene, kept in made.items()}
-    if without := [scene for scene, kept in means.items() if kept is None]:
-        raise CommandError(f"{folder}: {too_few(without[0], _reference_command(project, rows, without[0]))}")
+    means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
     file = folder / "probes.json"
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     return analysis.Results(rows, means, measured), made
-
-
-def _reference_command(project: Project, rows: list[Row], scene: str) -> str:
-    """Return the command line that refines the reference of a scene."""
-    row = next(row for row in rows if row["scene"] == scene)
-    called = scene if scene in project.scene_names() else f"{scene}.xml"
-    return make_command(project, called, row["resolution"], row["max_depth"])
