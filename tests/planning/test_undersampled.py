@@ -222,7 +222,10 @@ def test_names_of_objects():
         (frosted(0.01), {"other": other | {"bsdf": frosted(0.01)}}, "bsdf"),
     ):
         (called,) = lost_in(slab(bsdf, optimize=True, **more)).sharp
-        assert called.startswith(f"meshes without id (BSDF '{name}'; ") and "optimize=False" in called
+        assert (
+            called.startswith(f"meshes without id (BSDF '{name}', RoughDielectric; ")
+            and "optimize=False" in called
+        )
 
 
 def test_explain_has_the_warning():

@@ -211,7 +211,8 @@ def _called_shape(shape: mi.Shape) -> str:
     if not name:
         return ""
     if shape.class_name() == "Mesh":
-        return f"meshes without id (BSDF '{name}'; Mitsuba merges meshes of a BSDF unless optimize=False)"
+        merged = "Mitsuba merges meshes of a BSDF unless optimize=False"
+        return f"meshes without id (BSDF '{name}', {bsdf.class_name()}; {merged})"
     return f"a {shape.class_name().lower()} without id (BSDF '{name}')"
 
 
