@@ -191,15 +191,15 @@ MUTANTS = (
     Mutant(
         "undersampled light: merged at every vertex",
         "merging/undersampled.py",
-        "active = found.active & ~is_narrow(found.f.pdf_fwd_w, found.f.pdf_rev_w)",
+        "active = found.active & ~is_narrow(found.f)",
         "active = found.active",
         ("tests/planning/test_undersampled.py::test_a_path_is_merged_once",),
     ),
     Mutant(
         "undersampled light: lamps behind smooth glass count",
         "merging/undersampled.py",
-        "        active &= ~(only_delta & found.photon.delta)",
-        "        pass",
+        "found.photon.delta if kernel.plan.guided else only_delta & found.photon.delta",
+        "mi.Bool(False)",
         ("tests/planning/test_undersampled.py::test_lamps_behind_smooth_glass_are_not_undersampled_lamps",),
     ),
     Mutant(
@@ -717,8 +717,8 @@ MUTANTS = (
     Mutant(
         "pilot: paths that could be guided stay in where their gain is not predicted",
         "planning/pilot.py",
-        "if found is not None or (everything.guidable and not guiding):",
-        "if found is not None:",
+        "prepared.delta if kernel.near_specular else not guiding",
+        "prepared.delta and kernel.near_specular",
         ("tests/images/test_guided_hits.py::test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot",),
     ),
     Mutant(
@@ -1296,6 +1296,92 @@ MUTANTS = (
         ("tests/images/test_guided_hits.py::test_a_lamp_below_the_plate",),
     ),
     Mutant(
+        "near-specular guiding: events are judged from one side",
+        "transport/near_specular.py",
+        "return dr.minimum(f.pdf_fwd_w, f.pdf_rev_w) >=",
+        "return f.pdf_fwd_w >=",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: guided s = 1 is in no weight",
+        "transport/techniques.py",
+        "h.scale(h.combine(alone, own), z.guided)",
+        "h.scale(own, z.guided)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: t = 1 goes on",
+        "transport/techniques.py",
+        "active &= ~y.sds.meets_end(f)",
+        "active &= mi.Bool(True)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: t = 0 goes on",
+        "transport/techniques.py",
+        "active &= ~walk.sds.ends(newest)",
+        "active &= mi.Bool(True)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: inner connections go on",
+        "transport/connections.py",
+        "active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))",
+        "active &= mi.Bool(True)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: connections take no notice of earlier edges",
+        "transport/sds.py",
+        "after = state.scattered(event, coefficient)",
+        "after = replace(state.scattered(event, coefficient), isolated=mi.Bool(True))",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: guided directions may be specular",
+        "transport/photons/guided_hits.py",
+        "active &= ~is_specular(f)",
+        "active &= mi.Bool(True)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: light that rays cannot hit is left out",
+        "transport/sds.py",
+        "isolated = mis.is_used(walk.partial.d_vc)",
+        "isolated = mi.Bool(True)",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: pilots leave out the light at any gain",
+        "planning/pilot.py",
+        "LEAST_REDUCTION = 8.0",
+        "LEAST_REDUCTION = 0.0",
+        ("tests/images/test_near_specular_guiding.py::test_pilots_of_any_seed_decide_alike[0.1-False]",),
+    ),
+    Mutant(
+        "near-specular guiding: guided light counts as undersampled",
+        "merging/undersampled.py",
+        "found.photon.delta if kernel.plan.guided else only_delta",
+        "only_delta",
+        ("tests/images/test_near_specular_guiding.py::test_guided_light_is_not_undersampled",),
+    ),
+    Mutant(
         "merging: delta events leave d_vm as it is",
         "transport/mis.py",
         "heuristic.scale(partial.d_vm, step.cos_out),",
@@ -1361,8 +1447,8 @@ MUTANTS = (
     Mutant(
         "hard paths: only t = 0 knows of merges on the light's side",
         "transport/kernel.py",
-        "plan.arrival or kernel.merges_hard",
-        "plan.arrival",
+        "sds = kernel.sds if plan.arrival or near_specular else None",
+        "sds = kernel.sds if plan.arrival else None",
         ("tests/transport/test_oracle.py::test_kernel_with_merges_on_hard_paths[power-n1c1-False-0.0]",),
     ),
     Mutant(

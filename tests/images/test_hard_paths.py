@@ -4,7 +4,6 @@ The scenes are those of `test_merging` with a rough plate. Large lamps are found
 too: all strategies must give one mean. Photons in discs of a quarter of a pixel, whose blur is below noise.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
 import internals
@@ -19,16 +18,19 @@ from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import light_path, mis
 from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
-    IOR,
+    NEAR_SPECULAR,
     SIZE,
     ball,
-    bumpy,
     images,
     matte,
+    near_specular_scene,
     point,
+    principled,
+    rough,
     strategy_images,
     transform,
     under_glass,
+    without_photons,
 )
 from snapshots import ROUNDING
 
@@ -46,71 +48,16 @@ def many_photons(monkeypatch):
     monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", 1)
 
 
-def rough(alpha):
-    return {"type": "roughdielectric", "alpha": alpha, "int_ior": IOR, "ext_ior": 1.0}
-
-
-def principled(roughness):
-    found = {"type": "principled", "spec_trans": 1.0, "roughness": roughness, "eta": IOR}
-    return found | {"base_color": {"type": "rgb", "value": 1.0}}
-
-
-def ramp():
-    """Glass whose alpha grows along the plate from .002 to .4, by a factor in each texel."""
-    row = np.geomspace(0.002, 0.4, 16, dtype=np.float32)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.tile(row, (2, 1))[..., None]), "raw": True}
-    return {"type": "roughdielectric", "alpha": texture, "int_ior": IOR, "ext_ior": 1.0}
-
-
-def steel(alpha):
-    """A mirror of rough metal beside the floor, in which the camera sees it."""
-    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
-
-
-def sheet():
-    """A plate of one side: rough light is scattered once."""
-    return {"type": "rectangle", "to_world": transform().translate([0, 0, 0.5]).scale(4)}
-
-
-CASES = {
-    "alpha .005": {"plate": rough(0.005)},
-    "alpha .03": {"plate": rough(0.03)},
-    "alpha .15": {"plate": rough(0.15)},
-    "ramp": {"plate": ramp},
-    "principled": {"plate": principled(0.1)},
-    "blend": {"plate": {"type": "blendbsdf", "weight": 0.4, "a": rough(0.01), "b": rough(0.3)}},
-    "bumpy": {"plate": bumpy},
-    "steel": {"plate": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}, "mirror": steel(0.02)},
-    "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
-    "lens": {"plate": rough(0.02), "kind": "thinlens"},
-}
-
-
-@cache
-def scene(case):
-    more = dict(CASES[case])
-    if callable(more["plate"]):
-        more["plate"] = more["plate"](rough(0.02)) if more["plate"] is bumpy else more["plate"]()
-    return mi.load_dict(under_glass(ball(), **more))
-
-
-@cache
-def without_merging(case):
-    """Tiles of the scene without merging."""
-    return st.tiles(images(scene(case), 256, 8, first=100, guiding="never"))
-
-
 def merged(case, seeds=8, spp=128, **parameters):
-    return st.tiles(images(scene(case), spp, seeds, **MERGED, **parameters))
+    return st.tiles(images(near_specular_scene(case), spp, seeds, **MERGED, **parameters))
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", NEAR_SPECULAR)
 def test_images_are_those_without_merging(case):
     """Rationale: the gate, the weights and the bounds change which strategy finds a path, not how much light
     it carries; across the gate (a ramp of alpha) nothing may jump. Expected: the same tiles by Welch's test.
     """
-    st.assert_agree(st.compare_images(merged(case), without_merging(case)), at_least=12)
+    st.assert_agree(st.compare_images(merged(case), without_photons(case)), at_least=12)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +76,7 @@ def test_any_choice_of_strategies_has_the_same_mean(parameters):
     the stored vertices of light subpaths no path is hard. Expected: the same tiles by Welch's test.
     """
     found = merged("alpha .03", **parameters)
-    st.assert_agree(st.compare_images(found, without_merging("alpha .03")), at_least=12)
+    st.assert_agree(st.compare_images(found, without_photons("alpha .03")), at_least=12)
 
 
 LIGHTS = {
@@ -285,12 +232,14 @@ def test_stored_vertices_keep_their_merges():
         edges=mi.UInt32(1),
         hit=mi.Bool(True),
         volume=None,
+        sds=None,
         layer=None,
         connectible=lambda: mi.Bool(True),
     )
     kernel = SimpleNamespace(
         store_size=2,
         merges_hard=True,
+        guides_near_specular=False,
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
         path_layers=None,

@@ -261,3 +261,32 @@ class Hard(Explicit):
         self.hard = (total >= 0) & np.isfinite(merges).any(1)
         merges = np.where(self.hard[:, None], merges, -np.inf)
         self._take(np.concatenate([size, merges], axis=1))
+
+
+class Guided(Explicit):
+    """All strategies of ``paths``, with photon guiding through near-specular events, see `sds`.
+
+    Events with at least the density ``least`` from both sides count as specular beside delta ones. An SDS
+    path has no edge between two other vertices whose connection is in use. ``sds``: mask of those with
+    another vertex, from emitters that can be hit: s = 0 and s = 1, and the same two (further columns) with a
+    guided direction at the first vertex that is not specular, seen from the emitter; ``guide`` (n, k + 1):
+    density of that direction at each vertex, as an attribute at the one that guides.
+    """
+
+    def __init__(self, paths: Paths, coefficients: Coefficients, guide, least: float):
+        super().__init__(paths, coefficients)
+        k, n, size = paths.k, len(paths.kind), self.size
+        specular = paths.delta | (np.minimum(paths.to_camera, paths.to_light) >= least)
+        specular[:, [0, k]] = False
+        used = np.array([coefficients.of(e + 1, k) > 0 for e in range(k)])  # s = e + 1 connects edge e
+        connectible = ~specular[:, :-1] & ~specular[:, 1:] & used
+        diffuse = ~specular[:, 1:k]
+        self.sds = ~connectible.any(1) & diffuse.any(1) & ~paths.delta_emitter
+        last = diffuse.argmax(1) + 1 if k > 1 else np.zeros(n, dtype=int)
+        rows = np.arange(n)
+        self.guide = guide[rows, last].astype(np.float64)
+        ratio = np.log(self.guide / paths.to_light[rows, last])
+        guided = np.where(self.sds[:, None], size[:, :2] + ratio[:, None], -np.inf)
+        size = np.concatenate([size, guided], axis=1)
+        size[self.sds, 2 : k + 2] = -np.inf
+        self._take(size)

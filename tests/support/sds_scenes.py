@@ -1,9 +1,12 @@
 """Scenes of SDS paths: a floor under a plate of glass, lamp and camera above."""
 
+from functools import cache
+
 import internals
 import mitsuba as mi
 import numpy as np
 import views
+import welch as st
 
 LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 
@@ -104,3 +107,54 @@ def strategy_images(scene, spp, seeds, **more):
     names = method.aov_names()
     assert found.shape[-1] == 3 + len(names)
     return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
+
+
+def rough(alpha):
+    return {"type": "roughdielectric", "alpha": alpha, "int_ior": IOR, "ext_ior": 1.0}
+
+
+def principled(roughness):
+    found = {"type": "principled", "spec_trans": 1.0, "roughness": roughness, "eta": IOR}
+    return found | {"base_color": {"type": "rgb", "value": 1.0}}
+
+
+def ramp():
+    """Glass whose alpha grows along the plate from .002 to .4, by a factor in each texel."""
+    row = np.geomspace(0.002, 0.4, 16, dtype=np.float32)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.tile(row, (2, 1))[..., None]), "raw": True}
+    return {"type": "roughdielectric", "alpha": texture, "int_ior": IOR, "ext_ior": 1.0}
+
+
+def steel(alpha):
+    """A mirror of rough metal beside the floor, in which the camera sees it."""
+    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
+
+
+# Near-specular lobes, between what is a delta lobe and what is none.
+NEAR_SPECULAR = {
+    "alpha .005": {"plate": rough(0.005)},
+    "alpha .03": {"plate": rough(0.03)},
+    "alpha .15": {"plate": rough(0.15)},
+    "ramp": {"plate": ramp},
+    "principled": {"plate": principled(0.1)},
+    "blend": {"plate": {"type": "blendbsdf", "weight": 0.4, "a": rough(0.01), "b": rough(0.3)}},
+    "bumpy": {"plate": bumpy},
+    "steel": {"plate": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}, "mirror": steel(0.02)},
+    "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
+    "lens": {"plate": rough(0.02), "kind": "thinlens"},
+}
+
+
+@cache
+def near_specular_scene(case):
+    more = dict(NEAR_SPECULAR[case])
+    if callable(more["plate"]):
+        more["plate"] = more["plate"](rough(0.02)) if more["plate"] is bumpy else more["plate"]()
+    return mi.load_dict(under_glass(ball(), **more))
+
+
+@cache
+def without_photons(case):
+    """Tiles of `near_specular_scene` without photons."""
+    return st.tiles(images(near_specular_scene(case), 256, 8, first=100, guiding="never"))

@@ -47,11 +47,12 @@ class Undersampled:
         """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
 
         Only where the vertex is not near-specular itself: the path is merged there alone. Light of emitters
-        that rays can hit counts only behind a near-specular event; ``only_delta``: none came before ``z``.
+        that rays can hit counts only behind a near-specular event; ``only_delta``: none came before ``z``. It
+        does not count where photons guide s = 0.
         """
         expected = self.expected(kernel, merging, z, found)
-        active = found.active & ~is_narrow(found.f.pdf_fwd_w, found.f.pdf_rev_w)
-        active &= ~(only_delta & found.photon.delta)
+        active = found.active & ~is_narrow(found.f)
+        active &= ~(found.photon.delta if kernel.plan.guided else only_delta & found.photon.delta)
         kind = mi.UInt32(0)
         for bound in KINDS[:-1]:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)

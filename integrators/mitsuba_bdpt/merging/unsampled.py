@@ -19,6 +19,7 @@ from ..sampling.points import Points
 from ..transport import subpaths
 from ..transport.batch import Batch, Places
 from ..transport.inputs import Kernel, Observer
+from ..transport.near_specular import NARROW
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import Kept
@@ -103,7 +104,7 @@ def _merged(
     delta = undersampled is None
     if not delta:
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
-    side = replace(side, connect=None, only_delta=delta, only_specular=not delta, sds=None)
+    side = replace(side, connect=None, only_delta=delta, only_specular=0 if delta else NARROW, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, len(kernel.scene.emitters()) * channels)
 

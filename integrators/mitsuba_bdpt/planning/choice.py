@@ -72,6 +72,9 @@ NEAR = 1.15
 # outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
 GUIDE_GAIN = 3.0
 
+# The same in scenes with near-specular lobes, where the trimmed error falls too (`pilot.LEAST_REDUCTION`).
+NEAR_SPECULAR_GAIN = 1.0
+
 # Bootstrap resamplings of a pilot's groups, see `confidence`.
 RESAMPLINGS = 100
 
@@ -84,13 +87,19 @@ class Alternatives:
     """The ``candidates`` for a render with ``samples`` samples still to come.
 
     ``stratified``: whether its points are stratified, see `moments.Moments.variance`; ``guidable``: whether
-    photon-guided BSDF sampling is possible.
+    photon-guided BSDF sampling is possible; ``near_specular``: the scene has near-specular lobes.
     """
 
     candidates: list[Configuration]
     stratified: bool
     samples: float = math.inf
     guidable: bool = False
+    near_specular: bool = False
+
+    @property
+    def guide_gain(self) -> float:
+        """The gain from which on photon-guided BSDF sampling pays."""
+        return NEAR_SPECULAR_GAIN if self.near_specular else GUIDE_GAIN
 
 
 @dataclass(frozen=True)
@@ -137,7 +146,7 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """
     table = _unguided(moments, alternatives)
     guided = _guided(moments, alternatives, table)
-    return [guided, *table] if guided and guided.gain >= GUIDE_GAIN else table
+    return [guided, *table] if guided and guided.gain >= alternatives.guide_gain else table
 
 
 def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> float:
@@ -219,16 +228,18 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
     return f"a sample of it costs {more:.2f} times as much: it has to gain {needed}, and gains {gain:.2f}x"
 
 
-def left_out(table: list[Prediction], guided: float = 0.0, name: str = "guided s=0") -> list[dict[str, str]]:
+def left_out(
+    table: list[Prediction], guided: float = 0.0, least: float = GUIDE_GAIN, name: str = "guided s=0"
+) -> list[dict[str, str]]:
     """What the best of `choose` leaves out, and why, as in ``statistics["skipped"]``.
 
-    ``guided``: the `guided_gain` of the class ``name``.
+    ``guided``: the `guided_gain` of the class ``name``, which needs ``least``.
     """
     skipped: list[dict[str, str]] = []
     if guided and not table[0].candidate.guided:
         why = (
             f"guiding gains {guided:.2f}x or more in three quarters of the pilot's parts, outliers "
-            f"included, and has to gain {GUIDE_GAIN:g}x"
+            f"included, and has to gain {least:g}x"
         )
         skipped.append({"class": name, "level": "not worth its cost here", "why": why})
     without: dict[str, Callable[[Configuration], bool]] = {

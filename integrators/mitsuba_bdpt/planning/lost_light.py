@@ -127,7 +127,7 @@ def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -
     if not is_undersampling_possible(prepared, settings):
         return known
     strategies = plan.arrival, plan.endpoints, plan.connections, plan.joined, plan.camera_paths_per_light_path
-    return *known, *strategies, plan.emission is None, max(samples, PREVIEW)
+    return *known, *strategies, plan.emission is None, plan.guided > 0, max(samples, PREVIEW)
 
 
 def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW) -> LostLight:

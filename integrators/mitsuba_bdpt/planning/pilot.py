@@ -82,6 +82,10 @@ SELDOM = 16
 # Lanes that run a loop together.
 PACKET = 16
 
+# With near-specular lobes, where other strategies sample guidable light too, guiding is possible where it
+# lowers the light's second moment by this factor; see experiments, "Photon-guided BSDF sampling".
+LEAST_REDUCTION = 8.0
+
 # `Counters` of light subpaths only.
 _OF_LIGHT = ("light", "shadow_t1")
 
@@ -285,7 +289,8 @@ def measure(
 
     Each represents ``stands_for`` samples of the render. ``guiding``: predict the gain of photon-guided BSDF
     sampling where possible, with two more kernels. Guidable light is in no sample either way: its outliers
-    would hide the differences of the candidates.
+    would hide the differences of the candidates. Of light through near-specular lobes only where guiding may
+    pay.
     """
     everything = replace(
         plan,
@@ -302,8 +307,12 @@ def measure(
     guiding = guiding and everything.guidable
     if guiding:
         found = sds_light.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
-    if found is not None or (everything.guidable and not guiding):
-        kernel.sds = Unguided()
+    if found is not None and kernel.near_specular and found.reduction < LEAST_REDUCTION:
+        found = None
+    if found is not None:
+        kernel.sds = Unguided(kernel.near_specular)
+    elif everything.guidable and (prepared.delta if kernel.near_specular else not guiding):
+        kernel.sds = Unguided(near_specular=False)
     region, emission = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
         kernel.cells = components.guided_emission.Cells(prepared.emitters)

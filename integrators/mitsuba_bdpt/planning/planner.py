@@ -179,7 +179,7 @@ class Planner:
             name = "merging" if self.full.merging else "guided s=0"
             unguided = table[0].candidate.emission is None
             left_out = (
-                *choice.left_out(table, gain, name),
+                *choice.left_out(table, gain, alternatives.guide_gain, name),
                 *UNMEASURED * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
@@ -344,7 +344,9 @@ class Planner:
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """The alternatives for ``samples`` samples still to come."""
         possible = candidates(self._prepared, self.full, self._settings)
-        return choice.Alternatives(possible, self._settings.points == "sobol", samples, self.full.guidable)
+        near_specular = bool(self._prepared.near_specular)
+        stratified = self._settings.points == "sobol"
+        return choice.Alternatives(possible, stratified, samples, self.full.guidable, near_specular)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Expected number of samples still to come."""

@@ -46,7 +46,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     specular = prepared.delta or bool(prepared.near_specular)
     why = _why_not_merging(emitters, specular, bool(direct), "specular") if settings.merging else ""
     merging = skip("merging", "impossible", why) if why else settings.merging
-    why = _why_not_guided(prepared, settings, bool(hit), bool(direct))
+    why = _why_not_guided(prepared, settings, bool(hit), bool(direct), specular)
     if why and settings.guiding == "always":
         skip("guided s=0", "impossible", why)
     guidable = not why
@@ -190,7 +190,9 @@ def _why_not_merging(emitters: Emitters, some: bool, direct: bool, kind: str) ->
 SHORTEST = 3
 
 
-def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
+def _why_not_guided(
+    prepared: PreparedScene, settings: Settings, hit: bool, direct: bool, specular: bool
+) -> str:
     """Why s = 0 cannot be guided, or does not gain by it; empty if neither."""
     if prepared.space is not None:
         return "photons in scenes with participating media are not traced"
@@ -202,7 +204,7 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
         return f"max_depth={settings.max_depth} allows no such path"
     if prepared.emitters.contrast <= EVEN:
         return "s=0 finds a uniform environment by itself"
-    return _why_not_merging(prepared.emitters, prepared.delta, direct, "delta")
+    return _why_not_merging(prepared.emitters, specular, direct, "specular")
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -25,6 +27,9 @@ from .moments import FINE, GROUPS, SDSLight, tile_of
 # Camera samples (most subpaths end at once); photon subpaths of the estimate, and the most of the guide.
 LANES, PHOTONS = 1 << 14, 1 << 16
 
+# Camera subpaths per light subpath of the estimate's weights.
+CAMERA_PATHS = 4
+
 # Estimates of s = 0 above the arriving light times ``samples`` / SHARE are dropped: a render rarely samples
 # such light, so that it adds no noise to the image.
 SHARE = 16
@@ -37,15 +42,16 @@ def measure(
 
     ``samples``: camera samples of the render. None without photons.
     """
+    plan = replace(plan, camera_paths_per_light_path=CAMERA_PATHS)
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
-    aim = Aim.of(prepared.scene, prepared.emitters)
+    aim = Aim.of(prepared.scene, prepared.emitters, prepared.near_specular)
     made = [
         trace_guide(kernel, aim, Points("sobol", sequence_seed(seed, GUIDE + number)), count)[0]
         for number, count in enumerate((PHOTONS, min(photons_of(int(samples)), PHOTONS)))
     ]
     if made[0] is None or made[1] is None:
         return None
-    kernel.sds = Unguided()
+    kernel.sds = Unguided(kernel.near_specular)
     counts = dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, samples / SHARE)
     estimator = Estimator(made[0], made[1], *counts)
     region = prepared.camera.region

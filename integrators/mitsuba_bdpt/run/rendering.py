@@ -94,7 +94,7 @@ class Render:
         dr.make_opaque(seed)
         self.points = PassPoints(settings, seed)
         aims = self.plan.merging or self.plan.guidable
-        near_specular = self.prepared.near_specular if self.plan.merging else ()
+        near_specular = self.prepared.near_specular
         self.aim = Aim.of(scene, self.prepared.emitters, near_specular) if aims else None
         self.merging = None
         if self.plan.merging:
@@ -254,7 +254,7 @@ class Render:
             self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
         if self.plan.guided:
             guide = self._guide()
-            self.kernel.sds = None if guide is None else Guiding(guide)
+            self.kernel.sds = None if guide is None else Guiding(guide, self.kernel.near_specular)
         if self.plan.merging and self.merging is not None:
             self.kernel.sds = self._photons(step, self.merging)
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):

@@ -25,6 +25,7 @@ from .contribution import (
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .path_layers import INDIRECT
+from .sds import meets
 from .sketches import Sketch, guess
 from .visibility import ShadowRay, guessed, seen
 from .walk import Vertex, hard_merges, is_lit, newest_coefficient, where_lit
@@ -58,6 +59,8 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     at_z = newest_z, f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
     light_side, camera_side = mis.alternatives(h, y.partial, *at_y), mis.alternatives(h, z.partial, *at_z)
     sides, own = (kernel.kappa.inner, light_side, camera_side), kernel.kappa.inner
+    if kernel.guides_near_specular:
+        active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
     merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
     weight, shares = h.weigh(*sides, merges=merges)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)

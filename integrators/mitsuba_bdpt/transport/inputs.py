@@ -123,6 +123,8 @@ class Kernel:
         self.inverse_threshold = f32(dr.inf)
         # The further strategy for SDS paths: that of a pass, or None.
         self.sds: SdsStrategy | None = None
+        # Whether photons guide through near-specular events too.
+        self.near_specular = bool(prepared.near_specular)
         # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
         self.light_groups: LightGroups | None = None
         # Path layers, likewise (`Contribution.path_layer`).
@@ -145,6 +147,11 @@ class Kernel:
     def merges_hard(self) -> bool:
         """Whether hard paths are merged."""
         return self.sds is not None and self.sds.hard
+
+    @property
+    def guides_near_specular(self) -> bool:
+        """Whether near-specular events count as specular, see `sds`."""
+        return self.sds is not None and self.sds.near_specular
 
     def use_light_groups(self, groups: LightGroups):
         """Let contributions store their light group."""

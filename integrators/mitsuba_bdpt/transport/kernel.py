@@ -232,8 +232,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
-    # t = 0 samples SDS paths, other strategies hard ones too.
-    sds = kernel.sds if plan.arrival or kernel.merges_hard else None
+    # t = 0 samples SDS paths; other strategies do so with near-specular events.
+    near_specular = kernel.merges_hard or kernel.guides_near_specular
+    sds = kernel.sds if plan.arrival or near_specular else None
     walk = subpaths.light_walk(kernel, e, stream, shared, sds)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)
     state = path, counted_by_light(plan, kernel.space)
@@ -304,7 +305,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             )
             counters = replace(counters, non_finite=lost)
         if plan.direct:
-            c = contribution.drop_non_finite(techniques.next_event(kernel, z, sample.stream))
+            c = contribution.drop_non_finite(techniques.next_event(kernel, z, sample.stream, kernel.sds))
             total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
         if plan.connections != "none":
             total, counted = sink.connect(kernel, z, lane, sample.stream, total, start)

@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..geometry import polarization, rays
 from . import mis
 from .inputs import KEPT, Kernel
+from .sds import State
 from .sketches import Sketch, Sketches
 from .walk import Vertex, newest_coefficient, volume_cosine
 
@@ -23,7 +24,7 @@ class StoredVertex:
     geometric cosine of incidence |n.wi|, the constant part of the adjoint factor |n.wo| / |n.wi| (in volumes
     both are 1); ``partial``: partial sums in the area measure; ``edges`` up to it, s - 1; ``anchor``: starts
     rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media; ``light_group``: see
-    `Contribution`; ``layer``: see `Vertex`, None where connections do not need it.
+    `Contribution`; ``layer``: see `Vertex`, None where connections do not need it; ``sds``: see `Vertex`.
     """
 
     si: mi.SurfaceInteraction3f
@@ -35,6 +36,7 @@ class StoredVertex:
     medium: mi.UInt32 | None = None
     light_group: mi.UInt32 | None = None
     layer: mi.UInt32 | None = None
+    sds: Any = None  # a `State`
 
     @property
     def volume(self) -> mi.Bool | None:
@@ -57,6 +59,7 @@ class StoredVertex:
             edges=vertex.edges,
             medium=None if vertex.volume is None else dr.select(vertex.volume, vertex.edge.medium, 0),
             layer=vertex.layer,
+            sds=vertex.sds,
         )
 
 
@@ -104,7 +107,8 @@ class LightPath:
     offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vn``, where hard
     paths are merged; ``s``: light vertices up to and including each; ``count``: number of stored vertices;
     ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
-    ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`.
+    ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`; ``flags``: of its
+    ``sds``, where near-specular events count as specular.
     """
 
     si: dr.Local[mi.SurfaceInteraction3f]
@@ -121,6 +125,7 @@ class LightPath:
     layers: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
     sketches: Any = None  # `Sketches`, for draws by approximation
+    flags: dr.Local[mi.UInt32] | None = None
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
@@ -142,7 +147,20 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
         layers=dr.alloc_local(mi.UInt32, size) if layered else None,
         sketches=Sketches.allocate(kernel, size) if several else None,
+        flags=dr.alloc_local(mi.UInt32, size) if kernel.guides_near_specular else None,
     )
+
+
+def _flags(sds: State) -> mi.UInt32:
+    """The flags of a light vertex, as bits."""
+    bits = enumerate((sds.isolated, sds.specular, sds.diffuse))
+    return sum((dr.select(flag, mi.UInt32(1 << i), 0) for i, flag in bits), mi.UInt32(0))
+
+
+def _of_flags(bits: mi.UInt32) -> State:
+    """The inverse of `_flags`."""
+    isolated, specular, diffuse = ((bits & (1 << i)) != 0 for i in range(3))
+    return State(isolated=isolated, specular=specular, diffuse=diffuse)
 
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
@@ -164,6 +182,8 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     path.s.write(y.edges + 1, slot, keep)
     if path.medium is not None:
         path.medium.write(y.medium, slot, keep)
+    if path.flags is not None:
+        path.flags.write(_flags(y.sds), slot, keep)
     if path.light_groups is not None:
         path.light_groups.write(path.light_group, slot, keep)
     if path.layers is not None:
@@ -207,4 +227,5 @@ def read_light_vertex(
         medium=None if path.medium is None else path.medium.read(slot, active),
         light_group=path.light_group if groups is None else groups.read(slot, active),
         layer=None if path.layers is None else path.layers.read(slot, active),
+        sds=None if path.flags is None else _of_flags(path.flags.read(slot, active)),
     )

@@ -82,10 +82,14 @@ class Merge:
 
 def is_connectible(partial: Partial, coefficient: Coefficient):
     """Mask: a strategy with this ``coefficient`` connects the edge to the vertex."""
+    return mi.Bool(False) if is_absent(coefficient) else (partial.d_vcm > 0) & is_used(coefficient)
+
+
+def is_used(coefficient: Coefficient):
+    """Mask: this ``coefficient``, or partial sum, is not 0 in any class."""
     if is_absent(coefficient):
         return mi.Bool(False)
-    used = dr.max(coefficient) if isinstance(coefficient, mi.Vector4f) else coefficient
-    return (partial.d_vcm > 0) & (used > 0)
+    return (dr.max(coefficient) if isinstance(coefficient, mi.Vector4f) else coefficient) > 0
 
 
 def is_absent(x: PartialSum) -> bool:

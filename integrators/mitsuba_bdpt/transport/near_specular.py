@@ -24,6 +24,10 @@ from ..host.introspection import number, own_parameters
 # .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
 NARROW = 20.0
 
+# Least density (1 / sr) from both sides of an event through which photons guide; see experiments,
+# "Photon-guided BSDF sampling".
+GUIDED = 4.0
+
 # Points at which textures are evaluated, and samples of a BSDF of another class.
 _TEXTURE_POINTS, _SAMPLES = 4096, 4096
 
@@ -53,9 +57,12 @@ def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> lis
     return [(bsdf, found[id(bsdf)]) for bsdf, _ in family if found[id(bsdf)] >= NARROW]
 
 
-def is_narrow(pdf_fwd_w, pdf_rev_w):
-    """Mask: near-specular scattering, by its densities from both sides, so that both subpaths agree."""
-    return dr.minimum(pdf_fwd_w, pdf_rev_w) >= NARROW
+def is_narrow(f, least: float | None = None):
+    """Mask: near-specular scattering, by its densities from both sides, so that both subpaths agree.
+
+    ``f``: an `Evaluation`, or a `Step` that is not delta; ``least`` density, by default `NARROW`.
+    """
+    return dr.minimum(f.pdf_fwd_w, f.pdf_rev_w) >= (NARROW if least is None else least)
 
 
 def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:

@@ -60,7 +60,7 @@ class PathLayers:
     def _is_narrow(self, event: Step | Evaluation, volume: mi.Bool | None) -> mi.Bool:
         if not self.near_specular:
             return mi.Bool(False)
-        narrow = is_narrow(event.pdf_fwd_w, event.pdf_rev_w)
+        narrow = is_narrow(event)
         return narrow if volume is None else narrow & ~volume
 
 

@@ -7,15 +7,22 @@ edge: emitter, glass, wall, glass, camera. Of the classes of `Plan` only s = 0 a
 has at most one further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at
 fixed points. In scenes with near-specular lobes it samples *hard* paths instead, see `mis`: connectible, but
 too rarely. Which these are is decided by densities, without a `State`.
+
+In such scenes photon-guided BSDF sampling takes for specular every event that is delta or near-specular from
+both sides (`is_specular`), a function of the path on which all strategies agree. Unlike delta events, these
+could be connected. On SDS paths with a diffuse vertex from emitters that rays can hit, all strategies but
+s = 0 and s = 1, guided or not, are left out: they rarely sample them, and need not know the guide's density.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mitsuba as mi
 
 from . import mis
+from .near_specular import GUIDED, is_narrow
 
 
 @dataclass
@@ -25,13 +32,54 @@ class State:
     ``isolated``: no edge is connectible; ``only_delta``, on light subpaths with guiding: all events were
     delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
     (s = 0 by the guide, or by the BSDF) over its own; ``survived``, on photon subpaths of hard paths: the
-    probability with which `SdsStrategy.survival` let it go on.
+    probability with which `SdsStrategy.survival` let it go on. Where near-specular events count as specular
+    ``specular``: the last event was; ``diffuse``: one before the next vertex was not.
     """
 
     isolated: mi.Bool | None = None
     only_delta: mi.Bool | None = None
     guided: mi.Float | None = None
     survived: mi.Float | None = None
+    specular: Any = None
+    diffuse: Any = None
+
+    def scattered(self, specular: mi.Bool, coefficient: mis.Coefficient) -> State:
+        """The state after an event; ``coefficient`` of the connection of the edge to it."""
+        isolated = ~self.is_connectible(specular, coefficient) & self.isolated
+        return replace(self, isolated=isolated, specular=specular, diffuse=self.diffuse | ~specular)
+
+    def is_connectible(self, specular: mi.Bool | bool, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: a strategy connects the edge to the next vertex, whose event is ``specular``."""
+        return ~(self.specular | specular) & mis.is_used(coefficient)
+
+    def ends(self, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: an SDS path with a diffuse vertex if the next vertex, of the edge's class, is its end."""
+        return self.isolated & self.diffuse & ~self.is_connectible(False, coefficient)
+
+    def meets_end(self, f) -> mi.Bool:
+        """Mask: an SDS path with a diffuse vertex if the next one, with BSDF ``f``, is connected to the end.
+
+        The strategy is in use.
+        """
+        return self.isolated & self.diffuse & is_specular(f)
+
+
+def meets(a: tuple, b: tuple) -> mi.Bool:
+    """Mask: an SDS path with a diffuse vertex if two subpaths are connected, by a strategy in use.
+
+    Of each its `State`, BSDF at the vertex, and coefficient of the connection of the last edge.
+    """
+    possible, specular, diffuse = mi.Bool(True), mi.Bool(False), mi.Bool(False)
+    for state, f, coefficient in (a, b):
+        event = is_specular(f)
+        after = state.scattered(event, coefficient)
+        possible, specular, diffuse = possible & after.isolated, specular | event, diffuse | after.diffuse
+    return possible & specular & diffuse
+
+
+def is_specular(f) -> mi.Bool:
+    """Mask: a near-specular event, which photons guide through; ``f`` as in `near_specular.is_narrow`."""
+    return is_narrow(f, GUIDED)
 
 
 @dataclass
@@ -52,12 +100,13 @@ class SdsStrategy:
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
     subpaths use, or None; ``hard``: it samples hard paths, and `weighed`, `may_merge`, `kept` and `survival`
-    are defined.
+    are defined; ``near_specular``: near-specular events count as specular, and `counts` is defined.
     """
 
     counters: tuple[str, ...] = ()
     wavelengths = None
     hard = False
+    near_specular = False
 
     def weighed(self, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.Merge`."""
@@ -113,9 +162,21 @@ class SdsStrategy:
         """
         return sides, active
 
+    def counts(self, active: mi.Bool, on_sds_path: mi.Bool) -> mi.Bool:
+        """Mask: contributions of s = 0 and s = 1 that count."""
+        raise NotImplementedError(f"{type(self).__name__} does not guide through near-specular events")
+
     def arrive(self, kernel, merges: mis.PartialSum, emission) -> mis.PartialSum:
         """Alternatives of t = 0; ``merges``: ``d_vm`` times the density from the sensor."""
         return merges
+
+
+def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **more):
+    """``walk`` with the `State` of a subpath along which near-specular events count as specular."""
+    no, isolated = mi.Bool(False), mi.Bool(True)
+    if light:  # s = 0 is its only alternative so far
+        isolated = mis.is_used(walk.partial.d_vc)
+    return begun(walk, State(isolated=isolated, guided=guided, specular=no, diffuse=no), **more)
 
 
 def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vn: mis.PartialSum = 0):

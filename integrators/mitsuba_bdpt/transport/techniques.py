@@ -68,7 +68,12 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
         h.scale(z.partial.d_vc, older),
     )
     sides = 0, camera_side
-    if sds is not None:
+    if sds is not None and sds.near_specular:
+        on_sds_path = z.sds.ends(mis.choose(directly, kernel.kappa.endpoints, direct))
+        alone = h.scale(z.partial.d_vcm, newest)
+        sides = _beside_guided(kernel, z, on_sds_path, sides, alone, kernel.kappa.hit)
+        active = sds.counts(active, on_sds_path)
+    elif sds is not None:
         connectible = mis.is_connectible(z.partial, newest)
         sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
     merges = hard_merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
@@ -82,6 +87,20 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(emitters.index_of_hit(z.si, active), active)
     return c
+
+
+def _beside_guided(
+    kernel: Kernel, z: Vertex, on_sds_path, sides: tuple, alone, own: mis.Coefficient
+) -> tuple:
+    """Light and camera ``sides`` of s = 0 or s = 1, where near-specular events count as specular.
+
+    On an SDS path the only alternatives are the other of the two, ``alone``, and both from a direction at the
+    diffuse vertex by the guide (on guided subpaths: by the BSDF). ``own``: coefficient of the strategy.
+    """
+    h = kernel.heuristic
+    if z.guided is not None:
+        alone = h.combine(alone, h.scale(h.combine(alone, own), z.guided))
+    return mis.choose(on_sds_path, alone, sides[0]), mis.choose(on_sds_path, 0, sides[1])
 
 
 def _known(value, *pdfs):
@@ -105,8 +124,11 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
 
 
-def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
-    """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45)."""
+def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: SdsStrategy | None) -> Contribution:
+    """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45).
+
+    ``sds`` as in `hit_emitter`.
+    """
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
     value = z.throughput * f.value * e.weight
@@ -122,7 +144,12 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream) -> Contribution:
     merges = mis.choose(k <= kernel.last_merged, merges, 0)
     newest = mis.choose(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(h, mis.Partial(z.partial.d_vcm, older), newest, *densities)
-    sides = kernel.kappa.direct, light_side, camera_side
+    ends = light_side, camera_side
+    if sds is not None and sds.near_specular:
+        on_sds_path = z.sds.meets_end(f) & ~e.delta
+        ends = _beside_guided(kernel, z, on_sds_path, ends, light_side, kernel.kappa.direct)
+        active = sds.counts(active, on_sds_path)
+    sides = kernel.kappa.direct, *ends
     weight, shares = h.weigh(*sides, merges=merges)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
@@ -221,6 +248,8 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
+    if kernel.guides_near_specular:
+        active &= ~y.sds.meets_end(f)
     merges = hard_merges(kernel, y, newest, *densities, kernel.kappa.splat)
     weight, shares = h.weigh(*sides, merges=merges)
 
@@ -271,7 +300,9 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     hard = h.scale(hard_merges_before_end(kernel, partial, newest, z.pdf_w), z.pdf_a)
-    if kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
+    if kernel.guides_near_specular:
+        active &= ~walk.sds.ends(newest)
+    elif kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
         merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
         # The last edge is not connected either.
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))

@@ -23,7 +23,7 @@ from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
 from .path_layers import EMISSION
-from .sds import SdsStrategy, State
+from .sds import SdsStrategy, State, is_specular
 
 
 @dataclass
@@ -125,10 +125,12 @@ class Vertex:
     endpoint: Any = None  # a `Direct`, or a `CameraConnection`
     endpoint_active: Any = None
     f: Any = None  # a `bsdf.Evaluation`
-    # Set with guiding: `sds.State.guided` on arrival, and the guide.
+    # Set with guiding: `sds.State.guided` on arrival, and the guide; the whole state where near-specular
+    # events count as specular.
     guided: mi.Float | None = None
     advice: Any = None  # an `sds.Advice`
     layer: mi.UInt32 | None = None
+    sds: Any = None  # an `sds.State`
 
     @property
     def edge(self) -> Any:
@@ -172,7 +174,8 @@ class Side:
     (next-event estimation on the light side, t = 1 on the camera side); ``alpha``: the film needs to know
     whether a non-null event happened; ``parallel``: the first edge has one direction, with density one across
     it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false; ``only_specular``: it
-    ends at an event that is neither delta nor near-specular. Functions:
+    ends at an event that is not delta and has a smaller density from one side (1 / sr; 0: at none).
+    Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
     * ``connect``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of
@@ -191,7 +194,7 @@ class Side:
     connect: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_delta: bool = False
-    only_specular: bool = False
+    only_specular: float = 0.0
     sds: SdsStrategy | None = None
 
 
@@ -309,6 +312,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         landing=landing,
         guided=None if walk.sds is None else walk.sds.guided,
         layer=walk.layer,
+        sds=None if walk.sds is None or walk.sds.specular is None else walk.sds,
     )
 
 
@@ -399,7 +403,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     if side.only_delta:
         active &= step.delta
     if side.only_specular:
-        specular = step.delta | is_narrow(step.pdf_fwd_w, step.pdf_rev_w)
+        specular = step.delta | is_narrow(step, side.only_specular)
         active &= specular if vertex.volume is None else specular & ~vertex.volume
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, stream, useful)
@@ -452,18 +456,36 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
         return walk.sds, side.sds.merge(kernel, vertex, None)
     if walk.sds is None:
         return None, None
+    if walk.sds.specular is not None:
+        return _near_specular(kernel, side, walk.sds, vertex, coefficient, step)
     isolated, only_delta, guided = walk.sds.isolated, walk.sds.only_delta, walk.sds.guided
     if isolated is not None:
         isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
     if only_delta is not None:
         only_delta = only_delta & step.delta
-    if guided is not None and vertex.advice is not None:  # guided subpaths follow delta events only
-        other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
-        guided = dr.select(step.delta, guided, kernel.heuristic.start(other))
+    guided = _guided(kernel, guided, vertex, step, step.delta)
     merge = None
     if side.sds is not None and not mis.is_absent(walk.partial.d_vm):
         merge = side.sds.merge(kernel, vertex, isolated)
     return State(isolated, only_delta, guided), merge
+
+
+def _near_specular(kernel: Kernel, side: Side, before: State, vertex: Vertex, coefficient, step):
+    """`_sds` where near-specular events count as specular."""
+    specular = step.delta | is_specular(step)
+    state = before.scattered(specular, coefficient)
+    state = replace(state, guided=_guided(kernel, before.guided, vertex, step, specular))
+    if side.sds is None or mis.is_absent(vertex.partial.d_vm):
+        return state, None
+    return state, side.sds.merge(kernel, vertex, state.isolated)
+
+
+def _guided(kernel: Kernel, guided: mi.Float | None, vertex: Vertex, step, specular: mi.Bool):
+    """`State.guided` after an event; as before without advice: guided subpaths follow specular ones only."""
+    if guided is None or vertex.advice is None:
+        return guided
+    other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
+    return dr.select(specular, guided, kernel.heuristic.start(other))
 
 
 def has_lobe(kernel: Kernel, vertex: Vertex) -> mi.Bool:
@@ -478,7 +500,10 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Ve
     No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
     path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
     """
-    connectible = mis.is_connectible(vertex.partial, newest_coefficient(kernel, first, vertex.edges))
+    newest = newest_coefficient(kernel, first, vertex.edges)
+    if vertex.sds is not None:
+        return has_lobe(kernel, vertex) & vertex.sds.isolated & ~vertex.sds.is_connectible(False, newest)
+    connectible = mis.is_connectible(vertex.partial, newest)
     possible = has_lobe(kernel, vertex) & ~connectible
     isolated = None if walk.sds is None else walk.sds.isolated
     return possible if isolated is None else possible & isolated

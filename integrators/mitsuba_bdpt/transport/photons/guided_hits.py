@@ -9,6 +9,10 @@ events only. All densities but those of the direction cancel::
 
 The weights of both contain that ratio, and so does that of t = 0, which evaluates p_g at the same vertex: the
 first of the light subpath that is not delta.
+
+In scenes with near-specular lobes guided subpaths follow near-specular events too, and sample s = 1 as well:
+their lobes may be wider than the emitter is. The other strategies, t = 0 included, leave these paths out, see
+`sds`.
 """
 
 from __future__ import annotations
@@ -24,7 +28,8 @@ from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, spectra, techniques
 from ..contribution import one
 from ..inputs import Kernel
-from ..sds import Advice, SdsStrategy, State, begun
+from ..near_specular import GUIDED
+from ..sds import Advice, SdsStrategy, State, begun, begun_near_specular, is_specular
 from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide
 
@@ -33,22 +38,28 @@ _SEED = 0x5BD1E995
 
 
 class Guiding(SdsStrategy):
-    """Photon-guided BSDF sampling by a ``guide``."""
+    """Photon-guided BSDF sampling by a ``guide``; ``near_specular``: through near-specular events too."""
 
     counters = ("aimed", "guided")
 
-    def __init__(self, guide: photon_guide.Guide):
-        self.guide = guide
+    def __init__(self, guide: photon_guide.Guide, near_specular: bool):
+        self.guide, self.near_specular = guide, near_specular
 
     def begin_light(self, kernel, walk):
+        if self.near_specular:
+            return begun_near_specular(walk, light=True)
         state = State(isolated=mi.Bool(True), only_delta=mi.Bool(True))
         return begun(walk, state, kernel.heuristic.zero())
 
     def begin_camera(self, kernel, walk):
+        if self.near_specular:
+            return begun_near_specular(walk, light=False, guided=mi.Float(0))
         return begun(walk, State(isolated=mi.Bool(True), guided=mi.Float(0)))
 
-    def advise(self, kernel, adjoint, vertex, walk, step) -> Advice:
+    def advise(self, kernel, adjoint, vertex, walk, step) -> Advice | None:
         """At a light vertex ``other`` is that of the direction that the subpath came from."""
+        if adjoint and self.near_specular:
+            return None
         if adjoint:
             possible = is_sds_vertex(kernel, kernel.kappa.direct, walk, vertex) & walk.sds.only_delta
             return self._evaluated(kernel, vertex, -walk.d, possible)
@@ -85,6 +96,9 @@ class Guiding(SdsStrategy):
         )
         return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
 
+    def counts(self, active, on_sds_path):
+        return active
+
     def hit(self, kernel, z, connectible, densities, sides, active):
         light_side, camera_side = sides
         return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))), active
@@ -92,6 +106,12 @@ class Guiding(SdsStrategy):
 
 class _Guided(SdsStrategy):
     """The same at the end of a guided subpath, whose alternative is s = 0 by the BSDF."""
+
+    def __init__(self, near_specular: bool):
+        self.near_specular = near_specular
+
+    def counts(self, active, on_sds_path):
+        return active & on_sds_path
 
     def hit(self, kernel, z, connectible, densities, sides, active):
         return (_other(kernel, z, connectible), sides[1]), active & ~connectible
@@ -102,21 +122,29 @@ class Unguided(Guiding):
 
     counters = ()
 
-    def __init__(self):
-        pass
+    def __init__(self, near_specular: bool):
+        self.near_specular = near_specular
 
     def begin_light(self, kernel, walk):
-        return walk
+        return begun_near_specular(walk, light=True) if self.near_specular else walk
+
+    def begin_camera(self, kernel, walk):
+        if self.near_specular:
+            return begun_near_specular(walk, light=False)
+        return super().begin_camera(kernel, walk)
 
     def advise(self, kernel, adjoint, vertex, walk, step) -> Advice | None:
         """A guide that has the BSDF's density of the walk's direction."""
-        if adjoint:
+        if adjoint or self.near_specular:
             return None
         possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
         return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
         return state
+
+    def counts(self, active, on_sds_path):
+        return active & ~on_sds_path
 
     def hit(self, kernel, z, connectible, densities, sides, active):
         return sides, active & (connectible | (z.guided == 0))
@@ -147,14 +175,22 @@ def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, sha
 
 
 def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared, add, state):
+    near_specular, guided = guiding.near_specular, _Guided(guiding.near_specular)
+    connects = near_specular and kernel.plan.direct
+
     def visit(vertex, state, walk):
-        return dr.if_stmt(
-            (vertex, *state),
+        total, lost, traced = state
+        if connects:
+            c = techniques.next_event(kernel, vertex, numbers, guided)
+            (total, lost), traced = add(c, total, lost), traced + c.counted.shadow_s1
+        total, lost = dr.if_stmt(
+            (vertex, total, lost),
             techniques.sees_emitter(kernel, vertex),
-            lambda v, total, lost: add(techniques.hit_emitter(kernel, v, _Guided()), total, lost),
+            lambda v, total, lost: add(techniques.hit_emitter(kernel, v, guided), total, lost),
             lambda v, total, lost: (total, lost),
             label="guided s = 0",
         )
+        return total, lost, traced
 
     total, lost, aimed, traced = state
     walk = _begun(kernel, guiding, z, numbers, shared)
@@ -165,10 +201,12 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         False,
         kernel.max_depth,
         kernel.kappa.splat,
-        only_delta=True,
+        connect=(lambda z: techniques.choose_emitter(kernel, z, numbers)) if connects else None,
+        only_delta=not near_specular,
+        only_specular=GUIDED if near_specular else 0,
     )
     first, begun = walk.edges, walk.active
-    (total, lost), walk = random_walk(kernel, side, walk, numbers, visit, (total, lost))
+    (total, lost, traced), walk = random_walk(kernel, side, walk, numbers, visit, (total, lost, traced))
     traced += dr.select(begun, walk.edges - first, 0)
     return total, lost + one(walk.broken), aimed + one(begun), traced
 
@@ -181,6 +219,8 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     d, active = photon_guide.draw(guiding.guide, p, z.advice.found, u1, u2)
     pdf, local = guiding.density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
+    if guiding.near_specular:  # else another vertex is the last diffuse one
+        active &= ~is_specular(f)
     throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)
     active &= (spectra.brightest(throughput) > 0) & ~broken
@@ -191,7 +231,10 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
     guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
-    walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=State(guided=guided))
+    state = State(guided=guided)
+    if guiding.near_specular:
+        state = replace(state, isolated=mi.Bool(True), specular=mi.Bool(False), diffuse=mi.Bool(True))
+    walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
     if kernel.path_layers is not None:
         walk = replace(walk, layer=kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False))
     return walk

@@ -8,6 +8,9 @@ estimate f / p_0 of s = 0 of the path through the photon::
     second moment of s = 0          sum over photons of  T f / |n.d| Phi / (N pi R^2) * f / p_0
     the same with n guided samples  ... / (1 + n p_g / p_bsdf)
 
+With near-specular events S, the sum of kappa p of all strategies, takes the place of p_0 in the former, and
+that of s = 0 and s = 1 in the latter, since guiding leaves out the others (`sds`).
+
 The photons of the guide are independent of those of the estimate.
 """
 
@@ -25,7 +28,8 @@ from ..batch import Batch, Places
 from ..contribution import size_of
 from ..inputs import Kernel, Observer
 from ..plan import GUIDED
-from ..walk import Vertex, Walk, is_sds_vertex, random_walk
+from ..sds import is_specular
+from ..walk import Vertex, Walk, is_sds_vertex, newest_connection, random_walk
 from . import photon_guide
 from .photon import same_surface
 from .photon_guide import WINDOW, Guide
@@ -35,7 +39,7 @@ from .photon_guide import WINDOW, Guide
 class Estimator:
     """``photons`` of ``count`` subpaths, and the ``guide`` whose benefit is estimated.
 
-    ``most``: estimates of s = 0 beyond ``most`` times the arriving light are dropped.
+    ``most``: estimates of a path beyond ``most`` times the arriving light are dropped.
     """
 
     photons: Guide
@@ -48,7 +52,7 @@ class Estimator:
 class Found:
     """SDS light at a vertex, mean over the colours; ``vertices``: 1 if s = 0 can be guided.
 
-    ``arriving``: its mean; ``unguided``, ``guided``: second moments of s = 0.
+    ``arriving``: its mean; ``unguided``, ``guided``: second moments.
     """
 
     arriving: mi.Float64
@@ -103,18 +107,38 @@ def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream
         cos = dr.abs(dr.dot(z.si.n, y.d))
         value = _mean(z.throughput * f.value * y.flux) / cos
         active &= (value > 0) & (f.pdf_fwd_w > 0) & dr.isfinite(value)
+        if kernel.near_specular:
+            active &= ~is_specular(f)
         # All photons in the disc, represented by the drawn one. Double precision: radiance is squared.
         arriving = mi.Float64(value / size_of(y.flux) * total / (estimator.count * dr.pi * dr.square(radius)))
-        by_hit = mi.Float64(value / (y.older * f.pdf_fwd_w))
-        by_hit = dr.select(by_hit <= estimator.most * arriving, by_hit, 0)
         there = photon_guide.find(estimator.guide, z.si.p)
         pdf = photon_guide.density(estimator.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
-        unguided = dr.select(active, arriving * by_hit, 0)
+        found = [
+            dr.select(active & (each <= estimator.most * arriving), arriving * each, 0)
+            for each in (mi.Float64(value / s) for s in _sums(kernel, z, y, f))
+        ]
         arriving = dr.select(active, arriving, 0)
-        return Found(arriving, unguided, unguided / (1 + GUIDED * ratio), mi.UInt32(1))
+        goes_on = mi.UInt32(1)
+        if kernel.near_specular:  # guided samples of other directions end at once
+            goes_on = dr.select((total > 0) & ~active, mi.UInt32(0), 1)
+        return Found(arriving, found[0], found[1] / (1 + GUIDED * ratio), goes_on)
 
     return dr.if_stmt((z,), possible, measure, lambda z: nothing(), label="SDS light")
+
+
+def _sums(kernel: Kernel, z: Vertex, y, f) -> tuple[mi.Float, mi.Float]:
+    """Sums of kappa p of the strategies without and with guiding, guided ones excluded, over the photons'.
+
+    ``f``: the BSDF of the camera vertex ``z`` towards the photon ``y``.
+    """
+    if not kernel.near_specular:
+        by_hit = y.older * f.pdf_fwd_w
+        return by_hit, by_hit
+    every = y.connection + y.older * f.pdf_fwd_w
+    every += newest_connection(kernel, kernel.kappa.splat, z) + z.partial.d_vc * f.pdf_rev_w
+    # Weights do not know of the aim.
+    return every * y.aim, y.unconnected * f.pdf_fwd_w * y.aim
 
 
 def _mean(colours: mi.Spectrum) -> mi.Float:

@@ -75,7 +75,7 @@ class ConnectedPhoton(Photon):
 
     ``connection``: its ``d_vcm`` times the coefficient of the connection of the last edge. All partial sums
     are those of a light subpath, whose first direction is not aimed. ``delta``: from an emitter that rays can
-    hit, by delta events only.
+    hit, by delta events only; where photons guide s = 0, by any events.
     """
 
     connection: mi.Float
@@ -85,6 +85,22 @@ class ConnectedPhoton(Photon):
     def types(cls) -> tuple[Any, ...]:
         """Types of the fields in the current variant, in order."""
         return (*Photon.types(), mi.Float, mi.Bool)
+
+
+@dataclass
+class GuidingPhoton(Photon):
+    """A photon of a guide through near-specular events; ``older`` and ``connection`` as above.
+
+    ``unconnected``: the part of ``older`` of s = 0 and s = 1.
+    """
+
+    connection: mi.Float
+    unconnected: mi.Float
+
+    @classmethod
+    def types(cls) -> tuple[Any, ...]:
+        """Types of the fields in the current variant, in order."""
+        return (*Photon.types(), mi.Float, mi.Float)
 
 
 @dataclass

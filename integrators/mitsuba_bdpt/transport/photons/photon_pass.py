@@ -12,10 +12,11 @@ from ...sampling.points import Points, Purpose
 from .. import mis, spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
-from ..sds import SdsStrategy, State
+from ..near_specular import GUIDED, NARROW
+from ..sds import SdsStrategy, State, begun_near_specular
 from ..walk import has_lobe, is_sds_vertex, newest_connection, random_walk
 from .aim import Aim
-from .photon import ConnectedPhoton, HardPhoton, Photon
+from .photon import ConnectedPhoton, GuidingPhoton, HardPhoton, Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
@@ -35,7 +36,7 @@ class Kept(Enum):
     """Vertices of photon subpaths that are stored."""
 
     MERGED = "all diffuse vertices of SDS paths"
-    GUIDED = "the first non-delta vertex, if s = 0 can sample the path through it"
+    GUIDED = "the first vertex of a non-specular event, if s = 0 can sample the path through it"
     UNSAMPLED = "the first non-delta vertex, if no strategy can sample the path through it"
     UNDERSAMPLED = "all vertices with a non-delta lobe behind delta and near-specular events"
 
@@ -43,6 +44,17 @@ class Kept(Enum):
     def estimates(self) -> bool:
         """Whether photons estimate how much light a render lacks, of which emitter."""
         return self in (Kept.UNSAMPLED, Kept.UNDERSAMPLED)
+
+
+class _Unconnected(SdsStrategy):
+    """Keeps the partial sum of s = 0 and s = 1 in ``d_vm``, through near-specular events."""
+
+    def begin_light(self, kernel, walk):
+        return begun_near_specular(walk, light=True, d_vm=walk.partial.d_vc)
+
+    def merge(self, kernel, vertex, isolated):
+        direct = kernel.heuristic.scale(vertex.partial.d_vcm, kernel.kappa.direct)
+        return mis.Merge(mis.choose(vertex.edges == 1, direct, kernel.heuristic.zero()), isolated)
 
 
 @dataclass
@@ -91,11 +103,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     merges, undersampled = kept is Kept.MERGED, kept is Kept.UNDERSAMPLED
-    sds = kernel.sds if merges else None
+    near_specular = kept is Kept.GUIDED and kernel.near_specular
+    sds = kernel.sds if merges else _Unconnected() if near_specular else None
     e, aimed, finite, walk = _begun(kernel, aim, kept, sds, stream, shared)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
-    side = replace(side, connect=None, isolated=merges, only_delta=not merges and not undersampled)
-    side = replace(side, only_specular=undersampled)
+    side = replace(side, connect=None, isolated=merges)
+    specular = GUIDED * near_specular + NARROW * undersampled
+    side = replace(side, only_delta=not merges and not specular, only_specular=specular)
 
     def visit(y, counters, walk):
         older, more = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm), ()
@@ -112,13 +126,16 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
             keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
-        if kept is Kept.GUIDED:
+        if near_specular:
+            older, more = y.partial.d_vc, (_connection(kernel, y), y.partial.d_vm)
+        elif kept is Kept.GUIDED:
             keep &= older > 0
         if kept is Kept.UNSAMPLED:
             older = dr.select(finite, mi.Float(0), dr.nan)
         if undersampled:
             older = dr.select(finite, mi.Float(older), dr.nan)
-            more = _connection(kernel, y), walk.sds.only_delta & ~e.delta
+            only_delta = mi.Bool(True) if kernel.plan.guided else walk.sds.only_delta
+            more = _connection(kernel, y), only_delta & ~e.delta
         distance = dr.norm(y.si.p - y.previous)
         fields = y.si.p, -walk.d, y.si.n, flux, older, aimed, distance, y.edges, lanes, e.index
         found = type(out)(*fields, *more, layer=y.layer)
@@ -153,7 +170,7 @@ def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     # These weights do not know of the aim, see `merging.hard_paths`.
-    unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED
+    unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED or isinstance(sds, _Unconnected)
     start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
     if kept is Kept.UNDERSAMPLED:
@@ -169,6 +186,8 @@ def _kind(kernel: Kernel, kept: Kept) -> type[Photon]:
     """The record of its photons."""
     if kernel.merges_hard:
         return HardPhoton
+    if kept is Kept.GUIDED and kernel.near_specular:
+        return GuidingPhoton
     return ConnectedPhoton if kept is Kept.UNDERSAMPLED else Photon
 
 

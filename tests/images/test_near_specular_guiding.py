@@ -1,0 +1,197 @@
+"""Photon-guided BSDF sampling through near-specular lobes; scenes as in `test_hard_paths`."""
+
+import json
+from pathlib import Path
+
+import internals
+import mitsuba as mi
+import numpy as np
+import pytest
+import variants
+import welch as st
+from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.planning.planner import Planner
+from mitsuba_bdpt.run.rendering import Render
+from mitsuba_bdpt.transport import light_path, sds, walk
+from mitsuba_bdpt.transport.photons import guided_hits, guiding_benefit
+from sds_scenes import (
+    NEAR_SPECULAR,
+    ball,
+    images,
+    near_specular_scene,
+    rough,
+    steel,
+    transform,
+    under_glass,
+    without_photons,
+)
+
+import drjit as dr  # isort: skip
+
+SCENES = Path(__file__).parents[2] / "scenes"
+
+# Of a lamp that the plate does not mirror into the camera.
+ASIDE = [5.0, 0.0, 4.5]
+
+
+def guided(samples):
+    """The decision for all strategies, with so many guided samples."""
+    way = {"pass": 0, "light_paths": 1.0, "connections": "one", "guided": samples}
+    more = {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 1.0, "mean": 0.0}
+    return json.dumps([way | more])
+
+
+@pytest.mark.parametrize("case", NEAR_SPECULAR)
+def test_images_are_those_without_guiding(case):
+    """Rationale: guiding changes which strategy finds a path, not how much light it carries: strategies are
+    left out where others sample the path, at any roughness (a ramp of alpha across the bound). Expected: the
+    same tiles by Welch's test.
+    """
+    found = st.tiles(images(near_specular_scene(case), 128, 8, decisions=guided(4)))
+    st.assert_agree(st.compare_images(found, without_photons(case)), at_least=12)
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"skip": "none"},
+        {"light_paths": 0},
+        {"connections": "none"},
+        {"heuristic": "power"},
+        {"skip": "none", "stored_vertices": 1},
+        {"rr_depth": 1},
+    ],
+    ids=str,
+)
+def test_any_choice_of_strategies_has_the_same_mean(parameters):
+    """Rationale: edges that no strategy in use connects make more paths SDS paths. Expected: the tiles
+    without guiding.
+    """
+    found = st.tiles(images(near_specular_scene("alpha .03"), 128, 8, guiding="always", **parameters))
+    st.assert_agree(st.compare_images(found, without_photons("alpha .03")), at_least=12)
+
+
+def test_a_wide_lens():
+    """Rationale: t = 0 samples SDS paths, and leaves them to s = 0. Expected: the tiles without guiding."""
+    described = under_glass(ball(), plate=rough(0.02), kind="thinlens")
+    described["sensor"] |= {"aperture_radius": 0.8}
+    described = mi.load_dict(described)
+    a = images(described, 256, 8, guiding="always", skip="none")
+    b = images(described, 256, 8, first=100, guiding="never", skip="none")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+def half_sky():
+    """An environment of two brightnesses, which photons of the brighter half guide to."""
+    pixels = np.full((8, 16, 3), 0.01, dtype=np.float32)
+    pixels[1:3, 2:5] = 50.0
+    to_world = transform().rotate([1, 0, 0], 90)
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": to_world}
+
+
+@pytest.mark.parametrize("lamps", ["point and ball", "sky"])
+def test_other_emitters(lamps):
+    """Rationale: nothing is left out of the light of emitters that rays cannot hit; the sky is hit at no
+    vertex. Expected: the tiles without guiding.
+    """
+    more = {"light": half_sky()}
+    if lamps != "sky":
+        position = [0.0, 0.5, 2.0]
+        more = {"light": ball(), "point": {"type": "point", "position": position, "intensity": 1.0}}
+    described = mi.load_dict(under_glass(plate=rough(0.2), **more))
+    a = images(described, 128, 8, guiding="always")
+    b = images(described, 256, 8, first=100, guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+@pytest.mark.parametrize("variant", ["spectral", "mono", "mono_polarized"])
+def test_variants(variant):
+    """Expected: in each kind of variant the tiles without guiding."""
+    mi.set_variant(variants.of(variant))
+    described = mi.load_dict(under_glass(ball(), plate=rough(0.03)))
+    a = images(described, 128, 8, guiding="always")
+    b = images(described, 256, 8, first=100, guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+def nested():
+    """A plate of glass with a normal map, beside metal that is masked and has two sides."""
+    rng = np.random.default_rng(3)
+    normals = 0.5 + 0.5 * np.concatenate([0.05 * rng.uniform(-1, 1, (8, 8, 2)), np.ones((8, 8, 1))], axis=2)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(normals.astype(np.float32)), "raw": True}
+    plate = {"type": "normalmap", "normalmap": texture, "bsdf": rough(0.02)}
+    wall = steel(0.03)
+    wall["bsdf"] = {"type": "mask", "opacity": 0.7, "bsdf": {"type": "twosided", "bsdf": wall["bsdf"]}}
+    return under_glass(ball(), plate=plate, mirror=wall)
+
+
+def test_nested_bsdfs():
+    """Expected: through maps, masks and two sides the tiles without guiding."""
+    described = mi.load_dict(nested())
+    a = images(described, 128, 8, decisions=guided(4))
+    b = images(described, 256, 8, first=100, guiding="never")
+    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+
+
+@pytest.mark.parametrize("alpha", [0.001, 0.05])
+def test_small_lamps_without_fireflies(alpha):
+    """Rationale: through rough glass of little roughness s = 0 meets a small lamp as rarely as through ideal
+    glass, and connections do not find the lobes. Expected: the variance of pixels is less than a tenth of
+    that without (1/110 and 1/27 were measured).
+    """
+    described = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}, plate=rough(alpha)))
+    a = images(described, 64, 8, decisions=guided(4))
+    b = images(described, 64, 8, first=100, guiding="never")
+    assert a.var(axis=0).mean() < 0.1 * b.var(axis=0).mean()
+
+
+def test_guided_light_is_not_undersampled():
+    """Expected: of a small lamp's light through nearly smooth glass some is undersampled, and none if photons
+    guide to it.
+    """
+    described = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}, plate=rough(0.001)))
+    for guiding in ("always", "never"):
+        settings = internals.bdpt(max_depth=6, guiding=guiding).settings
+        render = Render(described, described.sensors()[0], settings, 0, 64)
+        lost = lost_light.estimate(render.prepared, render.plan, render.settings)
+        assert bool(lost.radiance) == (guiding == "never")
+
+
+@pytest.mark.parametrize("alpha, guides", [(0.005, True), (0.1, False)])
+def test_pilots_of_any_seed_decide_alike(alpha, guides, monkeypatch):
+    """Rationale: in `rough_glass_caustics` guiding gains 30 times (alpha .005) and nothing (.1: its error is
+    the same, and it takes 1.1 times as long). Expected: pilots of three seeds guide in the former, and not in
+    the latter, whose prediction is that of a pilot that does not look for guiding.
+    """
+    scene = mi.load_file(str(SCENES / "rough_glass_caustics.xml"), resolution=64, alpha=alpha)
+
+    def chosen(guiding):
+        settings = mi.load_dict({"type": "bdpt", "max_depth": 8, "guiding": guiding}).settings
+        return Render(scene, scene.sensors()[0], settings, 0, 64).planner.run_pilot(())[0]
+
+    for seed in range(3):
+        monkeypatch.setattr(Planner, "pilot_seed", seed)
+        found = chosen("auto")
+        assert bool(found.candidate.guided) == guides
+    assert guides or found.variance == chosen("emission").variance
+
+
+def test_scenes_without_near_specular_lobes_have_no_flags(monkeypatch):
+    """Expected: with ideal glass no event is tested, and no flag of a light vertex is stored."""
+
+    def never(*_):
+        raise AssertionError
+
+    for module in (sds, walk, guided_hits, guiding_benefit):
+        monkeypatch.setattr(module, "is_specular", never)
+    monkeypatch.setattr(light_path, "_flags", never)
+    images(mi.load_dict(under_glass(ball())), 4, 1, guiding="always")
+
+
+def test_stored_vertices_keep_their_flags():
+    """Expected: the flags of every combination are read as they were written."""
+    bits = dr.arange(mi.UInt32, 8)
+    written = light_path._of_flags(bits)
+    np.testing.assert_array_equal(light_path._flags(written).numpy(), np.arange(8))
+    flags = (written.isolated, written.specular, written.diffuse)
+    assert len({tuple(row) for row in np.stack([flag.numpy() for flag in flags], axis=1)}) == 8
