@@ -2023,6 +2023,34 @@ MUTANTS = (
         "found = measured\n",
         ("tests/measure/test_estimates.py::test_the_variance_of_an_unbiased_integrator[0.05]",),
     ),
+    Mutant(
+        "sweeps: a time limit leaves no second render of the smallest budget",
+        "measure/sweep.py",
+        "if time.monotonic() >= end and not is_least:",
+        "if time.monotonic() >= end:",
+        ("tests/measure/test_sweep.py::test_what_time_does_not_allow_is_cut_seed_by_seed",),
+    ),
+    Mutant(
+        "sweeps: figures are of a budget that was cut after one render",
+        "measure/analysis.py",
+        "if all(of[n] > 1 for of in several)",
+        "if all(of[n] > 0 for of in several)",
+        ("tests/measure/test_analysis.py::test_a_sweep_that_was_cut_has_figures",),
+    ),
+    Mutant(
+        "sweeps: time left counts renders, not their work",
+        "measure/showing.py",
+        "self._spent * (self._whole - self._work) / self._work",
+        "self._spent * (self._total - self._done) / self._done",
+        ("tests/measure/test_sweep.py::test_time_left_follows_from_work",),
+    ),
+    Mutant(
+        "sweeps: processor seconds decide nothing",
+        "measure/results.py",
+        'return row["cpu_seconds"] if row.get("clock") == "processor" else row["seconds"]',
+        'return row["seconds"]',
+        ("tests/measure/test_sweep.py::test_first_images_are_rows_too",),
+    ),
 )
 
 
