@@ -179,10 +179,10 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     connects = near_specular and kernel.plan.direct
 
     def visit(vertex, state, walk):
-        total, lost, traced = state
+        total, lost, *rays = state
         if connects:
             c = techniques.next_event(kernel, vertex, numbers, guided)
-            (total, lost), traced = add(c, total, lost), traced + c.counted.shadow_s1
+            (total, lost), rays = add(c, total, lost), [rays[0] + c.counted.shadow_s1]
         total, lost = dr.if_stmt(
             (vertex, total, lost),
             techniques.sees_emitter(kernel, vertex),
@@ -190,7 +190,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
             lambda v, total, lost: (total, lost),
             label="guided s = 0",
         )
-        return total, lost, traced
+        return total, lost, *rays
 
     total, lost, aimed, traced = state
     walk = _begun(kernel, guiding, z, numbers, shared)
@@ -206,7 +206,9 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         only_specular=GUIDED if near_specular else 0,
     )
     first, begun = walk.edges, walk.active
-    (total, lost, traced), walk = random_walk(kernel, side, walk, numbers, visit, (total, lost, traced))
+    state = (total, lost, traced) if connects else (total, lost)
+    (total, lost, *rays), walk = random_walk(kernel, side, walk, numbers, visit, state)
+    traced = rays[0] if connects else traced
     traced += dr.select(begun, walk.edges - first, 0)
     return total, lost + one(walk.broken), aimed + one(begun), traced
 

@@ -111,13 +111,14 @@ def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream
             active &= ~is_specular(f)
         # All photons in the disc, represented by the drawn one. Double precision: radiance is squared.
         arriving = mi.Float64(value / size_of(y.flux) * total / (estimator.count * dr.pi * dr.square(radius)))
+        found = [
+            dr.select(each <= estimator.most * arriving, each, 0)
+            for each in (mi.Float64(value / s) for s in _sums(kernel, z, y, f))
+        ]
         there = photon_guide.find(estimator.guide, z.si.p)
         pdf = photon_guide.density(estimator.guide, z.si.p, there, y.d)
         ratio = dr.select(active, pdf / f.pdf_fwd_w, 0)
-        found = [
-            dr.select(active & (each <= estimator.most * arriving), arriving * each, 0)
-            for each in (mi.Float64(value / s) for s in _sums(kernel, z, y, f))
-        ]
+        found = [dr.select(active, arriving * each, 0) for each in found]
         arriving = dr.select(active, arriving, 0)
         goes_on = mi.UInt32(1)
         if kernel.near_specular:  # guided samples of other directions end at once
