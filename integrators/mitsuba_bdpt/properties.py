@@ -18,7 +18,7 @@ from .host.introspection import named
 from .image import denoising, features, film_limits
 from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
-from .image.layers import film_layers, partitions
+from .image.layers import GROUP, PATH, film_layers, partitions
 from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
 
@@ -133,6 +133,17 @@ def _layers(value, name: str) -> tuple[str, ...]:
     return tuple(word for word in LAYERS if word in given)
 
 
+def _aovs(value, name: str) -> str:
+    text = features.checked(_string(value, name))
+    for layer in features.feature_names(text):
+        if layer.startswith((GROUP, PATH)):  # they are told apart by their names alone in a file
+            raise UsageError(
+                f"{name}={value!r}: {layer} has the name of a light group or path layer; give the feature "
+                "another name"
+            )
+    return text
+
+
 def _light_groups(value, name: str) -> str:
     light_groups.parsed(_string(value, name))
     return value
@@ -143,7 +154,7 @@ _READERS = {
     "max_depth": lambda value, name: UNLIMITED if (depth := _integer(value, name)) < 0 else depth,
     "light_paths": _light_paths,
     "decisions": lambda value, name: read_decisions(text) if (text := _string(value, name)) else None,
-    "aovs": lambda value, name: features.checked(_string(value, name)),
+    "aovs": _aovs,
     "layers": _layers,
     "light_groups": _light_groups,
 }

@@ -12,8 +12,9 @@ GROUPS = ("key", "sky")
 PATHS = ("emission", "direct", "indirect", "caustic")
 
 
-def rendered(path, alpha=False, groups=GROUPS, paths=()):
-    """An EXR file as of a render with light groups and path layers; the groups by name."""
+def rendered(path, alpha=False, groups=GROUPS, paths=(), features=()):
+    """An EXR file as of a render with light groups and path layers; the groups by name. ``features``: other
+    channels."""
     found = {group: np.random.default_rng(i).random((3, 4, 3)) for i, group in enumerate(groups)}
     names, pixels = ["R", "G", "B"] + ["A"] * alpha, [sum(found.values(), np.zeros((3, 4, 3)))]
     pixels += [np.full((3, 4, 1), 0.5)] * alpha
@@ -23,6 +24,8 @@ def rendered(path, alpha=False, groups=GROUPS, paths=()):
     for number, layer in enumerate(paths):
         names += [f"path.{layer}.{colour}" for colour in "RGB"]
         pixels.append(np.full((3, 4, 3), 2.0**number))
+    names += features
+    pixels.append(np.full((3, 4, len(features)), 9.0))
     values = np.concatenate(pixels, axis=-1).astype(np.float32)
     mi.Bitmap(values, mi.Bitmap.PixelFormat.MultiChannel, names).write(str(path))
     return {group: layer.astype(np.float32) for group, layer in found.items()}
@@ -86,6 +89,12 @@ def test_weights_of_both_kinds(tmp_path, weights, words):
         ({"key": (1, 2)}, "has 2 numbers; give one, or 3 for R, G, B"),
         ({"key": -1}, "key=-1 must be 0 or greater"),
         ({"key": float("nan")}, "key=nan must be 0 or greater, and finite"),
+        ({"sky": 2, "key": 1e40}, r"key=1e\+40: the image exceeds 3.4e38, .* single precision; give smaller"),
+        ({"key": "a"}, "key='a' must be a number, or 3 for R, G, B"),
+        ({"key": "2"}, "key='2' must be a number"),
+        ({"key": [1, [2, 3]]}, "key=.* must be a number"),
+        ({"key": None}, "key=None must be a number"),
+        ({2: 2}, "has no layer 2; Light groups"),
     ],
 )
 def test_what_cannot_be_mixed(tmp_path, weights, words):
@@ -108,6 +117,67 @@ def test_images_that_cannot_be_mixed(tmp_path, capsys):
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "key=1", "key=2"]) == 2
     assert "key has two weights; give it one" in capsys.readouterr().err
+    assert main(["mix", str(tmp_path / "a.exr"), "key=1", "-o", str(tmp_path / "b.jpg")]) == 2
+    assert "b.jpg' must end in .png or .exr" in capsys.readouterr().err
+    with pytest.raises(TypeError, match="image=ndarray must be an mi.Bitmap or the path of an EXR"):
+        mix(np.zeros((3, 4, 3)), {"key": 1})
+    with pytest.raises(TypeError, match="weights=list must be a dictionary"):
+        mix(tmp_path / "a.exr", [("key", 1)])
     with pytest.raises(SystemExit):
         main(["mix", str(tmp_path / "a.exr"), "key"])
     assert "must have the form LAYER=X or LAYER=X,Y,Z" in capsys.readouterr().err
+
+
+def test_features_are_no_layers(tmp_path):
+    """Expected: channels named like layers, but without a layer's name or with other colours than the
+    image, are not mixed; a file that has no others has no layers."""
+    features = [f"groups.{c}" for c in "RGB"] + ["path.T", "groups.n.X", "groups.n.Y", "groups.n.Z"]
+    layers = rendered(tmp_path / "a.exr", features=features)
+    assert np.array_equal(np.array(mix(tmp_path / "a.exr", {"key": 0})), layers["sky"])
+    with pytest.raises(CommandError, match="no layer 'n'; Light groups: key, sky$"):
+        mix(tmp_path / "a.exr", {"n": 2})
+    rendered(tmp_path / "b.exr", groups=(), features=features)
+    with pytest.raises(CommandError, match="has no layers of light groups or paths"):
+        mix(tmp_path / "b.exr", {})
+
+
+@pytest.mark.parametrize(
+    ("own", "colours"), [("Y", "RGB"), ("XYZ", "RGB"), (("low", "high"), ("low", "high"))]
+)
+def test_layers_have_the_colours_of_the_film(own, colours):
+    """Expected: layers of films of luminance or XYZ are RGB, and so is their mix; those of a ``specfilm``
+    have its bands."""
+    names = [*own, "A", *(f"path.direct.{c}" for c in colours)]
+    pixels = np.full((2, 2, len(names)), 2.0, dtype=np.float32)
+    mixed = mix(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names), {"direct": 3})
+    assert [channel.name for channel in mixed.struct_()] == [*colours, "A"]
+    assert (np.array(mixed) == [6.0] * len(colours) + [2.0]).all()
+
+
+def test_a_layer_of_weight_0_is_left_out(tmp_path):
+    """Rationale: half precision overflows to infinity at 65504. Expected: infinite light of a layer that
+    is switched off is not in the mix."""
+    pixels = np.full((2, 2, 9), 1.0, dtype=np.float32)
+    pixels[..., :6] = np.inf
+    names = ["R", "G", "B", *(f"groups.{g}.{c}" for g in GROUPS for c in "RGB")]
+    image = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names)
+    assert (np.array(mix(image, {"key": 0})) == 1).all()
+    assert (np.array(mix(image, {"key": 0, "sky": 0})) == 0).all()
+
+
+@pytest.mark.parametrize("output", ["a.exr", "A/../a.exr", "link.exr", "a.png", "linked.exr"])
+def test_a_mix_does_not_replace_its_image(tmp_path, output, capsys, monkeypatch):
+    """Expected: an error where the output is the image that is mixed, or the PNG beside it, by whichever
+    spelling or link of the path; both files keep their content."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "A").mkdir()
+    rendered(tmp_path / "a.exr")
+    (tmp_path / "a.png").write_bytes(b"the PNG of the render")
+    (tmp_path / "link.exr").symlink_to("a.exr")
+    (tmp_path / "linked.png").symlink_to("a.png")
+    before = (tmp_path / "a.exr").read_bytes()
+    assert main(["mix", "a.exr", "key=0.5", "-o", output]) == 2
+    error = capsys.readouterr().err
+    assert f"output={output!r}: the mix would replace" in error and "name another with -o" in error
+    assert (tmp_path / "a.exr").read_bytes() == before
+    assert (tmp_path / "a.png").read_bytes() == b"the PNG of the render"

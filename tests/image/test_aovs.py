@@ -335,6 +335,9 @@ def test_spectral_albedo():
         ("a:uv,a:duv_dx", "two layers a.U; give the feature another name"),
         ("variance:albedo", "two layers variance.R"),
         ("weighted.s0t2:albedo", "two layers weighted.s0t2.R"),
+        ("groups:albedo", "groups.R has the name of a light group or path layer; give the feature another"),
+        ("groups.x:albedo", "groups.x.R has the name of a light group or path layer"),
+        ("a:uv,path:depth", "path.T has the name of a light group or path layer"),
     ],
 )
 def test_bad_features_are_named(aovs, message):

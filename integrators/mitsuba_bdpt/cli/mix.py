@@ -20,10 +20,25 @@ def run(options: Namespace) -> int | None:
     return answered(lambda: _run(options))
 
 
+def _check_not_replaced(image: Path, output: Path) -> None:
+    """Raise ``CommandError`` if the mix would replace the rendered image, or the PNG beside it."""
+    for rendered in (image, image.with_suffix(".png")):
+        for written in (output, output.with_suffix(".png")):
+            is_same = written.exists() and rendered.exists() and written.samefile(rendered)
+            if is_same or written.resolve() == rendered.resolve():
+                raise CommandError(
+                    f"output={str(output)!r}: the mix would replace the render {str(rendered)!r}; name "
+                    "another with -o."
+                )
+
+
 def _run(options: Namespace) -> int:
     mi.set_variant(options.variant)
     output: Path = options.output or options.image.with_suffix(".mixed.png")
     is_exr = output.suffix.lower() == ".exr"
+    if not is_exr and output.suffix.lower() != ".png":
+        raise CommandError(f"output={str(output)!r} must end in .png or .exr")
+    _check_not_replaced(options.image, output)
     check_output(output, ".exr" if is_exr else ".png")
     twice = [name for name, count in Counter(name for name, _ in options.weights).items() if count > 1]
     if twice:

@@ -9,7 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError, did_you_mean
+from ..errors import CommandError, UsageTypeError, did_you_mean
 from ..image.layers import GROUP, PATH
 
 Weight = float | Sequence[float]
@@ -27,9 +27,14 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
 
     ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
     ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
-    for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too. The result has the image's
-    colours, and its alpha if it has one, in single precision. Raises ``CommandError``.
+    for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too. The result has the layers'
+    colours, and the image's alpha if it has one, in single precision. Raises ``CommandError``, and
+    ``UsageTypeError`` for other types.
     """
+    if not isinstance(image, (mi.Bitmap, Path, str)):
+        raise UsageTypeError(f"image={type(image).__name__} must be an mi.Bitmap or the path of an EXR")
+    if not isinstance(weights, Mapping):
+        raise UsageTypeError(f"weights={type(weights).__name__} must be a dictionary, by names of layers")
     name = "the image" if isinstance(image, mi.Bitmap) else repr(str(image))
     channels = _channels(image)
     layers, own = _chosen(name, _partitions(channels), weights)
@@ -39,26 +44,39 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     factors = {layer: np.ones(len(colours)) for layer in layers}
     for layer, weight in own.items():
         factors[layer] = _factors(layer, weight, colours)
-    mixed = [
-        sum(factors[layer][i] * values[colour] for layer, values in layers.items())
-        for i, colour in enumerate(colours)
-    ]
+    mixed = [np.zeros_like(values) for values in next(iter(layers.values())).values()]
+    for layer, values in layers.items():
+        for i, colour in enumerate(colours):
+            if factors[layer][i] > 0:  # infinite light of a layer may be switched off
+                mixed[i] += factors[layer][i] * values[colour]
     has_alpha = "A" in channels
-    pixels = np.stack([*mixed, channels["A"]] if has_alpha else mixed, axis=-1).astype(np.float32)
+    try:
+        with np.errstate(over="raise"):
+            pixels = np.stack([*mixed, channels["A"]] if has_alpha else mixed, axis=-1).astype(np.float32)
+    except FloatingPointError as error:
+        layer = max(factors, key=lambda name: factors[name].max())
+        raise CommandError(
+            f"{layer}={own.get(layer, 1)!r}: the image exceeds 3.4e38, the largest number of single "
+            "precision; give smaller weights"
+        ) from error
     if colours != list("RGB"):
         return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, colours + ["A"] * has_alpha)
     return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB)
 
 
 def _partitions(channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
-    """Return the layers of each partition of an image, by prefix."""
+    """Return the layers of each partition of an image, by prefix: those with the image's colours."""
+    image = {channel for channel in channels if "." not in channel} - {"A"}
+    colours = set("RGB") if image in ({"Y"}, set("XYZ")) else image
     found: dict[str, _Layers] = {}
     for channel, values in channels.items():
         for prefix in _KINDS:
             if channel.startswith(prefix):
                 layer, _, colour = channel.removeprefix(prefix).rpartition(".")
                 found.setdefault(prefix, {}).setdefault(layer, {})[colour] = values
-    return found
+    for prefix, layers in found.items():
+        found[prefix] = {name: layer for name, layer in layers.items() if name and set(layer) == colours}
+    return {prefix: layers for prefix, layers in found.items() if layers}
 
 
 def _chosen(
@@ -100,7 +118,7 @@ def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, 
             f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
         )
         names = [layer for layers in partitions.values() for layer in layers]
-        raise CommandError(f"{image} has no layer {name!r}; {did_you_mean(name, names)}{there}")
+        raise CommandError(f"{image} has no layer {name!r}; {did_you_mean(str(name), names)}{there}")
     return fitting[0]
 
 
@@ -121,7 +139,12 @@ def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
 
 def _factors(layer: str, weight: Weight, colours: list[str]) -> np.ndarray:
     """Return a layer's weight of each colour."""
-    values = np.atleast_1d(np.asarray(weight, dtype=np.float64))
+    try:
+        values = np.atleast_1d(np.asarray(weight))
+    except ValueError:  # a ragged list
+        values = np.array([None])
+    if values.dtype.kind not in "iuf":
+        raise CommandError(f"{layer}={weight!r} must be a number, or {len(colours)} for {', '.join(colours)}")
     if values.shape not in ((1,), (len(colours),)):
         raise CommandError(
             f"{layer}={weight!r} has {values.size} numbers; give one, or {len(colours)} for "
@@ -129,4 +152,4 @@ def _factors(layer: str, weight: Weight, colours: list[str]) -> np.ndarray:
         )
     if not all(math.isfinite(value) and value >= 0 for value in values):
         raise CommandError(f"{layer}={weight!r} must be 0 or greater, and finite")
-    return np.broadcast_to(values, len(colours))
+    return np.broadcast_to(values.astype(np.float64), len(colours))
