@@ -21,7 +21,8 @@ from ..geometry.mitsubas_choices import spread_points
 from ..host.introspection import number, own_parameters
 
 # Least density (1 / sr, at the axis of the lobe at normal incidence) of a near-specular lobe: that of alpha
-# .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
+# .063 in reflection, of .38 in refraction by glass (from both sides, see `is_narrow`, of .25). See
+# experiments, "Near-specular lobes".
 NARROW = 20.0
 
 # Least density (1 / sr) from both sides of an event through which photons guide; see experiments,
