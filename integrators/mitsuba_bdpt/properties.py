@@ -20,7 +20,7 @@ from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
 from .image.layers import GROUP, PATH, film_layers, partitions
 from .planning.configuration import read_decisions
-from .settings import LAYERS, LIGHT_PATHS, PARAMETERS, UNLIMITED, Settings
+from .settings import LAYERS, LIGHT_PATHS, NONE, PARAMETERS, UNLIMITED, Settings
 
 # Valid values of a render's arguments, for messages; for parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
@@ -91,7 +91,7 @@ def _number(value, name: str) -> float:
 def _string(value, name: str) -> str:
     if not isinstance(value, str):
         raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
-    return value
+    return "" if value.strip() == NONE else value
 
 
 def _choice(value, name: str) -> str:
@@ -145,8 +145,9 @@ def _aovs(value, name: str) -> str:
 
 
 def _light_groups(value, name: str) -> str:
-    light_groups.parsed(_string(value, name))
-    return value
+    text = _string(value, name)
+    light_groups.parsed(text)
+    return text
 
 
 # Readers of parameters with their own syntax.

@@ -29,6 +29,10 @@ POINTS = ("sobol", "independent")
 LAYERS = ("variance", "denoised", "stokes", "strategies")
 
 
+# Text that a parameter may have in place of an empty one.
+NONE = "none"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of the plugin.
@@ -251,7 +255,7 @@ _MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"
 def _default(parameter: Parameter) -> str:
     """The default, as a scene file has it."""
     if parameter.default == "":
-        return "none"
+        return NONE
     if isinstance(parameter.default, float):
         return f"{parameter.default:g}"
     return str(parameter.default).lower()

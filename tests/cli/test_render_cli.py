@@ -310,6 +310,8 @@ def test_denoise_adds_to_the_layers(around):
     integrator around it."""
     given = "-P", "layers=variance"
     assert loaded(around, "--integrator", "bdpt", "--denoise").settings.layers == ("denoised",)
+    none = ["--integrator", "bdpt", "--denoise", "-P", "layers=none"]
+    assert loaded(around, *none).settings.layers == ("denoised",)
     assert loaded(around, "--integrator", "bdpt", "--denoise", *given).settings.layers == (
         "variance",
         "denoised",

@@ -124,6 +124,16 @@ def test_all_parameters_are_written():
     assert set(PARAMETERS) == {name for changed in PARAMETER_SETS for name in changed}
 
 
+def test_none_is_the_default_of_texts():
+    """Rationale: the manual names it as the default. Expected: ``none`` is that of each parameter whose
+    default is no text; ``--denoise`` adds to it."""
+    given = {name: "none" for name, parameter in PARAMETERS.items() if parameter.default == ""}
+    assert set(given) == {"decisions", "aovs", "layers", "light_groups"}
+    assert mi.load_dict({"type": "bdpt"} | given).settings == mi.load_dict({"type": "bdpt"}).settings
+    with pytest.raises(RuntimeError, match="there is no layer 'none'"):
+        mi.load_dict({"type": "bdpt", "layers": "variance,none"})
+
+
 def test_scalar_variants_are_refused():
     """Expected: one sentence, also where the parser makes objects of another variant than the current one."""
     config = mi.parser.ParserConfig("scalar_rgb")

@@ -10,7 +10,7 @@ from layered import JOINED, LAMPS, check_sum, layers, scene
 from media_parts import fog
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.emitters.light_groups import LightGroups, ids
+from mitsuba_bdpt.emitters.light_groups import LightGroups
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
@@ -167,7 +167,8 @@ def test_each_emitter_has_its_own_group():
     made = LightGroups.of(target, "auto")
     assert sorted(made.names) == sorted(LAMPS)
     for emitter, group in zip(target.emitters(), made.of_emitters, strict=True):
-        assert made.names[group] in ids(emitter)
+        shape = emitter.get_shape()
+        assert made.names[group] == (emitter if shape is None else shape).id()
     lamps = {f"lamp{i}": {"type": "point", "position": [i, 0, 0]} for i in range(12)}
     made = LightGroups.of(mi.load_dict({"type": "scene"} | lamps), "auto")
     assert made.names == (*(f"lamp{i}" for i in range(8)), "rest")
@@ -178,8 +179,26 @@ def test_emitters_without_id_go_by_their_plugin():
     """Expected: an emitter without id, and on no shape with one, is found by its plugin's name."""
     shape = '<shape type="sphere"><emitter type="area"/></shape>'
     target = mi.load_string(f'<scene version="3.0.0">{shape}{shape}<emitter type="constant"/></scene>')
-    assert LightGroups.of(target, "auto").names == ("area", "area_2", "constant")
+    made = LightGroups.of(target, "auto")
+    assert made.names == ("area", "area_2", "constant")
     assert LightGroups.of(target, "sky: constant").names == ("sky", "rest")
+    same = LightGroups.of(target, "area: area; area_2: area_2; constant: constant")
+    assert (same.names, same.of_emitters) == (made.names, made.of_emitters)
+    assert LightGroups.of(target, "lamps: area*").of_emitters.count(0) == 2
+
+
+def test_names_of_layers_are_names_of_emitters():
+    """Expected: a group may name an emitter as ``auto`` does: with signs that a layer cannot have as _, and
+    those without id by the numbers that ids leave."""
+    lamp = '<shape type="sphere"{}><emitter type="area"/></shape>'
+    lamps = "".join(lamp.format(f' id="{i}"' if i else "") for i in ("", "", "key.1", "area_2", "rest"))
+    target = mi.load_string(f'<scene version="3.0.0">{lamps}</scene>')
+    made = LightGroups.of(target, "auto")
+    assert made.names == ("area", "area_2", "area_3", "key_1", "rest_2")
+    assert made.of_emitters == LightGroups.of(target, "; ".join(f"{n}: {n}" for n in made.names)).of_emitters
+    of_id = {e.get_shape().id(): g for e, g in zip(target.emitters(), made.of_emitters, strict=True)}
+    assert (of_id["area_2"], of_id["key.1"], of_id["rest"]) == (1, 3, 4)
+    assert LightGroups.of(target, "key: key.1").of_emitters.count(0) == 1
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
 import drjit as dr
@@ -67,11 +69,34 @@ def _error(text: str, what: str) -> UsageError:
     return UsageError(f"light_groups={' '.join(text.split())!r}: {what}")
 
 
-def ids(emitter: mi.Emitter) -> list[str]:
-    """Return the names of an emitter: its shape's id, its own, or that of its plugin if it has none."""
-    shape = emitter.get_shape()
-    own = [owner.id() for owner in (shape, emitter) if owner is not None and owner.id()]
-    return own or [PLUGINS.get(emitter.class_name(), emitter.class_name())]
+def _ids(emitter: mi.Emitter) -> list[str]:
+    """Return an emitter's ids: its shape's and its own, if they have one."""
+    return [owner.id() for owner in (emitter.get_shape(), emitter) if owner is not None and owner.id()]
+
+
+def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
+    """Return a name for each emitter that a layer can have: its id or, if it has none, its plugin's name.
+
+    Of equal names, later ones have a number.
+    """
+    ids = [_ids(emitter) for emitter in emitters]
+
+    def order(i: int):
+        # Emitters of equal names by their place: the order of a scene's shapes may vary.
+        shape = emitters[i].get_shape()
+        return not ids[i], ids[i], str(emitters[i]) if shape is None else str(shape.bbox())
+
+    found, last = {}, Counter({REST: 1})
+    for i in sorted(range(len(emitters)), key=order):
+        plugin = emitters[i].class_name()
+        base = re.sub(r"[^A-Za-z0-9_-]", "_", (ids[i] or [PLUGINS.get(plugin, plugin)])[0])
+        name = base
+        while name in last:
+            last[base] += 1
+            name = f"{base}_{last[base]}"
+        last[name] = 1
+        found[i] = name
+    return [found[i] for i in range(len(emitters))]
 
 
 class LightGroups:
@@ -111,7 +136,8 @@ class LightGroups:
 def _matched(text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]) -> dict[int, str]:
     """Return the group of each emitter that is in one, by index."""
     found: dict[int, str] = {}
-    known = [ids(emitter) for emitter in emitters]
+    names = _layer_names(emitters)
+    known = [list(dict.fromkeys([*_ids(e), own])) for e, own in zip(emitters, names, strict=True)]
     for name, patterns in groups.items():
         for pattern in patterns:
             own = [i for i, names in enumerate(known) if any(fnmatchcase(n, pattern) for n in names)]
@@ -130,18 +156,10 @@ def _matched(text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]
     return found
 
 
-def _own(emitters: list[mi.Emitter]) -> dict[int, str]:
+def _own(emitters: Sequence[mi.Emitter]) -> dict[int, str]:
     """Return a name for each of the first `MOST_OWN` emitters by name, by index."""
 
-    def key(i: int):
-        # Emitters of equal names by their place: the order of a scene's shapes may vary.
-        shape = emitters[i].get_shape()
-        place = str(emitters[i]) if shape is None else str(shape.bbox())
-        return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", ids(emitters[i])[0])], place
+    def by_numbers(name: tuple[int, str]):
+        return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name[1])]
 
-    found: dict[int, str] = {}
-    for i in sorted(range(len(emitters)), key=key)[:MOST_OWN]:
-        base = re.sub(r"[^A-Za-z0-9_-]", "_", ids(emitters[i])[0])
-        names = [base, *(f"{base}_{n}" for n in range(2, len(emitters) + 2))]
-        found[i] = next(name for name in names if name not in (*found.values(), REST))
-    return found
+    return dict(sorted(enumerate(_layer_names(emitters)), key=by_numbers)[:MOST_OWN])

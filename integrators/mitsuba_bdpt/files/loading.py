@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean
 from ..image import features
-from ..settings import PARAMETERS
+from ..settings import NONE, PARAMETERS
 
 SCENES_OWN = "scene"
 """What ``--integrator`` calls the integrator of the scene file."""
@@ -492,7 +492,7 @@ def _added(layers: str, more: str) -> str:
     """Return the parameter ``layers`` with one ``more``; the plugin rejects what is no text."""
     if not isinstance(layers, str):
         return layers
-    return f"{layers},{more}" if layers else more
+    return more if layers in ("", NONE) else f"{layers},{more}"
 
 
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
@@ -522,7 +522,7 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         name, node = _nested(nodes, node)
         prefix += f"{name}." if kind == "aov" else ""
     if kind == "bdpt":
-        aovs += features.pairs(node.props.get("aovs", ""))
+        aovs += [pair for pair in features.pairs(node.props.get("aovs", "")) if pair != NONE]
         if "layers" in carried:
             carried["layers"] = _added(node.props.get("layers", ""), carried["layers"])
     return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
