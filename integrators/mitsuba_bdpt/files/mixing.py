@@ -47,8 +47,9 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     mixed = [np.zeros_like(values) for values in next(iter(layers.values())).values()]
     for layer, values in layers.items():
         for i, colour in enumerate(colours):
-            if factors[layer][i] > 0:  # infinite light of a layer may be switched off
-                mixed[i] += factors[layer][i] * values[colour]
+            factor = factors[layer][i]
+            if factor > 0:  # infinite light of a layer may be switched off
+                mixed[i] += factor * values[colour]
     has_alpha = "A" in channels
     try:
         with np.errstate(over="raise"):
