@@ -127,6 +127,9 @@ def test_crops_are_of_the_sweep(tmp_path):
         ("bdpt", "64 spp, 0.64 s", "relMSE 0.25 (trimmed)"),
     ]
     np.testing.assert_allclose(made.columns[1].errors, 0.25 / 1.01, rtol=1e-3)
+    rows = [row | ({"match": "spp"} if row["method"] == "path" else {}) for row in found.rows]
+    made = figures.cropped(tmp_path, Results(rows, found.references, {}), kept, "b")
+    assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
 
 
 @pytest.mark.parametrize("columns", [1, 2])

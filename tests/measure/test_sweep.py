@@ -706,6 +706,7 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (("seeds = 2", "seeds = 0"), "seeds=0 must be a whole number"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] of cornell_box must be as many as spp"),
         (("seeds = 2", "sedes = 2"), "sedes is not a key"),
+        (("seeds = 2", "seed = 2"), r"seed is not a key of a preset; there are .*; did you mean seeds\?$"),
         (('scenes = ["cornell_box"]', ""), "scenes is missing"),
         (("seeds = 2", 'clock = "sun"'), r"clock='sun' must be one of \('wall', 'processor'\)"),
         (("[2, 4]", "[2.5]"), r"spp=\[2.5\] must be a list of whole numbers"),
@@ -767,6 +768,22 @@ def test_rivals_are_those_that_see_the_media(name):
     assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
     assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
     assert making._way(scene, "path") == {"type": path_tracers(scene.has_media)[0]}
+
+
+def test_equal_time_is_the_default(tmp_path):
+    """Rationale: [[integrator]] without `match` had the samples of the first one, and figures said "equal
+    time". Expected: equal seconds for all but the first; the presets of the project keep their meaning."""
+    text = PRESET.replace('match = "seconds"', "") + '[[integrator]]\ntype = "ptracer"\nmatch = "spp"\n'
+    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
+    assert [m.match for m in preset.methods] == ["spp", "seconds", "spp"]
+    expected = {
+        "benchmark": ["bdpt", "bdpt skip=impossible", "bdpt points=independent"],
+        "merging": ["bdpt", "bdpt guided", "bdpt merging"],
+        "small": ["bdpt"],
+    }
+    for name, equal in expected.items():
+        methods = read_preset(REPOSITORY.preset(name), REPOSITORY).methods
+        assert [m.name for m in methods if m.match == "spp"] == equal
 
 
 def test_three_lines_are_a_preset(tmp_path):

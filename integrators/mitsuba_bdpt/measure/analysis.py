@@ -275,6 +275,15 @@ class Results:
         return [name for name in tracers if name in others] + [name for name in others if name not in known]
 
     @cached_property
+    def at_equal_samples(self) -> list[str]:
+        """Integrators with the samples of the first one, not its seconds."""
+        return [name for name in self.methods[1:] if self._a_row(name).get("match") == "spp"]
+
+    def _a_row(self, method: str) -> Row:
+        """Return a row of an integrator."""
+        return next(row for row in self.rows if row["method"] == method)
+
+    @cached_property
     def standard(self) -> list[str]:
         """Baselines of efficiencies by budget and of costs.
 

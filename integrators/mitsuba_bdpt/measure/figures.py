@@ -288,7 +288,10 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 
 
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
-    """Return the images of a scene's first seed at the deciding budget, rivals first, and the reference."""
+    """Return the images of a scene's first seed at the deciding budget, rivals first, and the reference.
+
+    Captions say which integrators have equal samples in place of equal time.
+    """
     columns: list[crops.Column] = []
     for method in [*results.rivals, results.methods[0]]:
         rows = results.of(scene, method, results.deciding)
@@ -296,7 +299,8 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
         if file is None or not file.exists():
             continue
         (image,), _ = read_layers(file, "")
-        columns.append(crops.judged(method, rows[0]["spp"], rows[0]["seconds"], image, kept.image))
+        called = f"{method} (equal spp)" if method in results.at_equal_samples else method
+        columns.append(crops.judged(called, rows[0]["spp"], rows[0]["seconds"], image, kept.image))
     if not columns:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
     return crops.Block(scene, tuple(columns), kept.image)

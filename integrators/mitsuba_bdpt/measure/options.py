@@ -164,8 +164,8 @@ class Figure(Options):
     plot: str = option(
         "samples",
         Choice(("samples", "seconds", "efficiency", "rays", "crops")),
-        "relMSE over samples or seconds, efficiencies, rays by kind, or images at equal time with magnified "
-        "windows and errors in false colours; default: %(default)s",
+        "relMSE over samples or seconds, efficiencies, rays by kind, or images (at equal time, unless the "
+        "preset has match = 'spp') with magnified windows and errors in false colours; default: %(default)s",
     )
     columns: int = _columns(1)
     scenes: tuple[str, ...] | None = option(

@@ -23,8 +23,8 @@ keys::
     name = "path multijitter"
     type = "path"
     sampler = "multijitter"
-    match = "seconds"      # as many samples as fit into the seconds of the first (the nearest power of two,
-                           # if the sampler is stratified); or "spp", the same samples
+    match = "seconds"      # the default: as many samples as fit into the seconds of the first (the nearest
+                           # power of two, if the sampler is stratified); or "spp", the same samples
     scenes = ["kitchen"]   # only there; default: in all
     media = false          # only in scenes without media; true: only in those with; default: both
     seeds = 5              # at most so many; default: all
@@ -59,7 +59,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import CommandError, message
+from ..errors import CommandError, did_you_mean, message
 from ..files.texts import list_of, read_toml, table_of, text_of, whole_of
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
@@ -157,8 +157,8 @@ DEFAULTS: dict[str, Any] = {
     "seeds": FEWEST_RUNS,
     "integrator": [
         {"type": "bdpt"},
-        {"type": "path", "media": False, "match": "seconds"},
-        {"type": "volpath", "media": True, "match": "seconds"},
+        {"type": "path", "media": False},
+        {"type": "volpath", "media": True},
     ],
 }
 """What a preset need not say: the package's integrator and Mitsuba's path tracer in equal time."""
@@ -247,7 +247,12 @@ def _names(path, key, value) -> list[str]:
 
 def _methods(path, entries, scenes) -> tuple:
     list_of(path, "integrator", entries, dict, "tables: write [[integrator]] and the keys of each below")
-    methods = tuple(_method(path, dict(entry), scenes) for entry in entries)
+    # The first sets the time, so that it alone has its samples by default.
+    defaults = ("spp", *("seconds",) * (len(entries) - 1))
+    methods = tuple(
+        _method(path, {"match": match} | entry, scenes)
+        for match, entry in zip(defaults, entries, strict=True)
+    )
     if len({m.name for m in methods}) < len(methods):
         raise CommandError(f"{path}: two integrators have the same name")
     first = methods[0]
@@ -270,7 +275,8 @@ def _probes(path, counts) -> dict:
 
 def _check_keys(path, entry, needed, allowed, what):
     if unknown := sorted(set(entry) - allowed):
-        raise CommandError(f"{path}: {unknown[0]} is not a key of {what}; there are {sorted(allowed)}")
+        there, near = f"there are {sorted(allowed)}", did_you_mean(unknown[0], sorted(allowed))
+        raise CommandError(f"{path}: {unknown[0]} is not a key of {what}; {there}; {near}".rstrip("; "))
     if missing := sorted(needed - set(entry)):
         more = "; list them, or name scene files by --scenes" if missing[0] == "scenes" else ""
         raise CommandError(f"{path}: {missing[0]} is missing{more}")
@@ -306,7 +312,7 @@ def _method(path, entry, scenes) -> Method:
     kind = text_of(path, "type of an integrator", entry["type"])
     name = text_of(path, "name of an integrator", entry.pop("name", kind))
     sampler = text_of(path, f"sampler of integrator {name!r}", entry.pop("sampler", "independent"))
-    match, only, seeds = entry.pop("match", "spp"), entry.pop("scenes", None), entry.pop("seeds", None)
+    match, only, seeds = entry.pop("match"), entry.pop("scenes", None), entry.pop("seeds", None)
     media = entry.pop("media", None)
     if "max_depth" in entry:
         raise CommandError(

@@ -591,6 +591,12 @@ def _clock(results: Results) -> str:
     return "Seconds are processor seconds, of all threads together.\n" if processor else ""
 
 
+def _equal_samples(results: Results) -> str:
+    """Name the integrators that are not at equal time."""
+    names = ", ".join(f"`{name}`" for name in results.at_equal_samples)
+    return f"Not at equal time, but with the samples of the first integrator: {names}. " if names else ""
+
+
 def _introduction(results: Results, name: str) -> str:
     """Introduce the figures, with machine and software."""
     return f"""# {name}
@@ -603,9 +609,9 @@ without the worst 0.1 % of values, {results.deciding} samples per pixel unless s
 of the reference's noise: raw, it is the variance over seeds; trimmed, the error against the reference less
 the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
 the figure is a bound, since rare light that was not met is in no variance: ≥ where the other integrator's
-error is at least the one measured, ≤ where the first integrator's is, ~ where both are. Samples for equal
-time follow from the seconds at the largest budget; seconds are those measured, so other budgets are compared
-as if errors fell with 1 / time. Where seeds were added until an interval was narrow enough, it is slightly
+error is at least the one measured, ≤ where the first integrator's is, ~ where both are. Times are equal at
+the largest budget, where the samples for equal time are found; seconds are those measured, so other budgets
+are compared as if errors fell with 1 / time. {_equal_samples(results)}Where seeds were added until an interval was narrow enough, it is slightly
 too narrow (it holds the median in 90 % of cases, not 95 %).
 {_clock(results)}"""
 
