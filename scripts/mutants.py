@@ -1325,7 +1325,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: t = 0 goes on",
         "transport/techniques.py",
-        "active &= ~walk.sds.ends(newest)",
+        "active &= ~walk.sds.ends(partial, newest)",
         "active &= mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1352,7 +1352,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: guided directions may be specular",
         "transport/photons/guided_hits.py",
-        "active &= ~is_specular(f)",
+        "active &= ~specular | z.sds.may_narrow(z.partial, newest)",
         "active &= mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1361,11 +1361,45 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: light that rays cannot hit is left out",
         "transport/sds.py",
-        "isolated = mis.is_used(walk.partial.d_vc)",
-        "isolated = mi.Bool(True)",
+        "possible = mis.is_used(walk.partial.d_vc)",
+        "possible = mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
         ),
+    ),
+    Mutant(
+        "near-specular guiding: paths without a diffuse vertex are not guided",
+        "transport/sds.py",
+        "return guided | (self.narrow & ~mis.is_connectible(partial, coefficient))",
+        "return guided",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: paths without a diffuse vertex are guided at their first lobe",
+        "transport/walk.py",
+        "step.delta | (specular & before.diffuse)",
+        "specular",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: guided directions go on past another lobe",
+        "transport/walk.py",
+        "            specular &= sds.diffuse",
+        "            pass",
+        (
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c0-half-True]",
+        ),
+    ),
+    Mutant(
+        "near-specular guiding: pilots see no gain on paths without a diffuse vertex",
+        "transport/photons/guiding_benefit.py",
+        "active &= ~is_specular(f) | (z.sds.may_narrow(z.partial, newest) & y.only_delta)",
+        "active &= ~is_specular(f)",
+        ("tests/images/test_near_specular_guiding.py::test_an_unrelated_ball_changes_no_prediction",),
     ),
     Mutant(
         "near-specular guiding: pilots leave out the light at any gain",

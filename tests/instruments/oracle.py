@@ -269,8 +269,10 @@ class Guided(Explicit):
     Events with at least the density ``least`` from both sides count as specular beside delta ones. An SDS
     path has no edge between two other vertices whose connection is in use. ``sds``: mask of those with
     another vertex, from emitters that can be hit: s = 0 and s = 1, and the same two (further columns) with a
-    guided direction at the first vertex that is not specular, seen from the emitter; ``guide`` (n, k + 1):
-    density of that direction at each vertex, as an attribute at the one that guides.
+    guided direction at the first vertex that is not specular, seen from the emitter. Also those without such
+    a vertex (``narrow``) that are SDS paths with delta events alone as specular ones: their guided direction
+    is at the first vertex that is not delta. ``guide`` (n, k + 1): density of that direction at each vertex,
+    as an attribute at the one that guides.
     """
 
     def __init__(self, paths: Paths, coefficients: Coefficients, guide, least: float):
@@ -279,10 +281,15 @@ class Guided(Explicit):
         specular = paths.delta | (np.minimum(paths.to_camera, paths.to_light) >= least)
         specular[:, [0, k]] = False
         used = np.array([coefficients.of(e + 1, k) > 0 for e in range(k)])  # s = e + 1 connects edge e
-        connectible = ~specular[:, :-1] & ~specular[:, 1:] & used
-        diffuse = ~specular[:, 1:k]
-        self.sds = ~connectible.any(1) & diffuse.any(1) & ~paths.delta_emitter
-        last = diffuse.argmax(1) + 1 if k > 1 else np.zeros(n, dtype=int)
+        by_specular, by_delta = (
+            ~(~events[:, :-1] & ~events[:, 1:] & used).any(1) & ~paths.delta_emitter
+            for events in (specular, paths.delta)
+        )
+        diffuse, lobes = ~specular[:, 1:k], ~paths.delta[:, 1:k]
+        self.narrow = by_delta & lobes.any(1) & ~diffuse.any(1)
+        self.sds = self.narrow | (by_specular & diffuse.any(1))
+        guides = np.where(self.narrow[:, None], lobes, diffuse)
+        last = guides.argmax(1) + 1 if k > 1 else np.zeros(n, dtype=int)
         rows = np.arange(n)
         self.guide = guide[rows, last].astype(np.float64)
         ratio = np.log(self.guide / paths.to_light[rows, last])

@@ -1089,18 +1089,21 @@ def test_kernel_guides_through_near_specular_events(name, classes, lens, monkeyp
     """Rationale: which paths are SDS paths, and so what is left out and what knows the guide, is decided by
     every strategy from its own subpaths. Guided subpaths are traced by the unchanged code along the paths, as
     if from a guide of densities over four orders of magnitude. 1,000 random paths each of k = 3, 4 and 5
-    edges, a tenth of the vertices delta, half of the others specular by their densities.
+    edges, a tenth of the vertices delta, half of the others specular by their densities; of 300 more than
+    half are delta, and all others specular.
 
     Expected: every weight, guided ones too, is the oracle's to 1e-3 of its own size and 0 where the oracle
     has none; the weights of each path sum to 1 within 1e-4. The estimate of guided s = 0 is the BSDF over the
     guide's density, to 1e-3.
     """
-    kappa, rng, total = COEFFICIENTS[classes], np.random.default_rng(12), 0
+    kappa, rng, total, narrow = COEFFICIENTS[classes], np.random.default_rng(12), 0, 0
     for k in (3, 4, 5):
         world = World(rng, 1000, k, lens, delta=0.1)
         world.mixed[:] = False  # the guide would follow the other lobes of these
         density = (10.0 ** rng.uniform(-2, 2, (1000, k + 1))).astype(np.float32)
         chosen = rng.random((1000, k + 1)) < 0.5
+        world.paths.delta[:300, 1:k] = rng.random((300, k - 1)) < 0.6
+        chosen[:300] = True
         for pdf in (world.paths.to_camera, world.paths.to_light):
             pdf[chosen] = np.maximum(pdf[chosen], 1.1 * near_specular.GUIDED)
         with monkeypatch.context() as patch:
@@ -1118,8 +1121,8 @@ def test_kernel_guides_through_near_specular_events(name, classes, lens, monkeyp
         value, plain = (np.array(world.values[s][0])[explicit.sds] for s in (k + 2, 0))
         # Stand-ins have value 1, and weight 1 where they are sampled.
         np.testing.assert_allclose(value, plain / explicit.guide[explicit.sds], rtol=1e-3)
-        total += explicit.sds.sum()
-    assert total > 100
+        total, narrow = total + explicit.sds.sum(), narrow + explicit.narrow.sum()
+    assert total > 100 and narrow > 30
 
 
 # -- layer 3: densities of real scenes ---------------------------------------------------------------

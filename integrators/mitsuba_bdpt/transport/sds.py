@@ -12,6 +12,8 @@ In such scenes photon-guided BSDF sampling takes for specular every event that i
 both sides (`is_specular`), a function of the path on which all strategies agree. Unlike delta events, these
 could be connected. On SDS paths with a diffuse vertex from emitters that rays can hit, all strategies but
 s = 0 and s = 1, guided or not, are left out: they rarely sample them, and need not know the guide's density.
+So is t = 0 on paths whose events are all specular, some of them not delta, and that are SDS paths by their
+delta events alone: they are guided at the last vertex whose event is not delta.
 """
 
 from __future__ import annotations
@@ -29,11 +31,12 @@ from .near_specular import GUIDED, is_narrow
 class State:
     """What a walk knows of an SDS path; None where it is not needed.
 
-    ``isolated``: no edge is connectible; ``only_delta``, on light subpaths with guiding: all events were
+    ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were
     delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
     (s = 0 by the guide, or by the BSDF) over its own; ``survived``, on photon subpaths of hard paths: the
     probability with which `SdsStrategy.survival` let it go on. Where near-specular events count as specular
-    ``specular``: the last event was; ``diffuse``: one before the next vertex was not.
+    ``specular``: the last event was; ``diffuse``: one before the next vertex was not; ``narrow``: all were,
+    some of them not delta, and no edge is connectible with delta events alone as specular ones.
     """
 
     isolated: mi.Bool | None = None
@@ -42,6 +45,7 @@ class State:
     survived: mi.Float | None = None
     specular: Any = None
     diffuse: Any = None
+    narrow: Any = None
 
     def scattered(self, specular: mi.Bool, coefficient: mis.Coefficient) -> State:
         """The state after an event; ``coefficient`` of the connection of the edge to it."""
@@ -52,14 +56,22 @@ class State:
         """Mask: a strategy connects the edge to the next vertex, whose event is ``specular``."""
         return ~(self.specular | specular) & mis.is_used(coefficient)
 
-    def ends(self, coefficient: mis.Coefficient) -> mi.Bool:
-        """Mask: an SDS path with a diffuse vertex if the next vertex, of the edge's class, is its end."""
-        return self.isolated & self.diffuse & ~self.is_connectible(False, coefficient)
+    def may_narrow(self, partial: mis.Partial, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: ``narrow`` after a near-specular event at the next vertex, of this ``partial``."""
+        return (self.only_delta | self.narrow) & ~mis.is_connectible(partial, coefficient)
+
+    def ends(self, partial: mis.Partial, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: a path that is guided if the next vertex, of this ``partial``, is its end.
+
+        ``coefficient`` of the class that connects the last edge.
+        """
+        guided = self.isolated & self.diffuse & ~self.is_connectible(False, coefficient)
+        return guided | (self.narrow & ~mis.is_connectible(partial, coefficient))
 
     def meets_end(self, f) -> mi.Bool:
         """Mask: an SDS path with a diffuse vertex if the next one, with BSDF ``f``, is connected to the end.
 
-        The strategy is in use.
+        The strategy is in use, so that the path is no other that is guided.
         """
         return self.isolated & self.diffuse & is_specular(f)
 
@@ -173,10 +185,11 @@ class SdsStrategy:
 
 def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **more):
     """``walk`` with the `State` of a subpath along which near-specular events count as specular."""
-    no, isolated = mi.Bool(False), mi.Bool(True)
+    no, possible = mi.Bool(False), mi.Bool(True)
     if light:  # s = 0 is its only alternative so far
-        isolated = mis.is_used(walk.partial.d_vc)
-    return begun(walk, State(isolated=isolated, guided=guided, specular=no, diffuse=no), **more)
+        possible = mis.is_used(walk.partial.d_vc)
+    events = State(specular=no, diffuse=no, narrow=no)
+    return begun(walk, replace(events, isolated=possible, only_delta=possible, guided=guided), **more)
 
 
 def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vn: mis.PartialSum = 0):

@@ -69,7 +69,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribut
     )
     sides = 0, camera_side
     if sds is not None and sds.near_specular:
-        on_sds_path = z.sds.ends(mis.choose(directly, kernel.kappa.endpoints, direct))
+        on_sds_path = z.sds.ends(z.partial, mis.choose(directly, kernel.kappa.endpoints, direct))
         alone = h.scale(z.partial.d_vcm, newest)
         sides = _beside_guided(kernel, z, on_sds_path, sides, alone, kernel.kappa.hit)
         active = sds.counts(active, on_sds_path)
@@ -301,7 +301,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     hard = h.scale(hard_merges_before_end(kernel, partial, newest, z.pdf_w), z.pdf_a)
     if kernel.guides_near_specular:
-        active &= ~walk.sds.ends(newest)
+        active &= ~walk.sds.ends(partial, newest)
     elif kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
         merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
         # The last edge is not connected either.

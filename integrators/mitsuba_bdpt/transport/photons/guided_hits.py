@@ -11,8 +11,9 @@ The weights of both contain that ratio, and so does that of t = 0, which evaluat
 first of the light subpath that is not delta.
 
 In scenes with near-specular lobes guided subpaths follow near-specular events too, and sample s = 1 as well:
-their lobes may be wider than the emitter is. The other strategies, t = 0 included, leave these paths out, see
-`sds`.
+their lobes may be wider than the emitter is. Paths without a diffuse vertex are guided at the last one whose
+event is not delta, if delta events isolate it. The other strategies, t = 0 included, leave these paths out,
+see `sds`.
 """
 
 from __future__ import annotations
@@ -221,21 +222,24 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     d, active = photon_guide.draw(guiding.guide, p, z.advice.found, u1, u2)
     pdf, local = guiding.density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
+    newest, specular = newest_coefficient(kernel, kernel.kappa.splat, z.edges), mi.Bool(False)
     if guiding.near_specular:  # else another vertex is the last diffuse one
-        active &= ~is_specular(f)
+        specular = is_specular(f)
+        active &= ~specular | z.sds.may_narrow(z.partial, newest)
     throughput = dr.select(active, z.throughput * f.value / pdf, 0)
     broken = not_finite(active, throughput)
     active &= (spectra.brightest(throughput) > 0) & ~broken
     no, unit = mi.Bool(False), mi.Float(1)
     step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), no, no, unit)
-    partial = mis.scatter(h, z.partial, newest_coefficient(kernel, kernel.kappa.splat, z.edges), step)
+    partial = mis.scatter(h, z.partial, newest, step)
     ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
     guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
     state = State(guided=guided)
     if guiding.near_specular:
-        state = replace(state, isolated=mi.Bool(True), specular=mi.Bool(False), diffuse=mi.Bool(True))
+        state = replace(state, isolated=mi.Bool(True), only_delta=mi.Bool(False))
+        state = replace(state, specular=specular, diffuse=~specular, narrow=specular)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
     if kernel.path_layers is not None:
         walk = replace(walk, layer=kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False))

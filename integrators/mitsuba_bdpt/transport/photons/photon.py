@@ -91,16 +91,17 @@ class ConnectedPhoton(Photon):
 class GuidingPhoton(Photon):
     """A photon of a guide through near-specular events; ``older`` and ``connection`` as above.
 
-    ``unconnected``: the part of ``older`` of s = 0 and s = 1.
+    ``unconnected``: the part of ``older`` of s = 0 and s = 1; ``only_delta``: only delta events before it.
     """
 
     connection: mi.Float
     unconnected: mi.Float
+    only_delta: mi.Bool
 
     @classmethod
     def types(cls) -> tuple[Any, ...]:
         """Types of the fields in the current variant, in order."""
-        return (*Photon.types(), mi.Float, mi.Float)
+        return (*Photon.types(), mi.Float, mi.Float, mi.Bool)
 
 
 @dataclass

@@ -127,7 +127,8 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         if near_specular:
-            older, more = y.partial.d_vc, (_connection(kernel, y), y.partial.d_vm)
+            older = y.partial.d_vc
+            more = _connection(kernel, y), y.partial.d_vm, walk.sds.only_delta
         elif kept is Kept.GUIDED:
             keep &= older > 0
         if kept is Kept.UNSAMPLED:
