@@ -8,6 +8,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -254,6 +255,41 @@ def test_references_go_on_where_they_stopped(project, job):
     assert reached and second.provenance["spp"] > first.provenance["spp"]
     third, reached = making.make(job(2, seconds=0))
     assert reached and third.provenance["spp"] == second.provenance["spp"]
+
+
+def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch):
+    """Rationale: a reference "for at most about 7.5 s" took 2 minutes: eight renders of 256 samples. Renders
+    take 1 s per sample here, after 10 s of compilation. Expected: of 266 s 236 remain after measuring, 80 %
+    of which hold eight renders of 16 samples, and the rest three more rounds; `bdpt`, which is judged, is
+    not rendered. Without time eight renders of 4, and a warning before. A longer run continues with whole
+    renders and other seeds, and keeps the means until it has as many of them."""
+    clock, seen = [0.0], []
+    render, name = making.mi.render, "cornell_box"
+
+    def rendered(scene, *, spp, seed, **more):
+        clock[0] += spp + (0 if seen else 10)
+        seen.append((seed, spp))
+        return render(scene, spp=1, seed=seed, **more)
+
+    monkeypatch.setattr(making, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(making.mi, "render", rendered)
+    made = making.obtained(job(2, seconds=266.0))
+    assert [spp for _, spp in seen] == [4, 16, *[16] * 14] and clock[0] <= 266
+    assert made.provenance["spp"] == 224 and made.means.columns.freedom == 13
+    assert "as many as fit into 266 s: go on by" in capsys.readouterr().out
+    for sums in (True, False):
+        if not sums:
+            (project.renders / "reference_cornell_box_8_2.npz").unlink()
+        made, _ = making.make(job(2, seconds=1))
+        assert made.means.columns.freedom == 13
+    seeds = [{seed for seed, n in seen[2:] if n == spp and seed >= making.FIRST_SEED} for spp in (16, 256)]
+    assert [len(one) for one in seeds] == [14, 2] and not seeds[0] & seeds[1]
+    seen.clear()
+    path = reference.reference_path(project, name, 8, 3)
+    making.obtained(job(3, seconds=20.0))
+    assert [spp for _, spp in seen] == [4, 16, *[4] * 8] and path.is_file()
+    out = capsys.readouterr().out
+    assert "warning: cornell_box: 20 s are too few for its reference, which takes about 62 s" in out
 
 
 def test_a_better_reference_stays(project, job):
@@ -943,9 +979,9 @@ def test_time_left_follows_from_work(monkeypatch, capsys):
     assert [showing.clock(s) for s in (59.6, 61, 3600)] == ["1:00", "1:01", "1:00:00"]
 
 
-def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
+def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
     """Expected: of 100 seconds the missing references of two scenes take 25 each at most, and the renders
-    what is left, half of all at least; --reference-seconds and no limit as they say."""
+    what is left; --reference-seconds and no limit as they say. What took longer is said."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool"]')
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     asked = []
@@ -956,7 +992,7 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
     limits, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(sweep.Sweep, "run", lambda self, progress, seconds: limits.append(seconds))
-    for spent, left in ((10.0, 90.0), (70.0, 50.0)):
+    for spent, left in ((10.0, 90.0), (70.0, 30.0), (170.0, 0.0)):
 
         def prepared(self, *_, spent=spent):
             clock[0] += spent
@@ -966,6 +1002,7 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
         asked = build_parser().parse_args(["sweep", "x", "--seconds", "100", "-o", str(tmp_path / "out")])
         sweep.swept(REPOSITORY, str(preset_file(tmp_path, text)), asked)
         assert limits[-1] == left
+    assert capsys.readouterr().out.count("took 70 s more than --seconds 100:") == 1
 
 
 def test_the_table_is_tidy(tmp_path):

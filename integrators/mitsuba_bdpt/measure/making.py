@@ -76,7 +76,12 @@ SAMPLER = "multijitter"
 OF_MEDIA = "independent"
 
 PASS_SPP = 256
-"""Samples per pixel of a render of the whole image."""
+"""Samples per pixel of a render of the whole image, where there is time."""
+
+LEAST_SPP, TRIAL_SPP = 4, 16
+"""Samples per pixel of such a render at least; and of one that measures the seconds of a sample."""
+
+FITTED = 0.8  # share of the time left for which renders are planned
 
 FIRST_SEED = 1_000_000  # far from the seeds of measurements
 WINDOW_PASSES = 4  # per render of a window
@@ -154,7 +159,8 @@ class Job:
     """A reference to be made.
 
     ``spp``: of the renders to judge; ``seconds``: time limit; ``rounds``: least number of rounds of two
-    renders; ``max_depth``: None for the project's; ``by``: a key of `WAYS` that replaces the recipe's.
+    renders, which have fewer samples if several would not fit into the limit; ``max_depth``: None for the
+    project's; ``by``: a key of `WAYS` that replaces the recipe's.
     """
 
     project: Project
@@ -187,7 +193,8 @@ class Job:
 def obtained(job: Job) -> Reference:
     """Return the stored reference, or make it.
 
-    A new one has enough renders for a bias check, and is reported on standard output. Raises ``CommandError``
+    A new one has enough renders for a bias check, with as many samples as the time allows, and is reported
+    on standard output. Raises ``CommandError``
     if the stored one is of another scene.
     """
     if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
@@ -267,12 +274,12 @@ def _pixels(image):
 class Halves:
     """Sums of two independent halves of the renders, stored in a file.
 
-    With ``counts`` of renders per pixel, the tile means of each whole render, and digests of the plugin's
-    sources.
+    With ``counts`` of renders per pixel, the tile means of each whole render (of those with the most samples,
+    ``times`` `PASS_SPP`), and digests of the plugin's sources.
     """
 
     def __init__(self, path: Path, key: str):
-        self.path, self.key, self.rounds, self.columns = path, key, 0, []
+        self.path, self.key, self.rounds, self.columns, self.times = path, key, 0, [], 0.0
         self.sums = self.counts = np.zeros(0)  # allocated in the first round
         self.sources: set[str] = set()
         self.earlier: Means | None = None
@@ -292,7 +299,7 @@ class Halves:
             print(f"{self.path}: of another scene, integrator or number of samples; begun anew")
             return
         self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
-        self.columns = list(kept["columns"])
+        self.columns, self.times = list(kept["columns"]), float(kept.get("times", 1.0))
         whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
         self.counts = kept.get("counts", whole)
         self.sources = set(kept["sources"].tolist())
@@ -310,7 +317,8 @@ class Halves:
             self.counts[window] = most
         self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
         self.sums *= self.counts
-        self.rounds = math.ceil((1 + len(windows)) * most)  # upper bound of the rounds rendered
+        upper = math.ceil((1 + len(windows)) * most)  # of the rounds rendered, in older files
+        self.rounds = max(upper, stored.provenance.get("rounds", 0))
         self.sources |= set(stored.provenance.get("sources", ()))  # missing in older files
         self.earlier = stored.means
 
@@ -319,7 +327,9 @@ class Halves:
         if len(self.columns) < FEWEST_RUNS:
             return self.earlier
         made = Means.of(self.columns)
-        return self.earlier.joined(made) if self.earlier else made
+        both = self.earlier.joined(made) if self.earlier else made
+        # Earlier renders may have had far fewer samples.
+        return both if both.whole.error <= made.whole.error else made
 
     def add(self, images, window=None, times: float = 1.0):
         """Add an image to each half, and store the sums.
@@ -333,11 +343,14 @@ class Halves:
             self.sums, self.counts = np.zeros((2, *images[0].shape)), np.zeros((*images[0].shape[:2], 1))
         self.sums[:, *(window or ())] += times * np.stack(images)
         self.counts[window or ...] += times
-        if window is None:
+        if window is None and times > self.times:
+            self.earlier, self.columns, self.times = self.means(), [], times
+        if window is None and times == self.times:
             self.columns += [tile_columns(image) for image in images]
         self.rounds += 1
         self.path.parent.mkdir(parents=True, exist_ok=True)
         kept = {"sums": self.sums, "counts": self.counts, "columns": np.array(self.columns)}
+        kept |= {"times": np.array(self.times)}
         kept |= {"earlier": json.dumps(kept_of(self.earlier))} if self.earlier else {}
         with replacing(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
@@ -361,25 +374,32 @@ class Aim:
     """
 
     def __init__(self, job: Job, scene, by: str):
-        self.name, self.depth, spp = job.scene.name, job.depth, job.spp
-        ours = {"type": "bdpt", "merging": by == "merging"}
-        rivals = [(ours, spp)] + [(_way(job.scene, by), TWICE * spp)] * (by == "path")
-        self.images = []
+        self.job, self.scene, self.by = job, scene, by
+
+    @cached_property
+    def images(self) -> list[np.ndarray]:
+        """Renders of them, with a few seeds."""
+        spp, found = self.job.spp, []
+        ours = {"type": "bdpt", "merging": self.by == "merging"}
+        rivals = [(ours, spp)] + [(_way(self.job.scene, self.by), TWICE * spp)] * (self.by == "path")
         for parameters, samples in rivals:
-            rival = integrator_of(parameters, job.depth)
+            rival = integrator_of(parameters, self.job.depth)
             for seed in range(TRIALS):
-                self.images.append(_pixels(mi.render(scene, integrator=rival, spp=samples, seed=seed)))
+                image = mi.render(self.scene, integrator=rival, spp=samples, seed=seed)
+                found.append(_pixels(image))
+        return found
 
-    def reached(self, reference: Reference) -> bool:
-        """Return whether the reference is good enough for their errors and a bias check.
-
-        Raises ``CommandError`` if it is black, since errors are relative.
-        """
+    def check(self, reference: Reference) -> None:
+        """Raise ``CommandError`` if a reference is black, since errors are relative."""
         if not reference.image.any():
             raise CommandError(
-                f"scene={self.name!r} is black: the samples of its reference found no light; check its "
-                f"lamps, its sensor and max_depth={self.depth}, or leave it out"
+                f"scene={self.job.scene.name!r} is black: the samples of its reference found no light; check "
+                f"its lamps, its sensor and max_depth={self.job.depth}, or leave it out"
             )
+
+    def reached(self, reference: Reference) -> bool:
+        """Return whether the reference is good enough for their errors and a bias check."""
+        self.check(reference)
         if reference.means is None:
             return False
         return all(
@@ -436,6 +456,7 @@ def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     """Return a rendered reference, and False if the time was over first."""
+    started = time.perf_counter()
     by = job.by or recipe.by
     parameters = _way(job.scene, by, recipe.merging_radius) | {"max_depth": job.depth}
     integrator = _loaded(parameters)
@@ -443,30 +464,20 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
     scene = job.scene.load(job.resolution, sampler)
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
-    aim = Aim(job, scene, by)
     windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
     if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
         halves.go_on_from(stored, [window.slices for window in windows])
-    started = time.perf_counter()
-    reached = halves.rounds > 0 and aim.reached(halves.reference({}))
-    with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
-        while halves.rounds < job.rounds or not (reached or time.perf_counter() - started > job.seconds):
-            behind = [w for w in windows if w.is_behind(halves)]
-            for window in behind:
-                halves.add(
-                    _pair(window.scene, integrator, halves, WINDOW_PASSES), window.slices, WINDOW_PASSES
-                )
-            if not behind:
-                halves.add(_pair(scene, integrator, halves))
-            reached = aim.reached(halves.reference({}))
-            show(time.perf_counter() - started)
+    spp = _fitting(job, scene, integrator, started) if job.rounds > 1 else PASS_SPP
+    reached = _refined(job, halves, Aim(job, scene, by), (scene, integrator, windows), spp, started)
     provenance = provenance_of(
         job,
         integrator=parameters,
         sampler=sampler,
         spp=round(2 * float(halves.counts.min()) * PASS_SPP),
         spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
+        spp_per_render=spp,
+        rounds=halves.rounds,
         first_seed=FIRST_SEED,
         sources=sorted(halves.sources),
         judges_spp=job.spp,
@@ -474,10 +485,64 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     return halves.reference(provenance), reached
 
 
-def _pair(scene, integrator, halves: Halves, times: int = 1):
+def _fitting(job: Job, scene, integrator, started: float) -> int:
+    """Return the samples per pixel of renders of which all of a job's rounds fit into its seconds.
+
+    A power of two, `LEAST_SPP` to `PASS_SPP`. Prints a warning where not even the least fit.
+    """
+
+    def seconds(spp: int) -> float:
+        began = time.perf_counter()
+        np.array(mi.render(scene, integrator=integrator, spp=spp, seed=FIRST_SEED - 1))
+        return time.perf_counter() - began
+
+    seconds(LEAST_SPP)  # compiles
+    of_a_sample = seconds(TRIAL_SPP) / TRIAL_SPP
+    spent = time.perf_counter() - started
+    wanted = FITTED * (job.seconds - spent) / (2 * job.rounds * of_a_sample)
+    if wanted < LEAST_SPP:
+        least = spent + 2 * job.rounds * LEAST_SPP * of_a_sample
+        print(
+            f"warning: {job.scene.name}: {job.seconds:g} s are too few for its reference, which takes about "
+            f"{least:.2g} s with the fewest samples ({spent:.2g} s to load and compile)",
+            flush=True,
+        )
+    return min(2 ** math.floor(math.log2(max(wanted, LEAST_SPP))), PASS_SPP)
+
+
+def _refined(job: Job, halves: Halves, aim: Aim, rendered: tuple, spp: int, started: float) -> bool:
+    """Add rounds to the ``halves`` until they are good enough or the time is over; return whether they are.
+
+    ``rendered``: scene, integrator and windows; ``spp``: of each render. Renders with less than `PASS_SPP`
+    are those that the time allows, so that it is not measured whether they are good enough.
+    """
+    scene, integrator, windows = rendered
+    is_short, times = spp < PASS_SPP, spp / PASS_SPP
+    # A round that would end too late does not begin, where several had to fit.
+    spent, last = 0.0, 0.0
+    reached = halves.rounds > 0 and not is_short and aim.reached(halves.reference({}))
+    with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
+        while halves.rounds < job.rounds or not (reached or spent + last > job.seconds):
+            began = time.perf_counter()
+            behind = [w for w in windows if w.is_behind(halves)]
+            for window in behind:
+                images = _pair(window.scene, integrator, halves, WINDOW_PASSES * spp)
+                halves.add(images, window.slices, WINDOW_PASSES * times)
+            if not behind:
+                halves.add(_pair(scene, integrator, halves, spp), times=times)
+            now = halves.reference({})
+            aim.check(now)
+            spent = time.perf_counter() - started
+            last = time.perf_counter() - began if job.rounds > 1 else 0.0
+            is_judged = job.rounds == 1 or not (is_short or spent > job.seconds)
+            reached = is_judged and aim.reached(now)
+            show(spent)
+    return reached
+
+
+def _pair(scene, integrator, halves: Halves, spp: int):
     """Render two images with different seeds."""
     seed = FIRST_SEED + 2 * halves.rounds
-    spp = times * PASS_SPP
     return [_pixels(mi.render(scene, integrator=integrator, spp=spp, seed=seed + i)) for i in (0, 1)]
 
 
@@ -513,7 +578,9 @@ def said(job: Job, made: Reference, reached: bool) -> str:
     if reached:
         return text
     own = job.project, job.project.called(job.scene), job.resolution, job.depth
-    return f"{text}, not good enough for {job.spp} spp: go on by {make_command(*own, '--spp', str(job.spp))}"
+    is_short = made.provenance.get("spp_per_render", PASS_SPP) < PASS_SPP
+    why = f"as many as fit into {job.seconds:.3g} s" if is_short else f"not good enough for {job.spp} spp"
+    return f"{text}, {why}: go on by {make_command(*own, '--spp', str(job.spp))}"
 
 
 def run(options: Namespace) -> int:
