@@ -35,7 +35,7 @@ from mitsuba_bdpt.measure import (
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import Cells, preset_of, read_preset
 from mitsuba_bdpt.measure.project import Project, depth_in
-from mitsuba_bdpt.measure.results import errors, write_tables
+from mitsuba_bdpt.measure.results import COLUMNS, errors, keep_missing, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
 from patience import PATIENCE
@@ -1038,6 +1038,11 @@ def test_the_table_is_tidy(tmp_path):
         write_tables([row, row | {"seed": 2, "key": "gone"}], tmp_path)
     first, second = csv.DictReader((tmp_path / "rows.csv").read_text().splitlines())
     assert not [cell for cell in first.values() if set(cell) & set("{}[]")]
+    assert first["sampler"] == "multijitter"
+    own = [
+        row | {"parameters": json.dumps({"type": "bdpt"} | more)} for more in ({}, {"points": "independent"})
+    ]
+    assert [COLUMNS["sampler"](one) for one in own] == ["sobol", "independent"]
     assert first["parameters"] == "path rr_depth=3" and first["integrator"] == "path multijitter"
     assert (first["variance"], first["energy"], first["rays_camera"], first["flip"]) == (
         "0.25",
@@ -1073,15 +1078,41 @@ def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
     made.run(showing.Renders(), seconds=5.5)
     assert [cell.seed for cell in found] == [1, 1, 1, 1, 2, 2]
     assert {cell.budget for cell in found[:4]} == {2, 4}
-    text = "cornell_box, 2 of 8 renders, from 4 spp of seed 2 on; run it again with --seconds 2, about"
-    assert made.cut == text
+    assert made.cut == {"cornell_box": "2 of 8 renders, from 4 spp of seed 2 on"} and made.wanted == 2
     made = sweep.Sweep(REPOSITORY, preset, tmp_path)
     made.run(showing.Renders(), seconds=100)
-    assert len(found) == 6 + 8 and made.cut == ""
+    assert len(found) == 6 + 8 and not made.cut
     made = sweep.Sweep(REPOSITORY, preset, tmp_path)
     made.run(showing.Renders(), seconds=0)
     assert [(cell.seed, cell.budget) for cell in found[14:]] == [(1, 2), (1, 2), (2, 2), (2, 2)]
-    assert made.cut.startswith("cornell_box, 4 of 8 renders, from 4 spp of seed 1 on")
+    assert made.cut["cornell_box"] == "4 of 8 renders, from 4 spp of seed 1 on"
+
+
+def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, swept):
+    """Expected: the scene, its renders and the command that renders them, until a run renders them; a run of
+    another scene leaves that as it is. Rows that another preset wrote into the folder are named."""
+    making.make(job(3))
+    path, output = preset_file(folder), folder / "out"
+    monkeypatch.setattr(sweep, "Bench", Clock)
+    words = path, "-o", output
+    assert swept(*words, "--seconds", "1e-9") == 0
+    assert (
+        "cut for lack of time: cornell_box, 4 of 8 renders, from 4 spp of seed 1 on"
+        in capsys.readouterr().out
+    )
+    text = report.missing_text(output)
+    assert text.startswith("**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders, ")
+    assert re.search(f"by `mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds [1-9]+`", text)
+    keep_missing(output, ["another"], {}, "")
+    assert report.missing_text(output) == text
+    assert swept(*words) == 0 and report.missing_text(output) == ""
+    assert "warning" not in capsys.readouterr().out
+    path = preset_file(folder, PRESET.replace('type = "path"', 'type = "ptracer"'))
+    assert swept(path, "-o", output) == 0
+    assert (
+        "4 rows are not of this preset, and no longer in the tables: cornell_box by path. Their renders "
+        in (capsys.readouterr().out)
+    )
 
 
 def keys(folder, text=PRESET):

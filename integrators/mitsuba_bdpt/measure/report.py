@@ -47,7 +47,7 @@ from .metrics import Estimate, rel_mse_epsilon
 from .project import Project
 from .record import Error, Row
 from .reference import Reference
-from .results import load
+from .results import load, missing_of
 from .tables import by_scene, ranged, ratio, relative, replace_part, said, table
 
 # -- tables -----------------------------------------------------------------------------------
@@ -597,11 +597,20 @@ def _equal_samples(results: Results) -> str:
     return f"Not at equal time, but with the samples of the first integrator: {names}. " if names else ""
 
 
-def _introduction(results: Results, name: str) -> str:
-    """Introduce the figures, with machine and software."""
-    return f"""# {name}
+def missing_text(folder: Path) -> str:
+    """Return the paragraph about renders that were cut, with the command that renders them; or nothing."""
+    found = missing_of(folder)
+    if not found:
+        return ""
+    cut = "; ".join(f"`{scene}`, {one['text']}" for scene, one in found.items())
+    commands = dict.fromkeys(one["command"] for one in found.values() if one["command"])
+    how = f" Render them by {', '.join(f'`{command}`' for command in commands)}." if commands else ""
+    return f"**Renders are missing**, cut for lack of time: {cut}.{how}\n\n"
 
-{MARK} from the data beside it. Machine and versions: {machine(results)}.
+
+def _introduction(results: Results) -> str:
+    """Introduce the figures, with machine and software."""
+    return f"""{MARK} from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
 median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
@@ -618,12 +627,19 @@ not 95 %).
 
 
 def page(
-    results: Results, made: dict[str, Reference], goals: list[Goal], notes: dict[str, str], name: str
+    results: Results,
+    made: dict[str, Reference],
+    goals: list[Goal],
+    notes: dict[str, str],
+    name: str,
+    missing: str = "",
 ) -> str:
-    """Return the page of all tables, as Markdown, under a title."""
+    """Return the page of all tables, as Markdown, under a title; ``missing``: see `missing_text`."""
     if unknown := sorted(set(notes) - set(results.scenes)):
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
-    return f"""{_introduction(results, name)}
+    return f"""# {name}
+
+{missing}{_introduction(results)}
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
@@ -680,6 +696,7 @@ class Report:
     goals: list[Goal]
     notes: dict[str, str]
     title: str
+    missing: str = ""
 
     @staticmethod
     def of(project: Project, folder: Path) -> Report:
@@ -690,11 +707,11 @@ class Report:
         for scene, text in kept["notes"].items():
             text_of(files["notes"], scene, text)
         goals = checked_goals(files["goals"], kept["goals"])
-        return Report(results, made, goals, kept["notes"], title(results, folder))
+        return Report(results, made, goals, kept["notes"], title(results, folder), missing_text(folder))
 
     def text(self) -> str:
         """Return the page of all tables, as Markdown."""
-        return page(self.results, self.made, self.goals, self.notes, self.title)
+        return page(self.results, self.made, self.goals, self.notes, self.title, self.missing)
 
     def draw(self, folder: Path) -> None:
         """Write the plots that the page shows."""

@@ -197,11 +197,59 @@ def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[
     return sorted(found, key=lambda row: order.index(row["scene"]))
 
 
+def lost(table: list[Row], output: Path) -> list[str]:
+    """Return messages about stored rows whose render is not among those of the ``table``."""
+    file = output / "rows.parquet"
+    if not table or not file.exists():
+        return []
+    keys = ["scene", "method", "budget", "seed"]
+    try:
+        before = pyarrow.parquet.read_table(file, columns=keys).to_pylist()
+    except pyarrow.ArrowInvalid:  # damaged: it is written anew
+        return []
+    kept = {tuple(row[key] for key in keys) for row in table}
+    gone = [row for row in before if tuple(row[key] for key in keys) not in kept]
+    if not gone:
+        return []
+    names = ", ".join(dict.fromkeys(f"{row['scene']} by {row['method']}" for row in gone))
+    text = (
+        f"{output}: {len(gone)} rows are not of this preset, and no longer in the tables: {names}. Their "
+        "renders are kept: sweep the earlier preset again to have its rows, and name another folder by -o"
+    )
+    return [text]
+
+
+def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:
+    """Write what was cut of the ``scenes``, with the ``command`` that renders it, for the report.
+
+    Entries of other scenes stay.
+    """
+    file = output / "missing.json"
+    kept = {name: one for name, one in missing_of(output).items() if name not in scenes}
+    kept |= {name: {"text": text, "command": command} for name, text in cut.items()}
+    if kept:
+        write_json(file, kept)
+    else:
+        file.unlink(missing_ok=True)
+
+
+def missing_of(output: Path) -> dict[str, dict[str, str]]:
+    """Return what `keep_missing` wrote, by scene."""
+    file = output / "missing.json"
+    return read_json(file, "delete it, and sweep again") if file.exists() else {}
+
+
+def _sampler(row: Row) -> str:
+    """Return the random numbers of a render: `bdpt` has its own, its ``points``."""
+    given = json.loads(row["parameters"])
+    return given.get("points", "sobol") if given.get("type") == "bdpt" else row["sampler"]
+
+
 COLUMNS: dict[str, Callable[[Row], object]] = {
     "scene": lambda row: row["scene"],
     "integrator": lambda row: row["method"],
     "parameters": lambda row: _plain(row["parameters"]),
-    "sampler": lambda row: row["sampler"],
+    "sampler": _sampler,
     "spp": lambda row: row["spp"],
     "seed": lambda row: row["seed"],
     "clock": lambda row: row.get("clock", "wall"),

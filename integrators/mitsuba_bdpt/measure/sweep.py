@@ -52,6 +52,8 @@ from .results import (
     decisive,
     first_image_file,
     judge_of,
+    keep_missing,
+    lost,
     read_rows,
     rows,
     store,
@@ -216,11 +218,13 @@ def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
 class Sweep:
     """A preset being rendered into a folder.
 
-    ``failed``: messages of failures; ``cut``: what was left out for lack of time.
+    ``failed``: messages of failures; ``cut``: what was left out for lack of time, by scene; ``wanted``: the
+    seconds that it needs.
     """
 
     def __init__(self, project: Project, preset: Preset, output: Path):
-        self.project, self.preset, self.output, self.cut = project, preset, output, ""
+        self.project, self.preset, self.output = project, preset, output
+        self.cut, self.wanted = dict[str, str](), 0
         self.failed = list(preset.left_out)
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
@@ -299,7 +303,7 @@ class Sweep:
         Two seeds of the smallest budget are rendered in any case: with fewer there is no figure.
         """
         started = time.monotonic()
-        total, done, cut = sum(map(len, self._todo)), 0, list[str]()
+        total, done = sum(map(len, self._todo)), 0
         for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
             bench, end = Bench(cells, self.output), started + seconds * (i + 1) / len(self.scenes)
             self._first_images(cells)
@@ -313,10 +317,8 @@ class Sweep:
                     done += 1
             if late:
                 which = f"from {late[0].budget} spp of seed {late[0].seed} on"
-                cut.append(f"{cells.subject.name}, {len(late)} of {len(missing)} renders, {which}")
-        if cut:
-            wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
-            self.cut = f"{'; '.join(cut)}; run it again with --seconds {wanted}, about"
+                self.cut[cells.subject.name] = f"{len(late)} of {len(missing)} renders, {which}"
+        self.wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
 
     def _first_images(self, cells: Cells):
         """Render the missing first images of a scene, at its smallest budget."""
@@ -502,8 +504,13 @@ def swept(
     table = sweep.rows()
     if options.scenes or whole.scenes is None:
         table = beside(table, whole.scenes, output)
+    for told in lost(table, output):
+        print(f"warning: {told}")
     if table:
         write_tables(table, output)
+    command = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
+    scenes = [subject.name for subject in whole.subjects]
+    keep_missing(output, scenes, sweep.cut, f"{command} --seconds {sweep.wanted}" if command else "")
     _tell(sweep, table)
     late = time.monotonic() - began - (options.seconds or math.inf)
     if late > 1:
@@ -551,7 +558,8 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
     """Print what time did not allow, warnings, and the number of rows."""
     # What was cut comes first: the figures depend on it.
     if sweep.cut:
-        print(f"cut for lack of time: {sweep.cut}")
+        cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
+        print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
