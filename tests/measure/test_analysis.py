@@ -14,7 +14,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
-from mitsuba_bdpt.measure import analysis, reference, report, tables
+from mitsuba_bdpt.measure import analysis, estimates, reference, report, tables
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Refused, Results
 from mitsuba_bdpt.measure.preset import read_preset
@@ -128,7 +128,7 @@ def test_scenes_with_the_largest_gap_come_first():
     text = report.gaps_table(found)
     assert [line.split("`")[1] for line in text.splitlines()[2:]] == ["spots", "even", "alone"]
     assert cells(text, "`spots`") == ["8x (8–8)", "2x (2–2)"]
-    assert cells(text, "`alone`") == ["fewer than two renders"] * 2
+    assert cells(text, "`alone`") == ["fewer than two renders: seeds = 2 or more"] * 2
 
 
 def test_widths_are_those_of_the_interval_of_the_median():
@@ -306,7 +306,7 @@ def test_goals_stand_beside_what_is_measured(results):
     assert cells(text, "alone") == [
         "1x",
         "–",
-        "fewer than two renders at 64 spp, fewer than two renders at 256 spp",
+        ", ".join(f"fewer than two renders: seeds = 2 or more at {budget} spp" for budget in (64, 256)),
     ]
     assert cells(text, "none") == ["2x", "–", "3x trimmed, 3x raw, 2 of 2 scenes"]
     fog = noisy("bdpt", 16) + noisy("bdpt skip=none", 16, seconds=24.0) + noisy("volpath", 16)
@@ -459,7 +459,7 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     assert "| the reference has fewer than 8 renders, by `path` |" in report.checks_table(few, MADE, {})
     assert "| the reference has fewer than 8 renders |" in report.errors_table(few)
     alone = report.errors_table(Results(rows[:1], {"box": KNOWN}, {})).splitlines()[2]
-    assert alone.endswith("| fewer than three renders | fewer than two renders |")
+    assert alone.endswith("| fewer than three renders | fewer than two renders: seeds = 2 or more |")
 
 
 def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
@@ -481,6 +481,49 @@ def test_a_report_has_the_name_of_its_scene_or_preset(results, tmp_path):
     """Expected: of a single scene its name, of several that of the folder, which is the preset's."""
     assert report.title(Results(runs("bdpt", 2), {}, {}), tmp_path) == "Box"
     assert report.title(results, tmp_path / "rooms") == "Rooms"
+
+
+def test_a_path_tracer_is_known_by_its_type():
+    """Rationale: "over the stronger `path`" left out `path` under another name. Expected: both, the stronger
+    first among the words; `bdpt` under a name that begins with "path" is none."""
+    ways = {"path": "path", "my tracer": "path", "path of mine": "bdpt", "bdpt": "bdpt"}
+    errors = {"path": 0.04, "my tracer": 0.03}
+    found = [
+        row(name, seed, parameters=json.dumps({"type": kind}), rel_mse_trimmed=errors.get(name, 0.02))
+        for name, kind in ways.items()
+        for seed in (1, 2)
+    ]
+    results = Results(found, {"box": KNOWN}, {})
+    assert results.standard == ["path", "my tracer"] and results.tracer("box") == "path"
+    assert results.against_path("box").median == pytest.approx(1.5)
+    assert report.stronger(results) == "the strongest of path, my tracer"
+
+
+def test_a_single_seed_has_no_sentence_about_ratios():
+    """Expected: neither plot nor sentence where no efficiency can be computed; an integrator that has the
+    samples of the first one is not said to be at equal time."""
+    found = Results([row(method, match="spp") for method in ("bdpt", "path")], {"box": KNOWN}, {})
+    text = report.page(found, {"box": image_of_two()}, [], {}, "Box", "**Renders are missing**\n\n")
+    assert text.startswith("# Box\n\n**Renders are missing**\n\nMade by")
+    assert "By budget" not in text and "efficiency.png" not in text and not found.has_efficiency(["box"])
+    assert "Not at equal time, but with the samples of the first integrator: `path`." in text
+    several = [row(method, seed) for method in ("bdpt", "path") for seed in (1, 2)]
+    text = report.page(Results(several, {"box": KNOWN}, {}), {"box": image_of_two()}, [], {}, "Box")
+    assert "By budget" in text and "efficiency.png" in text and "Not at equal time" not in text
+
+
+def image_of_two():
+    provenance = {"integrator": {"type": "path"}, "max_depth": 3}
+    return Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
+
+
+def test_an_interval_that_says_nothing_is_none():
+    """Rationale: two seeds gave "9.29e+02 (7.09e-08–1.22e+13)". Expected: words from a ratio of 1000 on."""
+    made = [
+        tables.relative(estimates.RelativeError(analysis.Estimate(1.0, low, high), "", None, None))
+        for low, high in ((0.1, 10), (1e-3, 10), (0.0, 10))
+    ]
+    assert made == ["1.00e+00 (1.00e-01–1.00e+01)", *["1.00e+00 (too few renders for an interval)"] * 2]
 
 
 def test_parts_of_the_readme_are_replaced():

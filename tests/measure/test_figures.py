@@ -16,6 +16,13 @@ METHODS = ("bdpt", "path", "path multijitter", "bdpt skip=none", "an integrator 
 KNOWN = Means.known(np.full((4, 4, 3), 2.0))
 
 
+@pytest.fixture(autouse=True)
+def closed():
+    """Figures that a test keeps are closed after it."""
+    yield
+    figures.plt.close("all")
+
+
 def results(scenes=("a_caustic_with_a_long_name", "b")):
     """Errors c / spp at four budgets; `path` lacks a tenth of the light, its errors are lower bounds."""
     rng, rows = np.random.default_rng(1), []
@@ -212,6 +219,59 @@ def test_curves_are_raw_and_trimmed(monkeypatch):
     assert axis.get_xscale() == axis.get_yscale() == "log"
 
 
+def test_one_budget_has_points(monkeypatch):
+    """Rationale: of a single budget the trimmed error was a line without length, without marker. Expected: a
+    marker for each integrator, raw and trimmed, and two labels at each axis."""
+    found = saved(monkeypatch, figures)
+    kept = results(("b",))
+    one = Results([row for row in kept.rows if row["budget"] == 16], kept.references, {})
+    figures.convergence(one, "spp", None, 1, ("b",))
+    (axis,) = found[0].axes
+    dashed = [line for line in axis.lines if line.get_linestyle() == "--"]
+    assert len(dashed) == len(METHODS) and all(line.get_marker() not in ("", "None") for line in dashed)
+    for side in (axis.xaxis, axis.yaxis):
+        low, high = sorted(side.get_view_interval())
+        assert sum(low <= tick <= high for tick in side.get_majorticklocs()) >= 2
+
+
+def test_the_legend_of_efficiencies_has_the_markers_of_the_data(monkeypatch):
+    """Expected: trimmed and raw with the marker of an integrator that is drawn, the interval, and a marker of
+    size for an integrator with a name of its own."""
+    figure = drawn(monkeypatch, "efficiency", 1, ("b",))
+    handles = {handle.get_label(): handle for handle in figure.legends[0].legend_handles}
+    drawn_ones = {line.get_marker() for line in figure.axes[0].lines}
+    assert {handles[name].get_marker() for name in ("trimmed", "raw")} <= drawn_ones
+    assert "95 % interval" in handles and handles[f"over {METHODS[-1]}"].get_marker() not in (".", ",")
+
+
+def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
+    """Rationale: an empty plot, and status 0. Expected: what is missing, and the key that mends it."""
+    kept = results(("b",))
+    one = Results([row for row in kept.rows if not row["seed"]], kept.references, {})
+    monkeypatch.setattr(figures, "load", lambda project, folder: (one, {}))
+    words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "efficiency"}
+    with pytest.raises(CommandError, match="two renders of each integrator; set seeds = 2 or more"):
+        figures.run(Namespace(**words, scenes=None, columns=1))
+
+
+def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
+    """Expected: a warning with the height and the option that mends it; none for one scene. The scale of
+    errors has the same name at each width."""
+    kept, found = results(("a", "b")), saved(monkeypatch, crops)
+    monkeypatch.setattr(figures, "load", lambda project, folder: (kept, dict.fromkeys("ab")))
+    monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
+    words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "crops"}
+    for scenes in (None, ["b"]):
+        figures.run(Namespace(**words, scenes=scenes, columns=2))
+    assert re.search(r"a.pdf is 4\d cm tall, more .*: draw fewer scenes by --scenes", capsys.readouterr().out)
+    assert found[1].get_size_inches()[1] * 2.54 < figures.PAGE
+    crops.draw([block(3)], None, 1)
+    for figure in found:
+        names = [axis.get_xlabel() for axis in figure.axes if axis.get_xlabel()]
+        assert {" ".join(name.split()) for name in names} == {"squared relative error"}
+    check_texts(found[-1])
+
+
 @pytest.mark.parametrize("ending", ["pdf", "svg", "png"])
 def test_the_format_is_that_of_the_ending(tmp_path, ending):
     """Expected: a file of that format, the same bytes each time, of exactly 8.5 cm."""
@@ -220,6 +280,8 @@ def test_the_format_is_that_of_the_ending(tmp_path, ending):
         figures.PLOTS["efficiency"](results(("b",)), file, 1, ("b",))
     data = files[0].read_bytes()
     assert data == files[1].read_bytes()
+    if ending == "svg":
+        assert b">over path</text>" in data
     if ending == "pdf":
         assert data.startswith(b"%PDF")
         width = float(re.search(rb"/MediaBox \[\s*0 0 ([\d.]+)", data)[1])

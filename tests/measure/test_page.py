@@ -164,7 +164,7 @@ def results(outcome, lacks=""):
     return SimpleNamespace(
         against_path=against_path,
         path_lacks=lambda scene: lacks,
-        standard_in=lambda _: ["path", "path multijitter"],
+        tracer=lambda _: "path",
     )
 
 

@@ -41,6 +41,10 @@ LIGHT_TRACER = "ptracer"
 DECIDING = 64
 
 
+ALONE_HERE = "fewer than two renders: seeds = 2 or more"
+"""Why there is no figure, with the preset's key that mends it."""
+
+
 class Refused(CommandError):
     """A figure that cannot be computed from the data; the text has the reason."""
 
@@ -166,7 +170,7 @@ def efficiency(
     than two pairs, and for errors of 0.
     """
     if len(ours) < 2 or len(theirs) < 2:
-        raise Refused("fewer than two renders")
+        raise Refused(ALONE_HERE)
     ratios, bound = _ratios(ours, theirs, error, differ)
     return replace(summary(ratios), bound=bound)
 
@@ -174,7 +178,7 @@ def efficiency(
 def gap(rows: Sequence[Row], differs: bool = False) -> Summary:
     """Return the summary of raw over trimmed relMSE: large where few values carry most of the error."""
     if len(rows) < 2:
-        raise Refused("fewer than two renders")
+        raise Refused(ALONE_HERE)
     (raw, _), (trimmed, _) = (seed_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
     if min(*raw, *trimmed) == 0:
         raise Refused(f"{rows[0]['method']} is exact here")
@@ -287,9 +291,30 @@ class Results:
     def standard(self) -> list[str]:
         """Baselines of efficiencies by budget and of costs.
 
-        `path` with each sampler, `volpath` and `volpathmis`; other rivals if none of these was rendered.
+        `path`, `volpath` and `volpathmis`, by any name; other rivals if none of these was rendered.
         """
-        return [rival for rival in self.rivals if rival in (*RIVALS, *MEDIA_RIVALS)] or self.rivals
+        tracers = RIVALS[0], *MEDIA_RIVALS
+        return [rival for rival in self.rivals if self.kind(rival) in tracers] or self.rivals
+
+    def kind(self, method: str) -> str:
+        """Return the type of an integrator; of one without parameters, the first word of its name."""
+        given = [row.get("parameters") for row in self.rows if row["method"] == method][:1]
+        return json.loads(given[0])["type"] if given and given[0] else method.split()[0]
+
+    def tracer(self, scene: str) -> str:
+        """Return the type of the last of `standard` in a scene."""
+        return self.kind((self.standard_in(scene) or RIVALS)[-1])
+
+    def has_efficiency(self, scenes: Sequence[str]) -> bool:
+        """Return whether the first integrator has an efficiency over a rival in one of the ``scenes``."""
+        for scene in scenes:
+            for rival in self.rivals:
+                try:
+                    self.efficiency(scene, rival)
+                except Refused:
+                    continue
+                return True
+        return False
 
     def standard_in(self, scene: str) -> list[str]:
         """Return the `standard` integrators that were rendered in a scene."""
@@ -349,7 +374,7 @@ class Results:
         counts = Counter(row["budget"] for row in rows)
         several = [n for n, count in counts.items() if count > 1]
         if not several:
-            raise Refused("fewer than two renders")
+            raise Refused(ALONE_HERE)
         if scene not in self.references:
             raise Refused(FEW)
         budget = self.deciding if counts[self.deciding] > 1 else max(several)

@@ -24,7 +24,7 @@ COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
 ERRORS = {"norm": LogNorm(1e-5, 10), "cmap": "viridis"}
 
 GAP, LINE = 0.03, 0.105  # inches between images, and per line of text
-SCALE = 0.38  # inches of the scale of errors, with its labels
+SCALE = 0.48  # inches of the scale of errors, with its labels in two lines
 CHARACTER = 0.052  # inches
 SMALL = 6  # points
 
@@ -105,8 +105,8 @@ class _Layout:
         return self.head + self.height + self.window + max(self.height, SCALE) + 3 * GAP
 
 
-def draw(blocks: Sequence[Block], file: Path, columns: int) -> None:
-    """Draw the ``blocks`` under each other, as wide as so many columns of a page.
+def draw(blocks: Sequence[Block], file: Path, columns: int) -> float:
+    """Draw the ``blocks`` under each other, as wide as so many columns; return the height in inches.
 
     In each, a column per image, the reference last: image, windows, errors in false colours.
     """
@@ -120,6 +120,7 @@ def draw(blocks: Sequence[Block], file: Path, columns: int) -> None:
             _block(figure, block, layout, top)
             top -= layout.whole
         save(figure, file)
+    return tall
 
 
 def _axis(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
@@ -169,9 +170,8 @@ def _bar(figure: Figure, left: float, top: float, layout: _Layout) -> None:
     """Draw the scale of the errors in the place below the reference."""
     axis = _axis(figure, left + 0.08 * layout.width, top - GAP, 0.84 * layout.width, 0.07)
     bar = figure.colorbar(ScalarMappable(**ERRORS), cax=axis, orientation="horizontal")
-    bar.set_label(
-        "squared relative error" if layout.width > 1 else "squared error", fontsize=SMALL, labelpad=0
-    )
+    between = " " if layout.width > 1 else "\n"
+    bar.set_label(f"squared{between}relative error", fontsize=SMALL, labelpad=0)
     bar.set_ticks([1e-4, 1e-2, 1])
     bar.ax.tick_params(labelsize=SMALL, pad=1, length=2)
     bar.ax.minorticks_off()

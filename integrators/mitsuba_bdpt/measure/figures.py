@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..errors import CommandError
 from ..files.images import read_layers
@@ -53,7 +53,7 @@ STYLES = {
     MEDIA_RIVALS[1]: ("#E69F00", "D"),
     LIGHT_TRACER: ("#CC79A7", "x"),
 }
-PLAIN = (("#000000", "."), ("#882255", "h"), ("#117733", "<"), ("#332288", ">"))
+PLAIN = (("#000000", "p"), ("#882255", "*"), ("#117733", "<"), ("#332288", ">"))
 """Of other integrators, in turn."""
 
 RAYS = {
@@ -71,6 +71,7 @@ DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
 SHORT = 30.0  # ratio of the ends of a logarithmic axis
+PAGE = 29.7  # cm, the height of A4
 BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
 
 
@@ -135,7 +136,9 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
                 continue
             look = style(results.methods, method) | {"linestyle": DASHES[error]}
             x, low, middle, high = points.T
-            axis.plot(x, middle, **look | ({} if error == "rel_mse" else {"marker": ""}))
+            # A single point has no line.
+            is_plain = error != "rel_mse" and len(points) > 1
+            axis.plot(x, middle, **look | ({"marker": ""} if is_plain else {}))
             if error == "rel_mse":
                 axis.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
                 hollow = np.array([bool(bound) for bound in bounds])
@@ -150,14 +153,19 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
 
 
 def _ticks(side) -> None:
-    """Label powers of ten of a logarithmic axis; where there are few, 2 and 5 times these too."""
+    """Label powers of ten of a logarithmic axis; where there are few, 2 and 5 times these too, or others."""
     low, high = side.get_view_interval()
     side.set_minor_formatter(NullFormatter())
-    if high < SHORT * low:
-        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
-        side.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.10g}"))
-    else:
-        side.set_major_locator(LogLocator(numticks=6))
+    powers, fine = LogLocator(numticks=6), LogLocator(subs=(1.0, 2.0, 5.0), numticks=12)
+
+    def several(locator) -> bool:
+        return sum(low <= tick <= high for tick in locator.tick_values(low, high)) > 1
+
+    if high >= SHORT * low and several(powers):
+        side.set_major_locator(powers)
+        return
+    side.set_major_locator(fine if several(fine) else MaxNLocator(4, steps=[1, 2, 5, 10]))
+    side.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.10g}"))
 
 
 def _points(
@@ -212,15 +220,17 @@ def efficiencies(
         axis.set_ylim(len(scenes) - 0.5, -0.5)
         axis.grid(axis="x")
         axis.set_axisbelow(True)
+        shown = [rival for rival in rivals if any(results.of(scene, rival) for scene in scenes)]
+        looks = [style(results.methods, rival) for rival in shown]
         handles = [
-            Line2D([], [], label=f"over {rival}", **style(results.methods, rival) | {"linestyle": ""})
-            for rival in rivals
-            if any(results.of(scene, rival) for scene in scenes)
+            Line2D([], [], label=f"over {rival}", **look | {"linestyle": ""})
+            for rival, look in zip(shown, looks, strict=True)
         ]
-        plain = {"color": "black", "linestyle": "", "marker": "o"}
+        plain = {"color": "#666666", "linestyle": "", "marker": looks[0]["marker"] if looks else "o"}
         handles += [
             Line2D([], [], label="trimmed", **plain),
             Line2D([], [], label="raw", markerfacecolor="white", **plain),
+            Line2D([], [], label="95 % interval", color="#666666", linewidth=0.8),
             Line2D(
                 [], [], label="at least, at most", **plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
             ),
@@ -319,9 +329,19 @@ def run(options: Namespace) -> int:
     if options.plot == "efficiency" and not results.rivals:
         raise CommandError(f"{folder} has no other integrator than {results.methods[0]} to compare with")
     scenes = options.scenes or results.scenes
+    if options.plot == "efficiency" and not results.has_efficiency(scenes):
+        raise CommandError(
+            f"{folder}: no efficiency can be computed, which takes two renders of each integrator; set "
+            "seeds = 2 or more in the preset and sweep again, which renders the others"
+        )
     if options.plot == "crops":
         blocks = [cropped(folder, results, made[scene], scene) for scene in scenes]
-        crops.draw(blocks, output, options.columns)
+        tall = 2.54 * crops.draw(blocks, output, options.columns)
+        if tall > PAGE:
+            print(
+                f"warning: {output} is {tall:.0f} cm tall, more than a page (A4 has {PAGE:g} cm): draw fewer "
+                f"scenes by --scenes, such as --scenes {scenes[0]!r}"
+            )
     else:
         PLOTS[options.plot](results, output, options.columns, scenes)
     print(output)

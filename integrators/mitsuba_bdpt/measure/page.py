@@ -22,7 +22,7 @@ from markdown_it import MarkdownIt
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..files.whole import check_own
-from .analysis import NOTHING, RIVALS, Refused, Results
+from .analysis import NOTHING, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
 from .report import Report
@@ -61,7 +61,7 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
 
     The ratio is infinite where path tracers find nothing, NaN where there is none.
     """
-    rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+    rival = results.tracer(scene)
     lacks = results.path_lacks(scene)
     try:
         found = results.against_path(scene)

@@ -33,7 +33,7 @@ PAPER = {
     "xtick.major.width": 0.5,
     "ytick.major.width": 0.5,
     "pdf.fonttype": 42,
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
     "svg.hashsalt": "mitsuba-bdpt",
 }
 

@@ -341,7 +341,7 @@ def gallery(results: Results) -> str:
 
     def figure(scene: str) -> str:
         lacks = results.path_lacks(scene)
-        rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+        rival = results.tracer(scene)
         return ranged(results.against_path(scene)) + (f"<br>`{rival}`: {lacks}" if lacks else "")
 
     cells = [
@@ -372,7 +372,7 @@ Goal = dict[str, Any]
 def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> str:
     """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
     lacks = results.path_lacks(scene)
-    rival = (results.standard_in(scene) or RIVALS)[-1].split()[0]
+    rival = results.tracer(scene)
     return ranged(results.against_path(scene, error)) + (f"; `{rival}`: {lacks}" if lacks else "")
 
 
@@ -613,7 +613,8 @@ def _introduction(results: Results) -> str:
     return f"""{MARK} from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
-median (smallest–largest) over seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
+median (smallest–largest) over seeds; the figure has the 95 % interval of the median, which is the same range
+for up to five seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
 without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. Its expectation is free
 of the reference's noise: raw, it is the variance over seeds; trimmed, the error against the reference less
 the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
@@ -624,6 +625,13 @@ are compared as if errors fell with 1 / time. {_equal_samples(results)}Where see
 added until an interval was narrow enough, it is slightly too narrow (it holds the median in 90 % of cases,
 not 95 %).
 {_clock(results)}"""
+
+
+def _by_budget(results: Results) -> str:
+    """Return the table of efficiencies by budget with its sentence; nothing where there are none."""
+    found = budgets_table(results)
+    which = f"over {stronger(results)} of those that pass the bias check, or of all where none does"
+    return f"By budget, {which}:\n\n{found}\n" if found else ""
 
 
 def page(
@@ -643,13 +651,10 @@ def page(
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
-{"![Efficiency per scene](efficiency.png)" if results.rivals else ""}
+{"![Efficiency per scene](efficiency.png)" if results.has_efficiency(results.scenes) else ""}
 
-By budget, over {stronger(results)} of those that pass the bias check, or of all where none does:
-
-{budgets_table(results)}
-{first_images_table(results)}How much of the error single values carry: raw over trimmed relMSE at
-{results.deciding} samples per pixel:
+{_by_budget(results)}{first_images_table(results)}How much of the error single values carry:
+raw over trimmed relMSE at {results.deciding} samples per pixel:
 
 {gaps_table(results)}
 ## Errors
@@ -715,7 +720,7 @@ class Report:
 
     def draw(self, folder: Path) -> None:
         """Write the plots that the page shows."""
-        if self.results.rivals:
+        if self.results.has_efficiency(self.results.scenes):
             figures.efficiencies(self.results, self.results.rivals, folder / "efficiency.png")
         figures.convergence(self.results, "seconds", folder / "seconds.png")
         figures.convergence(self.results, "spp", folder / "samples.png")

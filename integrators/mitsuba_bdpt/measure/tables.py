@@ -11,6 +11,9 @@ from .analysis import Refused, Summary
 from .estimates import RelativeError
 from .metrics import Estimate
 
+WIDE = 1e3
+"""Ratio of the ends of an interval from which on it says nothing."""
+
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table; escapes bars and line ends."""
@@ -45,6 +48,8 @@ def relative(found: RelativeError) -> str:
     text = f"{found.bound} {found.total.value:.2e}".lstrip()
     if math.isinf(found.total.high):
         return f"{text} (one render)"
+    if found.total.high > WIDE * found.total.low:
+        return f"{text} (too few renders for an interval)"
     return f"{text} ({found.total.low:.2e}–{found.total.high:.2e})"
 
 
