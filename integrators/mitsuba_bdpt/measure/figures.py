@@ -136,9 +136,9 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
                 continue
             look = style(results.methods, method) | {"linestyle": DASHES[error]}
             x, low, middle, high = points.T
-            # A single point has no line.
-            is_plain = error != "rel_mse" and len(points) > 1
-            axis.plot(x, middle, **look | ({"marker": ""} if is_plain else {}))
+            # A single point has no line: a dash stands for a dashed one.
+            dash = {"marker": "_", "markersize": 8} if len(points) == 1 else {"marker": ""}
+            axis.plot(x, middle, **look | (dash if error != "rel_mse" else {}))
             if error == "rel_mse":
                 axis.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
                 hollow = np.array([bool(bound) for bound in bounds])
