@@ -43,7 +43,7 @@ gallery: $(INSTALLED)
 		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
-	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics pane frosted_bulb polished_metal; do \
+	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
 		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
@@ -55,7 +55,7 @@ pictures: $(INSTALLED)
 	$(VENV)/bin/mitsuba-bdpt equal-time glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
 	$(VENV)/bin/python scripts/polarization.py
 	for scene in glass_caustics pool_floor lamp_in_glass_seen \
-			rough_glass_caustics pane frosted_bulb polished_metal; do \
+			rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
 		$(VENV)/bin/mitsuba-bdpt equal-time $$scene --spp 64 -o docs/images/$${scene}_merging.png \
 			-i bdpt path "bdpt merging=true" || exit 1; \
 	done

@@ -26,6 +26,7 @@ LAMPS = {
     "cornell_box": [(0, -1, 0)],
     "glass_caustics": [(0, -1, 0)],
     "rough_glass_caustics": [(0, -1, 0)],
+    "frosted_glass_caustics": [(0, -1, 0)],
     "uplight_room": [(0, 1, 0)],
     "ajar_door": [(0, -1, 0)],
     "furnished_door": [(0, -1, 0)],
@@ -191,7 +192,7 @@ def test_what_only_merging_finds(name, share):
     assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
 
 
-@pytest.mark.parametrize("name", ["rough_glass_caustics", "pane", "frosted_bulb", "polished_metal"])
+@pytest.mark.parametrize("name", ["rough_glass_caustics", "frosted_glass_caustics", "pane", "frosted_bulb", "polished_metal"])
 def test_near_specular_scenes_have_no_deltas(name):
     """Expected: some BSDF has a glossy lobe, and no BSDF a delta lobe, so that every path can be connected in
     principle."""
