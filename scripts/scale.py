@@ -510,7 +510,7 @@ def write(record: dict) -> None:
     """The record as data, its tables as a page, and the goals in the page of figures."""
     write_text(RECORD, json.dumps(record, indent=1) + "\n")
     write_text(PAGE, replace_part(PAGE.read_text(), "scale", tables(record)))
-    write_text(FIGURES_PAGE, replace_part(FIGURES_PAGE.read_text(), "scale goals", goals(record)))
+    write_text(FIGURES_PAGE, replace_part(FIGURES_PAGE.read_text(), "goals", goals(record), by="scale"))
 
 
 def main(arguments=None) -> int:

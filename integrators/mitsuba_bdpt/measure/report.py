@@ -741,21 +741,24 @@ def run(options: Namespace) -> int:
     return 0
 
 
+PARTS: dict[str, Callable[[Report], str]] = {
+    "goals": lambda found: goals_table(found.results, found.goals),
+    "efficiency": lambda found: efficiency_table(found.results),
+    "errors": lambda found: errors_table(found.results),
+    "first images": lambda found: first_images_table(found.results),
+    "gallery": lambda found: gallery(found.results),
+}
+"""Parts of Markdown files that a report fills, by their names in `<!-- report: NAME -->`."""
+
+
 def _filled(file: Path, found: Report) -> str:
     """Return the text of a Markdown file with its parts filled; ``CommandError`` if it has none."""
-    parts = {
-        "goals": lambda: goals_table(found.results, found.goals),
-        "efficiency": lambda: efficiency_table(found.results),
-        "errors": lambda: errors_table(found.results),
-        "first images": lambda: first_images_table(found.results),
-        "gallery": lambda: gallery(found.results),
-    }
     text = file.read_text()
     names = re.findall(r"<!-- report: (.*?) -->", text)
     for name in names:
-        if name not in parts:
-            raise CommandError(f"{file}: there is no part {name!r}; there are {', '.join(parts)}")
-        text = replace_part(text, name, parts[name]())
+        if name not in PARTS:
+            raise CommandError(f"{file}: there is no part {name!r}; there are {', '.join(PARTS)}")
+        text = replace_part(text, name, PARTS[name](found))
     if not names:
         raise CommandError(f"{file} has no `<!-- report: NAME -->` with an `<!-- end -->`; add one")
     return text
