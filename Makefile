@@ -55,7 +55,7 @@ pictures: $(INSTALLED)
 	$(VENV)/bin/mitsuba-bdpt equal-time glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
 	$(VENV)/bin/python scripts/polarization.py
 	for scene in glass_caustics pool_floor lamp_in_glass_seen \
-			rough_glass_caustics frosted_glass_caustics pane polished_metal; do \
+			rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
 		$(VENV)/bin/mitsuba-bdpt equal-time $$scene --spp 64 -o docs/images/$${scene}_merging.png \
 			-i bdpt path "bdpt merging=true" || exit 1; \
 	done
