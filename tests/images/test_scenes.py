@@ -192,7 +192,9 @@ def test_what_only_merging_finds(name, share):
     assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
 
 
-@pytest.mark.parametrize("name", ["rough_glass_caustics", "frosted_glass_caustics", "pane", "frosted_bulb", "polished_metal"])
+@pytest.mark.parametrize(
+    "name", ["rough_glass_caustics", "frosted_glass_caustics", "pane", "frosted_bulb", "polished_metal"]
+)
 def test_near_specular_scenes_have_no_deltas(name):
     """Expected: some BSDF has a glossy lobe, and no BSDF a delta lobe, so that every path can be connected in
     principle."""

@@ -537,7 +537,7 @@ def test_parts_of_the_readme_are_replaced():
 
 @pytest.mark.parametrize("page", ["figures", "public"])
 def test_reports_fill_every_part_of_the_committed_pages(page):
-    """Rationale: a part of another script's on such a page stops the report. Expected: all parts are known."""
+    """Rationale: another script's part on such a page stops the report. Expected: all parts are known."""
     names = re.findall(r"<!-- report: (.*?) -->", (ROOT / f"docs/reports/{page}.md").read_text())
     assert names and set(names) <= report.PARTS.keys()
 
