@@ -332,7 +332,8 @@ class Results:
     def deciding(self) -> int:
         """The budget of comparisons: `DECIDING`, or the largest that every scene has.
 
-        With two renders of each integrator, where a sweep of so many was cut for lack of time.
+        Where a time limit left single renders at some budgets, only budgets with two renders of each
+        integrator count.
         """
         counts: dict[str, dict[str, Counter[int]]] = {scene: {} for scene in self.scenes}
         for row in self.rows:

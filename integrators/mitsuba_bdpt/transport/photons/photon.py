@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Self, get_type_hints
 
 import drjit as dr
 import mitsuba as mi
@@ -38,14 +38,12 @@ class Photon:
 
     @classmethod
     def types(cls) -> tuple[Any, ...]:
-        """Types of the fields in the current variant, in order.
+        """Types of the fields but ``layer`` in the current variant, in order.
 
         Dr.Jit would keep the types of the first variant in use.
         """
-        return (
-            *(mi.Point3f, mi.Vector3f, mi.Normal3f, mi.Spectrum),
-            *(mi.Float, mi.Float, mi.Float, mi.UInt32, mi.UInt32, mi.UInt32),
-        )
+        hints = get_type_hints(cls)
+        return tuple(hints[field.name] for field in fields(cls) if not field.kw_only)
 
     @classmethod
     def zeros(cls, count: int, layered: bool = False) -> Self:
@@ -81,11 +79,6 @@ class ConnectedPhoton(Photon):
     connection: mi.Float
     delta: mi.Bool
 
-    @classmethod
-    def types(cls) -> tuple[Any, ...]:
-        """Types of the fields in the current variant, in order."""
-        return (*Photon.types(), mi.Float, mi.Bool)
-
 
 @dataclass
 class GuidingPhoton(Photon):
@@ -98,11 +91,6 @@ class GuidingPhoton(Photon):
     unconnected: mi.Float
     only_delta: mi.Bool
 
-    @classmethod
-    def types(cls) -> tuple[Any, ...]:
-        """Types of the fields in the current variant, in order."""
-        return (*Photon.types(), mi.Float, mi.Float, mi.Bool)
-
 
 @dataclass
 class HardPhoton(Photon):
@@ -114,11 +102,6 @@ class HardPhoton(Photon):
     connection: mi.Float
     d_vm: mi.Float
     d_vn: mi.Float
-
-    @classmethod
-    def types(cls) -> tuple[Any, ...]:
-        """Types of the fields in the current variant, in order."""
-        return (*Photon.types(), mi.Float, mi.Float, mi.Float)
 
 
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):
