@@ -1060,32 +1060,77 @@ def test_the_table_is_tidy(tmp_path):
     assert not list(tmp_path.rglob(".*"))
 
 
-def test_what_time_does_not_allow_is_cut_seed_by_seed(tmp_path, monkeypatch):
-    """Expected: eight renders of a second each, of which 5.5 s allow six: all budgets of the first seed, then
-    of the second; the cut ones are named with the option that has time for them, two more seconds, and a
-    second run renders them. Two seeds of the smallest budget are rendered even without time: figures need
-    pairs."""
+def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
+    """Expected: renders of a second per sample, 2 and 4 samples, by two integrators and two seeds, each twice
+    as long where its budget compiles: 8, 16, 4 and 8 s. In 29 s all but the last are rendered, in 23 s small
+    ones of later seeds in place of the large one that does not fit; the cut ones are named with the option
+    that has time for them, and a second run with it renders them. Two seeds of the smallest budget are
+    rendered even without time: figures need pairs."""
     preset = read_preset(preset_file(tmp_path), REPOSITORY)
     found, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
 
     def rendered(self, bench, cell):
-        clock[0] += 1
+        is_first = (cell.method, cell.budget) not in {(c.method, c.budget) for c in found}
+        clock[0] += cell.budget * (1 + is_first)
         found.append(cell)
+        return float(cell.budget)
+
+    def swept(seconds):
+        found.clear()
+        made = sweep.Sweep(REPOSITORY, preset, tmp_path)
+        made.run(showing.Renders(), seconds=seconds)
+        keys = [(cell.seed, cell.budget) for cell in found]
+        assert keys[::2] == keys[1::2]  # both integrators
+        return keys[::2], made
 
     monkeypatch.setattr(sweep.Sweep, "_cell", rendered)
-    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-    made.run(showing.Renders(), seconds=5.5)
-    assert [cell.seed for cell in found] == [1, 1, 1, 1, 2, 2]
-    assert {cell.budget for cell in found[:4]} == {2, 4}
-    assert made.cut == {"cornell_box": "2 of 8 renders, from 4 spp of seed 2 on"} and made.wanted == 2
-    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-    made.run(showing.Renders(), seconds=100)
-    assert len(found) == 6 + 8 and not made.cut
-    made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-    made.run(showing.Renders(), seconds=0)
-    assert [(cell.seed, cell.budget) for cell in found[14:]] == [(1, 2), (1, 2), (2, 2), (2, 2)]
-    assert made.cut["cornell_box"] == "4 of 8 renders, from 4 spp of seed 1 on"
+    every, made = swept(100)
+    assert every == [(1, 2), (1, 4), (2, 2), (2, 4)] and not made.cut and made.wanted == 0
+    keys, made = swept(29)
+    assert keys == every[:3]
+    assert made.cut == {"cornell_box": "2 of 8 renders: 2 at 4 spp"} and made.wanted == 10
+    keys, made = swept(23)
+    assert keys == [(1, 2), (2, 2)] and made.cut == {"cornell_box": "4 of 8 renders: 4 at 4 spp"}
+    assert made.wanted == 40
+    assert swept(0)[0] == [(1, 2), (2, 2)]
+
+
+def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
+    """Expected: a scene that is complete takes no share, and what one leaves goes to the next ones."""
+    text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
+    made = sweep.Sweep(REPOSITORY, read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
+    made._todo[0], clock, shares = [], [0.0], []
+    monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
+
+    def in_time(self, cells, missing, seconds):
+        shares.append(seconds)
+        clock[0] += 10 if missing else 0
+        return missing[:1], 7.0
+
+    monkeypatch.setattr(sweep.Sweep, "_in_time", in_time)
+    made.run(showing.Renders(), seconds=60)
+    assert shares[1:] == [30, 50]
+    assert made.wanted == 18  # of two scenes that share it, each 7 s and a quarter more
+
+
+def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
+    """Rationale: at the largest budget it took longer than the whole limit. Expected: of budgets to 400
+    samples, 1.25 ms each of both integrators and four renders, a quarter of the limit allows 4 (16 ms
+    of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit); a note says so."""
+    text = PRESET.replace("[2, 4]", "[4, 40, 400]")
+    preset = read_preset(preset_file(folder, text), REPOSITORY)
+    cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
+    monkeypatch.setattr(Clock, "timed", lambda self, cell, spp, seed: Timed(None, spp * PER[cell.method], 0))
+    monkeypatch.setattr(Clock, "compile_seconds", lambda self, cell, spp: None)
+    for seconds, budget in ((0.016, 4), (1.6, 40), (None, 400)):
+        bench = Clock(cells, folder / f"{budget}", seconds)
+        assert bench.spp_of(cells.of(4, 1)[1]) == 16
+        assert [int(text.split()[-2]) for text in bench.notes] == [budget] * (budget < 400)
+        assert bench.spp_of(cells.of(400, 1)[1]) == 1600 and len(bench.notes) == (budget < 400)
+
+
+PER = {"ours": 1e-3, "path": 0.25e-3}
 
 
 def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, swept):
@@ -1096,13 +1141,14 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, s
     monkeypatch.setattr(sweep, "Bench", Clock)
     words = path, "-o", output
     assert swept(*words, "--seconds", "1e-9") == 0
-    assert (
-        "cut for lack of time: cornell_box, 4 of 8 renders, from 4 spp of seed 1 on"
-        in capsys.readouterr().out
-    )
+    assert "cut for lack of time: cornell_box, 4 of 8 renders: 4 at 4 spp" in capsys.readouterr().out
     text = report.missing_text(output)
-    assert text.startswith("**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders, ")
-    assert re.search(f"by `mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds [1-9]+`", text)
+    assert text.startswith(
+        "**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders: 4 at 4 spp"
+    )
+    assert re.search(
+        f"by `mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds [1-9][0-9]*`", text
+    )
     keep_missing(output, ["another"], {}, "")
     assert report.missing_text(output) == text
     assert swept(*words) == 0 and report.missing_text(output) == ""

@@ -20,10 +20,11 @@ import math
 import tempfile
 import time
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache, lru_cache, partial
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import Any
 
@@ -64,13 +65,18 @@ from .showing import Renders
 from .timing import Timed, alternating, timed
 
 CALIBRATIONS = 3  # alternating renders that calibrate the samples for equal time
+CALIBRATED = 0.25  # share of a limit of time for these renders, and for those that find how many samples fit
+ROOM = 1.25  # times the predicted seconds of what was cut, in the advice of how many to allow
 
 
 class Bench:
-    """Loaded scenes and integrators of one scene's cells, with compiled kernels."""
+    """Loaded scenes and integrators of one scene's cells, with compiled kernels.
 
-    def __init__(self, cells: Cells, output: Path):
-        self.cells, self.output = cells, output
+    ``seconds``: limit of the time for all its renders. ``notes``: of what that limits, besides renders.
+    """
+
+    def __init__(self, cells: Cells, output: Path, seconds: float | None = None):
+        self.cells, self.output, self.seconds, self.notes = cells, output, seconds, list[str]()
         _, self._file, self._resolution, self._depth = cells.where()
         self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
 
@@ -114,29 +120,54 @@ class Bench:
         return self._pilot[cell.method, spp]
 
     def spp_of(self, cell: Cell) -> int:
-        """Return the samples of a cell: its budget, or those for equal time.
-
-        The ratio of seconds is measured once, at the largest budget.
-        """
-        first, largest = self.cells.of(cell.budget, cell.seed)[0], max(self.cells.subject.spp)
+        """Return the samples of a cell: its budget, or those for equal time."""
+        first = self.cells.of(cell.budget, cell.seed)[0]
         if cell.match == "spp" or cell.method == first.method:
             return self._possible(cell.sampler, cell.budget)
         if cell.method not in self._spp:
-            one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
-            kept = self.output / "ratios" / f"{one.key}.json"
-            if not kept.exists():
-                for one_of_both in (first, cell):
-                    self.compile_seconds(one_of_both, largest)
-                both = [partial(self.timed, c, largest) for c in (first, cell)]
-                turns = alternating(both, CALIBRATIONS, is_warm=True)
-                seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
-                write_json(kept, float(np.median([ours / theirs for ours, theirs in seconds])))
-            self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
+            self._spp[cell.method] = self._samples_in_equal_time(first, cell)
         wanted = cell.budget * self._spp[cell.method]
         if cell.sampler == "independent":
             return max(round(wanted), 1)
         # Mitsuba's stratified samplers are a tenth slower per sample far from a power of two.
         return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
+
+    def _samples_in_equal_time(self, first: Cell, cell: Cell) -> float:
+        """Return the samples of an integrator in the seconds of one sample of the ``first``.
+
+        Measured once, at the largest budget, or the largest that the limit of time allows, and kept in a
+        file.
+        """
+        largest = max(self.cells.subject.spp)
+        one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
+        kept = self.output / "ratios" / f"{one.key}.json"
+        if not kept.exists():
+            budget = self._calibrated(first, cell)
+            if budget < largest:
+                self.notes.append(f"{cell.scene}: equal time of {cell.method} was measured at {budget} spp")
+            for one_of_both in (first, cell):
+                self.compile_seconds(one_of_both, budget)
+            both = [partial(self.timed, c, budget) for c in (first, cell)]
+            turns = alternating(both, CALIBRATIONS, is_warm=True)
+            seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
+            write_json(kept, float(np.median([ours / theirs for ours, theirs in seconds])))
+        return read_json(kept, "delete it, to measure it anew")
+
+    def _calibrated(self, first: Cell, cell: Cell) -> int:
+        """Return the budget at which equal time is measured."""
+        budgets = sorted(self.cells.subject.spp)
+        if self.seconds is None:
+            return budgets[-1]
+        rivals = sum(m.match == "seconds" for m in self.cells.methods[1:])
+        patience, at, best = CALIBRATED * self.seconds / rivals, 0, budgets[0]
+        # Small renders take longer per sample than large ones, so that more may fit than the first suggest.
+        while best > at:
+            at = best
+            for one in (first, cell):
+                self.compile_seconds(one, at)
+            of_a_sample = sum(self.timed(one, at, 0).seconds for one in (first, cell)) / at
+            best = max((b for b in budgets if (1 + CALIBRATIONS) * b * of_a_sample <= patience), default=at)
+        return at
 
     def _possible(self, sampler: str, spp: int) -> int:
         """Return the samples that a sampler takes: stratified ones may round up."""
@@ -219,12 +250,12 @@ class Sweep:
     """A preset being rendered into a folder.
 
     ``failed``: messages of failures; ``cut``: what was left out for lack of time, by scene; ``wanted``: the
-    seconds that it needs.
+    seconds that it needs; ``notes``: what else time did not allow.
     """
 
     def __init__(self, project: Project, preset: Preset, output: Path):
         self.project, self.preset, self.output = project, preset, output
-        self.cut, self.wanted = dict[str, str](), 0
+        self.cut, self.wanted, self.notes = dict[str, str](), 0, list[str]()
         self.failed = list(preset.left_out)
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
@@ -302,23 +333,46 @@ class Sweep:
 
         Two seeds of the smallest budget are rendered in any case: with fewer there is no figure.
         """
-        started = time.monotonic()
-        total, done = sum(map(len, self._todo)), 0
+        end = time.monotonic() + seconds
+        wanted = list[float]()
+        short = [bool(missing) for missing in self._todo]
         for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
-            bench, end = Bench(cells, self.output), started + seconds * (i + 1) / len(self.scenes)
             self._first_images(cells)
-            late = list[Cell]()
-            for cell in sorted(missing, key=lambda cell: cell.seed):
-                is_least = cell.budget == min(cells.subject.spp) and cell.seed < FIRST_SEED + 2
-                if time.monotonic() >= end and not is_least:
-                    late.append(cell)
-                else:
-                    self._cell(bench, cell)
-                    done += 1
+            share = (end - time.monotonic()) / max(sum(short[i:]), 1)
+            late, needed = self._in_time(cells, missing, max(share, 0.0))
             if late:
-                which = f"from {late[0].budget} spp of seed {late[0].seed} on"
-                self.cut[cells.subject.name] = f"{len(late)} of {len(missing)} renders, {which}"
-        self.wanted = math.ceil((time.monotonic() - started) * (total - done) / max(done, 1))
+                self.cut[cells.subject.name] = _cut_text(late, missing)
+                wanted.append(needed)
+        self.wanted = math.ceil(ROOM * len(wanted) * max(wanted, default=0.0))
+
+    def _in_time(self, cells: Cells, missing: list[Cell], seconds: float) -> tuple[list[Cell], float]:
+        """Render those of the ``missing`` cells that fit; returns the others, and the seconds they need.
+
+        Integrators of one budget and seed are rendered together or not at all.
+        """
+        bench, end = Bench(cells, self.output, seconds), time.monotonic() + seconds
+        taken, known = dict[str, float](), set[tuple[str, int]]()
+
+        def predicted(group: list[Cell]) -> float:
+            # The first render of a budget compiles, in a render that is not measured.
+            renders = [(c.method, c.budget, 1 + ((c.method, c.budget) not in known)) for c in group]
+            return sum(n * budget * taken.get(method, 0.0) for method, budget, n in renders)
+
+        def fits(group: list[Cell]) -> bool:
+            is_least = group[0].budget == min(cells.subject.spp) and group[0].seed < FIRST_SEED + 2
+            left = end - time.monotonic()
+            return is_least or (left > 0 and predicted(group) <= left)
+
+        ordered = sorted(missing, key=lambda cell: (cell.seed, cell.budget))
+        groups = [list(group) for _, group in groupby(ordered, key=lambda cell: (cell.seed, cell.budget))]
+        while group := next(filter(fits, groups), None):
+            groups.remove(group)
+            for cell in group:
+                if rendered := self._cell(bench, cell):
+                    taken[cell.method] = rendered / cell.budget
+                known.add((cell.method, cell.budget))
+        self.notes += bench.notes
+        return list(chain.from_iterable(groups)), sum(map(predicted, groups))
 
     def _first_images(self, cells: Cells):
         """Render the missing first images of a scene, at its smallest budget."""
@@ -352,14 +406,18 @@ class Sweep:
             except Exception as error:  # a probe must not end the sweep
                 self.failed.append(f"{name}: {error}")
 
-    def _cell(self, bench: Bench, cell: Cell):
-        """Render a cell in this process."""
+    def _cell(self, bench: Bench, cell: Cell) -> float | None:
+        """Render a cell in this process; returns its wall seconds, None if it failed."""
         self._progress.begin(_description(cell))
+        seconds = None
         try:
-            self._store(bench.cells, cell, measure(bench, cell))
+            row, image = measure(bench, cell)
+            self._store(bench.cells, cell, (row, image))
+            seconds = row["seconds"]
         except Exception as error:  # one cell must not end the others
             self._note(_description(cell), error)
         self._progress.end(_description(cell), _work(cell))
+        return seconds
 
     def _store(self, cells: Cells, cell: Cell, result):
         if cells.where() not in self._judges:
@@ -425,6 +483,13 @@ class Sweep:
 
 def _description(cell: Cell) -> str:
     return f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
+
+
+def _cut_text(late: list[Cell], missing: list[Cell]) -> str:
+    """Return how many of the ``missing`` renders were cut, and at which budgets."""
+    counts = Counter(cell.budget for cell in late)
+    at = ", ".join(f"{count} at {budget} spp" for budget, count in sorted(counts.items()))
+    return f"{len(late)} of {len(missing)} renders: {at}"
 
 
 def _work(cell: Cell) -> float:
@@ -516,7 +581,7 @@ def swept(
     if late > 1:
         print(
             f"took {late:.0f} s more than --seconds {options.seconds:g}: kernels are compiled, equal time is "
-            "measured at the largest budget, and two seeds of the smallest are rendered in any case"
+            "measured and two seeds of the smallest budget are rendered in any case"
         )
     return table, sweep.failed
 
@@ -560,6 +625,8 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
+    for text in sweep.notes:
+        print(f"{text}, the largest that time allowed; delete {sweep.output / 'ratios'} to measure it anew")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
