@@ -110,10 +110,19 @@ def test_images_stand_side_by_side(monkeypatch, columns, count):
 
 
 def test_windows_lie_where_errors_differ():
-    """Expected: the first of two disjoint windows within the window of fireflies."""
+    """Expected: the first of two disjoint windows within the window of fireflies, the second at least a side
+    apart, also where the largest errors fill more than one window; without room for that they only touch.
+    """
     made = block(2)
     (left, top, side), (left2, top2, _) = crops.windows(made.columns[0].errors, made.columns[1].errors)
     assert side == 5 and left >= 20 - 1 and top >= 36 - 1
+    assert abs(left - left2) >= 2 * side or abs(top - top2) >= 2 * side
+    large = np.full((60, 60), 1e-3)
+    large[20:40, 20:40] = 1.0
+    (left, top, side), (left2, top2, _) = crops.windows(large, np.full((60, 60), 1e-4))
+    assert 20 <= left <= 30 and 20 <= top <= 30 and side == 10
+    assert abs(left - left2) >= 2 * side or abs(top - top2) >= 2 * side
+    (left, top, side), (left2, top2, _) = crops.windows(np.eye(8), np.ones((8, 8)))
     assert abs(left - left2) >= side or abs(top - top2) >= side
 
 

@@ -57,7 +57,7 @@ def judged(name: str, spp: int, seconds: float, image: np.ndarray, target: np.nd
 def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
     """Return two disjoint windows (left, top, side) of the largest differences of two images of errors.
 
-    Compares logarithms, so that no single pixel decides.
+    At least a side apart, where the image has the room. Compares logarithms, so that no single pixel decides.
     """
     height, width = first.shape
     side = max(4, min(height, width) // WINDOW)
@@ -68,7 +68,11 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
     for _ in COLOURS:
         top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
         chosen.append((left, top, side))
-        score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -1
+        # Neighbours would show the same: they come after all others, and what overlaps never.
+        score[max(0, top - 2 * side) : top + 2 * side, max(0, left - 2 * side) : left + 2 * side] -= (
+            score.max()
+        )
+        score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -np.inf
     return chosen
 
 
