@@ -69,9 +69,8 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
         top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
         chosen.append((left, top, side))
         # Neighbours would show the same: they come after all others, and what overlaps never.
-        score[max(0, top - 2 * side) : top + 2 * side, max(0, left - 2 * side) : left + 2 * side] -= (
-            score.max()
-        )
+        far = 2 * side
+        score[max(0, top - far) : top + far, max(0, left - far) : left + far] -= score.max() + 1
         score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -np.inf
     return chosen
 
