@@ -620,10 +620,10 @@ of the reference's noise: raw, it is the variance over seeds; trimmed, the error
 the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
 the figure is a bound, since rare light that was not met is in no variance: ≥ where the other integrator's
 error is at least the one measured, ≤ where the first integrator's is, ~ where both are. Times are equal at
-the largest budget, where the samples for equal time are found; seconds are those measured, so other budgets
-are compared as if errors fell with 1 / time. {_equal_samples(results)}Where seeds were
-added until an interval was narrow enough, it is slightly too narrow (it holds the median in 90 % of cases,
-not 95 %).
+the largest budget, or the largest that a limit of time allowed, and at others nearly; seconds are those
+measured, so that unequal times are compared as if errors fell with 1 / time.
+{_equal_samples(results)}Where seeds were added until an interval was narrow enough, it is slightly too
+narrow (it holds the median in 90 % of cases, not 95 %).
 {_clock(results)}"""
 
 
