@@ -2060,9 +2060,30 @@ MUTANTS = (
     Mutant(
         "sweeps: a time limit leaves no second render of the smallest budget",
         "measure/sweep.py",
-        "if time.monotonic() >= end and not is_least:",
-        "if time.monotonic() >= end:",
-        ("tests/measure/test_sweep.py::test_what_time_does_not_allow_is_cut_seed_by_seed",),
+        "return is_least or (left > 0 and predicted(group) <= left)",
+        "return left > 0 and predicted(group) <= left",
+        ("tests/measure/test_sweep.py::test_what_time_does_not_allow_is_cut",),
+    ),
+    Mutant(
+        "sweeps: renders that would end after the time limit begin",
+        "measure/sweep.py",
+        "return is_least or (left > 0 and predicted(group) <= left)",
+        "return is_least or left > 0",
+        ("tests/measure/test_sweep.py::test_what_time_does_not_allow_is_cut",),
+    ),
+    Mutant(
+        "sweeps: equal time is measured at the largest budget in spite of a time limit",
+        "measure/sweep.py",
+        "if self.seconds is None:",
+        "if True:",
+        ("tests/measure/test_sweep.py::test_equal_time_is_measured_at_a_budget_that_time_allows",),
+    ),
+    Mutant(
+        "sweeps: scenes that lack nothing take a share of the time limit",
+        "measure/sweep.py",
+        "short = [bool(missing) for missing in self._todo]",
+        "short = [True for missing in self._todo]",
+        ("tests/measure/test_sweep.py::test_the_limit_is_shared_by_scenes_that_lack_renders",),
     ),
     Mutant(
         "sweeps: figures are of a budget that was cut after one render",
