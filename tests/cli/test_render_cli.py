@@ -335,6 +335,38 @@ def test_direct_is_replaced_with_its_depth(around):
     assert deeper.max_depth == 5
 
 
+def test_files_of_version_06_keep_their_parameters(scene):
+    """Rationale: `maxDepth` was renamed after the integrator was replaced, and paths had no limit. Expected:
+    depth, Russian roulette and hidden emitters as in a file of version 3; -P and --crop replace what has the
+    old name, --size meets the crop window; the file's own integrator takes -P too."""
+    old = SCENE.replace("3.0.0", "0.6.0").replace('value="path"', 'value="volpath"')
+    for now, then in (
+        ("max_depth", "maxDepth"),
+        ("hide_emitters", "hideEmitters"),
+        ("sample_count", "sampleCount"),
+    ):
+        old = old.replace(f'"{now}"', f'"{then}"')
+    old = old.replace(
+        '"hideEmitters" value="false"/>', '"hideEmitters" value="true"/><integer name="rrDepth" value="7"/>'
+    )
+    scene.write_text(old.replace("<string", '<integer name="cropWidth" value="2"/><string'))
+    settings = loaded(scene, "--integrator", "bdpt").settings
+    assert (settings.max_depth, settings.rr_depth, settings.hide_emitters) == (3, 7, True)
+    assert loaded(scene, "--integrator", "bdpt", "-P", "max_depth=5").settings.max_depth == 5
+    assert "max_depth = 2" in str(loaded(scene, "--integrator", "scene", "-P", "max_depth=2"))
+    film = load(build_parser().parse_args(["render", str(scene)]))[0].sensors()[0].film()
+    assert tuple(film.crop_size()) == (2, 4)
+    words = "render", str(scene), "--size", "12x8"
+    with pytest.raises(CommandError, match="crop window"):
+        load(build_parser().parse_args([*words]))
+    film = load(build_parser().parse_args([*words, "--crop", "1,2,5,3"]))[0].sensors()[0].film()
+    assert (tuple(film.size()), tuple(film.crop_offset()), tuple(film.crop_size())) == (
+        (12, 8),
+        (1, 2),
+        (5, 3),
+    )
+
+
 @pytest.mark.parametrize("kind", ["direct_projective", "prb", "prb_basic", "prb_projective", "prbvolpath"])
 def test_integrators_that_end_paths_by_themselves_are_replaced_with_their_depth(scene, kind):
     """Expected: the ``max_depth`` that the integrator has where the file gives none; else the file's."""

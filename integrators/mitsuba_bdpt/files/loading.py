@@ -67,22 +67,31 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
 def parsed(
     scene: Path, definitions: Mapping[str, object], strict: bool = True
 ) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    """Parse a ``scene`` file by Mitsuba's parser.
+    """Parse a ``scene`` file by Mitsuba's parser, see `parsed_by`.
 
     ``definitions``: values of its parameters; if ``strict``, unused and missing ones are errors.
     """
     config = mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
     if strict:
-        return config, mi.parser.parse_file(config, str(scene), **definitions)
+        return config, parsed_by(config, scene, definitions)
     config.unused_parameters = mi.LogLevel.Debug
     while True:
         try:
-            return config, mi.parser.parse_file(config, str(scene), **definitions)
+            return config, parsed_by(config, scene, definitions)
         except RuntimeError as error:
             missing = _MISSING.search(str(error))
             if missing is None:
                 raise
             definitions = {**definitions, missing[1]: "1"}
+
+
+def parsed_by(
+    config: mi.parser.ParserConfig, scene: Path, definitions: Mapping[str, object]
+) -> mi.parser.ParserState:
+    """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6."""
+    state = mi.parser.parse_file(config, str(scene), **definitions)
+    mi.parser.transform_upgrade(config, state)  # no change when `transform_all` repeats it
+    return state
 
 
 def named_files(state: mi.parser.ParserState) -> list[Path]:

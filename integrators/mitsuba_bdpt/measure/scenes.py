@@ -21,6 +21,7 @@ from ..files.loading import (
     named_files,
     parameters,
     parsed,
+    parsed_by,
     searching,
     spectra,
 )
@@ -167,7 +168,7 @@ class SceneFile(MeasuredScene):
             return super()._instantiated(definitions, sampler)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        return mi.parser.parse_file(config, str(self.file), **in_proportion(self.file, definitions))
+        return parsed_by(config, self.file, in_proportion(self.file, definitions))
 
 
 class DictionaryScene(MeasuredScene):
