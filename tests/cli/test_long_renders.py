@@ -15,6 +15,7 @@ from mitsuba_bdpt.cli import checkpoints
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.files.loading import named_files, parsed, searching
 from mitsuba_bdpt.image.accumulator import Accumulator
+from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.run.snapshot import read
 from mitsuba_bdpt.run.statistics import Meter
 from patience import PATIENCE
@@ -120,6 +121,31 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
     assert rendered.image("a.exr")[1]["spp"] == 32
     assert main([*arguments, "--resume"]) == 2
     assert "there is no checkpoint" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("after", "text"), [(0, "no checkpoint 'a.checkpoint.npz': no pass was over"), (1, "checkpoint 'a.ch")]
+)
+def test_ctrl_c_within_a_pass_tells_what_the_checkpoint_lacks(monkeypatch, capsys, after, text):
+    """Rationale: the image had the pass, the checkpoint did not, and the next run began anew without a word.
+    Expected: a line names the samples of both; what is there is gone on from."""
+    arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
+    original, reports = Render.report, []
+
+    def report(self):
+        if len(reports) == after:
+            raise KeyboardInterrupt
+        reports.append(original(self))
+        return reports[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Render, "report", report)
+        assert main(arguments) == 130
+    done = rendered.image("a.exr")[1]["spp"]
+    err = capsys.readouterr().err
+    assert text in err and Path("a.checkpoint.npz").exists() == bool(after)
+    assert not after or f"{reports[0].spp_done} of the image's {done} samples per pixel" in err
+    assert main(arguments) == 0 and ("goes on" in capsys.readouterr().err) == bool(after)
 
 
 NAMES = """<scene version="3.0.0">

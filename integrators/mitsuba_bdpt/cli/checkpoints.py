@@ -125,6 +125,17 @@ class Checkpoints:
             print(f"warning: no checkpoint {str(self.path)!r}: {why}", file=sys.stderr)
         self._last = time.monotonic()
 
+    def written_at_end(self, done: int) -> None:
+        """Write the state of a render that ended with ``done`` samples per pixel.
+
+        Prints where the checkpoint lacks samples of the image.
+        """
+        self.write()
+        kept = 0 if self._report is None else self._report.spp_done
+        if kept < done:
+            lacks = f"{kept} of the image's {done} samples per pixel" if kept else "no pass was over"
+            print(f"{'checkpoint' if kept else 'no checkpoint'} {str(self.path)!r}: {lacks}", file=sys.stderr)
+
     def remove(self) -> None:
         """Remove the checkpoint, after the finished image has been written."""
         self.path.unlink(missing_ok=True)

@@ -320,7 +320,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         if whole and not interrupted:
             outcome.written = kept.remove
         else:
-            kept.write()
+            kept.written_at_end(done)
     return outcome
 
 
