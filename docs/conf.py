@@ -42,7 +42,7 @@ html_show_copyright = False
 html_copy_source = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
-html_extra_path = ["static/index.html"]
+html_extra_path = ["index.html"]
 
 
 class Translator(HTML5Translator):

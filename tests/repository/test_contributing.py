@@ -29,9 +29,12 @@ def fields(form):
     return {part["id"]: part.get("validations", {}).get("required", False) for part in body if "id" in part}
 
 
-@pytest.mark.parametrize("name, required", [("bug", "what scene command doctor"), ("noise", "scene doctor")])
+@pytest.mark.parametrize(
+    "name, required",
+    [("bug", "what scene command doctor"), ("noise", "scene doctor"), ("feature", "what doctor")],
+)
 def test_reports_have_what_reproduces_them(name, required):
-    """Expected: a report cannot be sent without a scene and the output of `doctor`."""
+    """Expected: a report of a bug or noise cannot be sent without a scene, none without `doctor`'s output."""
     asked = fields(ROOT / ".github" / "ISSUE_TEMPLATE" / f"{name}.yml")
     assert all(asked[field] for field in required.split())
 
