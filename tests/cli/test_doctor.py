@@ -85,6 +85,20 @@ def test_error_of_the_child_is_repeated():
     assert findings == [doctor.Finding("FAIL", "test image", "ImportError: no x")]
 
 
+def test_a_variant_without_its_device_says_why():
+    """Rationale: Dr.Jit's own error about a missing driver names its initialization, which is no remedy.
+    Expected: the reason that the line of the variants gives; other errors as they are."""
+    last = "Traceback\nImportError: jit_init_thread_state(): the CUDA backend hasn't been initialized.\n"
+    for backends, text in (
+        ('["LLVM"]', "cuda_ad_rgb cannot render here: no CUDA device or driver was found"),
+        ('["LLVM", "CUDA"]', last.splitlines()[-1]),
+    ):
+        found = doctor.render_in_child(
+            "cuda_ad_rgb", child(1, f'{{"variants": ["cuda_ad_rgb"], "backends": {backends}}}\n', last)
+        )
+        assert found[-1] == doctor.Finding("FAIL", "test image", text)
+
+
 @pytest.mark.parametrize("mean", ["0.0", "NaN", "1e9"])
 def test_wrong_image_is_a_failure(mean):
     findings = doctor.render_in_child("llvm_ad_rgb", child(0, f'{{"llvm": "23", "mean": {mean}}}'))

@@ -213,7 +213,8 @@ def test_choice(make, light, monkeypatch):
         assert {r["class"] for r in reasons} >= (set() if light else {"t<=1", "inner"})
         assert statistics["seconds"]["pilot"] > 0
     text = integrator.explain(target, spp=32)
-    assert "confidence: in " in text
+    chosen = re.search(r"^           1.00 .{28}(.*)$", text, re.MULTILINE)[1]
+    assert text.splitlines()[-1].startswith(f"chosen: {chosen} (confidence: in ")
     assert "  relative time  cost per sample     error  configuration\n           1.00  " in text
     assert ("no light subpaths" in text) != light and "this is the plan before the pilot" not in text
     text = integrator.explain(target)

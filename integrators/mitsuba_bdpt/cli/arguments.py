@@ -103,10 +103,10 @@ def build_parser() -> argparse.ArgumentParser:
     def add_command(name: str, text: str) -> Parser:
         return commands.add_parser(name, help=text, description=text)
 
-    doctor = add_command("doctor", "say what is installed and render a tiny image to prove that it works")
+    doctor = add_command("doctor", "print versions, variants and the LLVM library, and render a tiny image")
     doctor.add_argument("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
     add_render_arguments(add_command("render", "render a Mitsuba scene file to an EXR and a PNG image"))
-    text = "say which strategies a render of a scene file uses, which it skips, and which paths none samples"
+    text = "list the strategies that a render of a scene file uses and skips, and the paths that none samples"
     explain = add_command("explain", text)
     add_scene_arguments(explain)
     explain.set_defaults(integrator="bdpt", time=None, target_error=None, denoise=False)
@@ -174,7 +174,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         "default: the limits of the machine, of its control groups and of ulimit"
     )
     add("--memory", type=number(float, 1e-3), metavar="GIB", help=text)
-    text = "say more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
+    text = "log more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
     add("-v", "--verbose", action="count", default=0, help=text)
 
 

@@ -166,7 +166,9 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
             text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {crash_remedy()}"
         return Finding("FAIL", "test image", text)
     if child.returncode > 0:
-        return Finding("FAIL", "test image", last)
+        reason = why_not(variant, report["backends"]) if "backends" in report else ""
+        text = f"{variant} cannot render here: {reason}" if reason else last
+        return Finding("FAIL", "test image", text)
     mean = report.get("mean", float("nan"))
     # Bounds: the box reflects less than its lamp emits, and no part of it is black.
     if not 0.01 < mean < 10:

@@ -124,7 +124,7 @@ def _named(candidate: Configuration) -> str:
 
 
 def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
-    """Describe the predictions, and the confidence in the first."""
+    """Describe the predictions; the last line is the choice and its confidence."""
     if not table:
         return []
     head = (
@@ -149,10 +149,10 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         lines.append(
             f"  these figures are of connections with one light subpath; the render connects with {joined}"
         )
-    lines.append(
-        f"  confidence: in {confidence:.0%} of bootstrap resamples of the pilot the chosen configuration is "
-        f"within {NEAR:g}x of the best"
-    )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
+    lines.append(
+        f"chosen: {_named(table[0].candidate)} (confidence: in {confidence:.0%} of bootstrap resamples of "
+        f"the pilot it is within {NEAR:g}x of the best)"
+    )
     return lines
