@@ -35,12 +35,16 @@ class FailureError(RuntimeError):
     """A command or measurement failed for other reasons than its arguments."""
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return a question with the most similar ``known`` name, or an empty string."""
+def did_you_mean(name: str, known: Iterable[str], parts: bool = False) -> str:
+    """Return a question with the most similar ``known`` name, or an empty string.
+
+    ``parts``: with the shortest name that contains ``name``, if there is one.
+    """
     import difflib  # takes 5 ms, and is rarely needed
 
     by_case = {other.lower(): other for other in known}
-    near = difflib.get_close_matches(name.lower(), by_case, 1)
+    around = [other for other in by_case if parts and name and name.lower() in other]
+    near = sorted(around, key=len) or difflib.get_close_matches(name.lower(), by_case, 1)
     return f"did you mean {by_case[near[0]]}? " if near else ""
 
 

@@ -16,6 +16,8 @@ from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 
+from stress_cases.warned import Warned
+
 GROUPS = "low: globe, b*; high: panel"
 OF_GROUPS = {"low": ("globe", "bulb"), "high": ("panel",), "rest": ("sky",)}
 
@@ -201,6 +203,60 @@ def test_names_of_layers_are_names_of_emitters():
     assert LightGroups.of(target, "key: key.1").of_emitters.count(0) == 1
 
 
+def test_brackets_in_ids_are_themselves():
+    """Rationale: names of copies have numbers in brackets or after a point. Expected: only * and ? stand for
+    other characters; a text that is an id matches this one alone."""
+    ids = ("lamp[1]", "lamp1", "lamp[!x]", "lamp*", "lamp?")
+    target = mi.load_dict(
+        {"type": "scene"} | {i: {"type": "point", "position": [n, 0, 0]} for n, i in enumerate(ids)}
+    )
+
+    def matched(pattern):
+        groups = LightGroups.of(target, f"a: {pattern}").of_emitters
+        return {e.id() for e, group in zip(target.emitters(), groups, strict=True) if group == 0}
+
+    for own in ids:
+        assert matched(own) == {own}
+    assert matched("lamp[*") == {"lamp[1]", "lamp[!x]"}
+    assert matched("lamp[?]") == {"lamp[1]"}
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [{}, {"light_paths": 0}, {"merging": True}, {"connections": "all", "skip": "none", "path_layers": True}],
+    ids=["pilot", "path tracing", "merging", "all"],
+)
+def test_a_pattern_may_match_no_emitter(parameters):
+    """Rationale: one command renders all shots. Expected: the group of a pattern that matches none is black,
+    with a warning; the other layers are those of a render without it; it goes on from a snapshot. Tolerance:
+    order of atomic additions."""
+    target, text = scene(rfilter="box"), "torch: torch*; low: globe, b*"
+    method = bdpt(max_depth=4, light_groups=text, spp_per_pass=4, **parameters)
+    with Warned() as warnings:
+        image, groups = layers(method, target)
+    assert list(groups) == ["torch", "low", "rest"] and not groups["torch"].any()
+    check_sum(image, groups)
+    warnings = [text for text in warnings if "torch" in text]
+    assert len(warnings) == 1 and "has an id like 'torch*'" in warnings[0]
+    assert "the layer of the group torch is black" in warnings[0] and "Emitters: bulb" in warnings[0]
+    _, expected = layers(
+        bdpt(max_depth=4, light_groups="low: globe, b*", spp_per_pass=4, **parameters), target
+    )
+    for name, layer in expected.items():
+        np.testing.assert_allclose(groups[name], layer, rtol=1e-5, atol=2e-6 * image.max())
+    start = stopped(method, target, 1, spp=8, seed=3)
+    resumed = np.array(method.render(target, spp=8, seed=3, start=start), dtype=np.float64)
+    np.testing.assert_allclose(resumed[..., :3], image, **ROUNDING)
+
+
+def test_groups_without_any_emitter():
+    """Expected: where no pattern matches, all light is the rest; a group with another pattern says so."""
+    made = LightGroups.of(scene(), "a: x*; b: y?")
+    assert made.names == ("a", "b", "rest") and set(made.of_emitters) == {2}
+    made = LightGroups.of(scene(), "a: x*, panel")
+    assert made.of_emitters.count(0) == 1 and "the group a is without it" in made.warnings[0]
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -210,6 +266,7 @@ def test_names_of_layers_are_names_of_emitters():
         ("a: panel; a: globe", "there are two groups a; list"),
         ("rest: panel", "rest is the group of all other emitters; give"),
         (";".join(f"g{i}: panel" for i in range(17)), "there are 17 groups, 16 at most; join"),
+        ("a: el", "has the id 'el'; did you mean panel"),
         ("a: pannel", "no emitter, and no shape with one, has the id 'pannel'; did you mean panel.*globe"),
         ("a: floor", "has the id 'floor'"),
         ("a: panel; b: p*", "the emitter 'panel' is in the groups a and b; take it out of one"),

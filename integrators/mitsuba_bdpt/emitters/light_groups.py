@@ -69,6 +69,24 @@ def _error(text: str, what: str) -> UsageError:
     return UsageError(f"light_groups={' '.join(text.split())!r}: {what}")
 
 
+def is_pattern(name: str) -> bool:
+    """Return whether ``name`` has ``*`` or ``?``, which stand for any characters, or for any one."""
+    return "*" in name or "?" in name
+
+
+def matches(name: str, pattern: str) -> bool:
+    """Return whether ``name`` is the text ``pattern``, or fits it as in `is_pattern`."""
+    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
+
+
+def layer_name(emitter_id: str, keep: str = "") -> str:
+    """Return the name of a layer for an id: other characters than letters, digits, _, - become _.
+
+    ``keep``: characters that stay too.
+    """
+    return re.sub(f"[^A-Za-z0-9_{re.escape(keep)}-]", "_", emitter_id)
+
+
 def _ids(emitter: mi.Emitter) -> list[str]:
     """Return an emitter's ids: its shape's and its own, if they have one."""
     return [owner.id() for owner in (emitter.get_shape(), emitter) if owner is not None and owner.id()]
@@ -89,7 +107,7 @@ def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
     found, last = {}, Counter({REST: 1})
     for i in sorted(range(len(emitters)), key=order):
         plugin = emitters[i].class_name()
-        base = re.sub(r"[^A-Za-z0-9_-]", "_", (ids[i] or [PLUGINS.get(plugin, plugin)])[0])
+        base = layer_name((ids[i] or [PLUGINS.get(plugin, plugin)])[0])
         name = base
         while name in last:
             last[base] += 1
@@ -102,11 +120,12 @@ def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
 class LightGroups:
     """The light groups of a scene.
 
-    ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter.
+    ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter;
+    ``warnings``: of patterns that match no emitter.
     """
 
-    def __init__(self, names: list[str], of_emitters: list[int]):
-        self.names, self.of_emitters = tuple(names), tuple(of_emitters)
+    def __init__(self, names: list[str], of_emitters: list[int], warnings: Sequence[str] = ()):
+        self.names, self.of_emitters, self.warnings = tuple(names), tuple(of_emitters), tuple(warnings)
         self._table = mi.UInt32(of_emitters)
         dr.make_opaque(self._table)
 
@@ -114,7 +133,8 @@ class LightGroups:
     def of(scene: mi.Scene, text: str) -> LightGroups | None:
         """Return the groups that the parameter's ``text`` defines; None for an empty text.
 
-        Emitters in no group form the group `REST`. Raises ``UsageError``.
+        Emitters in no group form the group `REST`. A group whose patterns match none is empty. Raises
+        ``UsageError``.
         """
         if not text.strip():
             return None
@@ -122,38 +142,48 @@ class LightGroups:
         if not emitters:
             raise _error(text, "the scene has no emitters; leave light_groups out")
         groups = parsed(text)
-        chosen = _matched(text, groups, emitters) if groups else _own(emitters)
+        chosen, warnings = _matched(text, groups, emitters) if groups else (_own(emitters), [])
         names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
         if len(chosen) < len(emitters):
             names.append(REST)
-        return LightGroups(names, [names.index(chosen.get(i, REST)) for i in range(len(emitters))])
+        of_emitters = [names.index(chosen.get(i, REST)) for i in range(len(emitters))]
+        return LightGroups(names, of_emitters, warnings)
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Return the groups of the emitters ``index``."""
         return dr.gather(mi.UInt32, self._table, index, active)
 
 
-def _matched(text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]) -> dict[int, str]:
-    """Return the group of each emitter that is in one, by index."""
-    found: dict[int, str] = {}
+def _matched(
+    text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]
+) -> tuple[dict[int, str], list[str]]:
+    """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`."""
     names = _layer_names(emitters)
     known = [list(dict.fromkeys([*_ids(e), own])) for e, own in zip(emitters, names, strict=True)]
-    for name, patterns in groups.items():
-        for pattern in patterns:
-            own = [i for i, names in enumerate(known) if any(fnmatchcase(n, pattern) for n in names)]
-            if not own:
-                every = sorted({n for names in known for n in names})
-                there = ", ".join(every[:20]) + (", ..." if len(every) > 20 else "")
-                remedy = f"{did_you_mean(pattern, every)}Emitters: {there}"
-                raise _error(text, f"no emitter, and no shape with one, has the id {pattern!r}; {remedy}")
-            for i in own:
-                if found.setdefault(i, name) != name:
-                    raise _error(
-                        text,
-                        f"the emitter {known[i][0]!r} is in the groups {found[i]} and {name}; "
-                        "take it out of one",
-                    )
-    return found
+    every = sorted({n for names in known for n in names})
+    there = f"Emitters: {', '.join(every[:20])}" + (", ..." if len(every) > 20 else "")
+    found: dict[int, str] = {}
+    unmatched: list[tuple[str, str]] = []
+    for name, pattern in ((name, pattern) for name, patterns in groups.items() for pattern in patterns):
+        own = [i for i, names in enumerate(known) if pattern in names]
+        own = own or [i for i, names in enumerate(known) if any(matches(n, pattern) for n in names)]
+        if not own and is_pattern(pattern):
+            unmatched.append((name, pattern))
+        elif not own:
+            remedy = f"{did_you_mean(pattern, every, parts=True)}{there}"
+            raise _error(text, f"no emitter, and no shape with one, has the id {pattern!r}; {remedy}")
+        for i in own:
+            if found.setdefault(i, name) != name:
+                raise _error(
+                    text,
+                    f"the emitter {known[i][0]!r} is in the groups {found[i]} and {name}; take it out of one",
+                )
+    return found, [
+        f"bdpt: light_groups: no emitter, and no shape with one, has an id like {pattern!r}; the layer of "
+        f"the group {name} is {'without it' if name in found.values() else 'black'}; if the scene should "
+        f"have such an emitter, correct the pattern. {there}"
+        for name, pattern in unmatched
+    ]
 
 
 def _own(emitters: Sequence[mi.Emitter]) -> dict[int, str]:

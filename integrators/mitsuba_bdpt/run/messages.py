@@ -7,6 +7,7 @@ import math
 
 import mitsuba as mi
 
+from ..emitters.light_groups import LightGroups
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
 from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
@@ -51,6 +52,12 @@ def warn_of_parameters(scene, sensor):
             "strategies do not agree about it; make it 0.2 degrees or more"
         )
         warn_once(scene, sensor, f"bdpt: {_some(narrow)}: {text}")
+
+
+def warn_of_light_groups(scene, sensor, groups: LightGroups | None):
+    """Warn once about patterns of light ``groups`` that match no emitter."""
+    for text in groups.warnings if groups is not None else ():
+        warn_once(scene, sensor, text)
 
 
 def warn_of_media(prepared, sensor):

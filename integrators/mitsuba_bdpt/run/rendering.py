@@ -84,6 +84,7 @@ class Render:
         self.meter = Meter()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
+        messages.warn_of_light_groups(scene, sensor, self.light_groups)
         if settings.merging:
             components.merging.check(sensor, self.prepared.space is not None)
         self.findings = Findings(self.prepared, sensor)
