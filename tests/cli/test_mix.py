@@ -1,10 +1,13 @@
 """The command `mix` and its function: new weights of light groups or path layers, from files."""
 
+import json
+
 import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import CommandError, mix
 from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.files.images import attribute
 
 GROUPS = ("key", "sky")
 
@@ -66,13 +69,64 @@ def test_path_layers_are_mixed_like_groups(tmp_path):
     assert np.array_equal(mixed, layers["sky"])
 
 
+def test_names_may_be_patterns_and_ids(tmp_path):
+    """Expected: * and ? stand for any characters, of layers of one kind; exact names win over patterns; ids
+    are names where layers have _ in place of their signs."""
+    names = ("lamp-key", "lamp-fill", "emit-Key_Light", "L_mpchen", "n_1_")
+    layers = rendered(tmp_path / "a.exr", groups=names, paths=PATHS)
+
+    def check(weights, **expected):
+        factors = {name: expected.get(name.replace("-", ""), 1) for name in names}
+        mixed = sum(np.float64(layers[name]) * factor for name, factor in factors.items())
+        np.testing.assert_allclose(np.array(mix(tmp_path / "a.exr", weights)), mixed, rtol=1e-6)
+
+    check({"lamp-*": 2}, lampkey=2, lampfill=2)
+    check({"lamp-*": 2, "lamp-key": 5}, lampkey=5, lampfill=2)
+    check({"groups.?amp-k*": 2}, lampkey=2)
+    check({"groups.*": 2}, **{name.replace("-", ""): 2 for name in names})
+    check({"emit-Key Light": 3, "Lämpchen": 0.5, "n[1]": 4}, emitKey_Light=3, L_mpchen=0.5, n_1_=4)
+    check({"emit-Key ?*": 3}, emitKey_Light=3)
+    assert (np.array(mix(tmp_path / "a.exr", {"c*": 2, "*direct": 0})) == 17).all()
+
+
+def test_a_mix_records_its_weights(tmp_path):
+    """Expected: the header of a mixed EXR has the weights of each layer that an argument names."""
+    rendered(tmp_path / "a.exr")
+    assert main(["mix", str(tmp_path / "a.exr"), "k*=0.5,1,2", "-o", str(tmp_path / "b.exr")]) == 0
+    assert json.loads(attribute(tmp_path / "b.exr", "bdptMix") or "") == {"groups.key": [0.5, 1, 2]}
+    metadata = mix(tmp_path / "a.exr", {"groups.sky": 3}).metadata()
+    assert json.loads(metadata["bdptMix"]) == {"groups.sky": [3, 3, 3]}
+
+
+def test_a_denoised_render_is_mixed_with_its_noise(tmp_path, capsys):
+    """Expected: a line says so where the file has a denoised image, and none elsewhere."""
+    for features, count in (((), 0), ([f"denoised.{c}" for c in "RGB"], 1)):
+        rendered(tmp_path / "a.exr", features=features)
+        assert main(["mix", str(tmp_path / "a.exr"), "key=2", "-o", str(tmp_path / "b.png")]) == 0
+        error = capsys.readouterr().err
+        assert error.count("note: the layers are not denoised") == count == error.count("\n")
+
+
+def test_weights_may_be_colours(tmp_path):
+    """Expected: colours of scalar and vectorised variants are three numbers."""
+    layers = rendered(tmp_path / "a.exr")
+    expected = layers["sky"] + layers["key"] * np.array([1.0, 2.0, 3.0])
+    for weight in (mi.Color3f(1, 2, 3), mi.ScalarColor3f(1, 2, 3), [1, 2, 3]):
+        mixed = np.array(mix(tmp_path / "a.exr", {"key": weight}))
+        np.testing.assert_allclose(mixed, expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("weights", "words"),
     [
         ({"direct": 2}, "has a light group and a path layer 'direct'; write groups.direct or path.direct"),
         ({"sky": 2, "caustic": 1}, "'sky' is one of the light groups and 'caustic' one of the path layers"),
         ({"caustics": 2}, "no layer 'caustics'; did you mean caustic. Light groups: direct, sky; Path l"),
-        ({"caustic": 2, "path.caustic": 1}, "caustic has two weights"),
+        ({"caustic": 2, "path.caustic": 1}, "caustic has two weights, by 'caustic' and 'path.caustic'; give"),
+        ({"c*": 2, "*ic": 1}, r"caustic has two weights, by 'c\*' and '\*ic'"),
+        ({"d*": 2}, r"has a light group and a path layer 'd\*'; write groups.d\* or path.d\*"),
+        ({"x*": 2}, r"has no layer 'x\*'; Light groups"),
+        ({"st": 2}, "has no layer 'st'; did you mean caustic"),
     ],
 )
 def test_weights_of_both_kinds(tmp_path, weights, words):
@@ -88,6 +142,8 @@ def test_weights_of_both_kinds(tmp_path, weights, words):
         ({"kex": 2}, "has no layer 'kex'; did you mean key. Light groups: key, sky"),
         ({"key": (1, 2)}, "has 2 numbers; give one, or 3 for R, G, B"),
         ({"key": -1}, "key=-1 must be 0 or greater"),
+        ({"key": (-1.0,)}, "key=-1 must be 0 or greater"),
+        ({"key": mi.ScalarColor3f(-1, 2, 3)}, "key=-1,2,3 must be 0 or greater"),
         ({"key": float("nan")}, "key=nan must be 0 or greater, and finite"),
         ({"sky": 2, "key": 1e40}, r"key=1e\+40: the image exceeds 3.4e38, .* single precision; give smaller"),
         ({"key": "a"}, "key='a' must be a number, or 3 for R, G, B"),
@@ -109,6 +165,11 @@ def test_images_that_cannot_be_mixed(tmp_path, capsys):
     rendered(tmp_path / "a.exr", groups=())
     with pytest.raises(CommandError, match="has no layers of light groups or paths; render it with light"):
         mix(tmp_path / "a.exr", {})
+    tensor = mi.TensorXf(np.zeros((3, 4, 9), dtype=np.float32))
+    with pytest.raises(
+        CommandError, match=r"the image has no names of channels, .* pass film\(\).bitmap\(\)"
+    ):
+        mix(mi.Bitmap(tensor), {"key": 1})
     (tmp_path / "b.exr").write_text("no image")
     with pytest.raises(CommandError, match="cannot be read"):
         mix(tmp_path / "b.exr", {})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
@@ -10,8 +11,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from ..files.images import check_output, developed, grey, write_whole
+from ..files.images import check_output, developed, grey, has_channels, write_whole
 from ..files.mixing import mix
+from ..image.layers import DENOISED
 from .mistakes import answered
 
 
@@ -50,5 +52,9 @@ def _run(options: Namespace) -> int:
     screen = grey(np.array(mixed)) if of_bands else mixed
     png = developed(screen, options.exposure)
     write_whole(png, output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
+    if has_channels(options.image, DENOISED):
+        print(
+            "note: the layers are not denoised, so that the mix has the noise of the render", file=sys.stderr
+        )
     print(output)
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -52,13 +52,23 @@ def check_png(film: mi.Film) -> None:
 
 def attribute(path: Path, name: str) -> str | None:
     """Return a text of an EXR header; None if it is missing, or the file is no EXR."""
-    if not path.is_file():
-        return None
-    try:
-        found = OpenEXR.File(str(path), header_only=True).header().get(name)
-    except (OSError, RuntimeError, ValueError):
-        return None
+    found = _header(path).get(name)
     return found if isinstance(found, str) else None
+
+
+def has_channels(path: Path, names: Iterable[str]) -> bool:
+    """Return whether the file is an EXR with all of these channels."""
+    return set(names) <= {channel.name for channel in _header(path).get("channels", [])}
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """Return the header of an EXR; empty for other files."""
+    if not path.is_file():
+        return {}
+    try:
+        return OpenEXR.File(str(path), header_only=True).header()
+    except (OSError, RuntimeError, ValueError):
+        return {}
 
 
 def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
+from ..emitters.light_groups import is_pattern, layer_name, matches
 from ..errors import CommandError, UsageTypeError, did_you_mean
 from ..image.layers import GROUP, PATH
 
@@ -17,6 +20,9 @@ Weight = float | Sequence[float]
 
 # Names of the partitions of an image, by the prefix of their layers.
 _KINDS = {GROUP: "light groups", PATH: "path layers"}
+
+# Attribute of the header of a mixed EXR: its weights by layer, as JSON.
+WEIGHTS = "bdptMix"
 
 # Layers of one partition: channels by the name of the layer and the colour.
 _Layers = dict[str, dict[str, np.ndarray]]
@@ -27,9 +33,10 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
 
     ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
     ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
-    for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too. The result has the layers'
-    colours, and the image's alpha if it has one, in single precision. Raises ``CommandError``, and
-    ``UsageTypeError`` for other types.
+    for layers that are left out. ``groups.NAME``, ``path.NAME`` and ids of emitters are names too; in names
+    ``*`` and ``?`` stand for any characters. The result has the layers' colours, the image's alpha if it has
+    one, in single precision, and the weights as JSON in the metadata ``bdptMix``. Raises ``CommandError``,
+    and ``UsageTypeError`` for other types.
     """
     if not isinstance(image, (mi.Bitmap, Path, str)):
         raise UsageTypeError(f"image={type(image).__name__} must be an mi.Bitmap or the path of an EXR")
@@ -37,13 +44,15 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
         raise UsageTypeError(f"weights={type(weights).__name__} must be a dictionary, by names of layers")
     name = "the image" if isinstance(image, mi.Bitmap) else repr(str(image))
     channels = _channels(image)
-    layers, own = _chosen(name, _partitions(channels), weights)
+    partitions = _partitions(name, channels)
+    prefix, own = _chosen(name, partitions, weights)
+    layers = partitions[prefix]
     colours = list(next(iter(layers.values())))
     if set(colours) == set("RGB"):  # files have them in another order
         colours = list("RGB")
     factors = {layer: np.ones(len(colours)) for layer in layers}
-    for layer, weight in own.items():
-        factors[layer] = _factors(layer, weight, colours)
+    for layer, argument in own.items():
+        factors[layer] = _factors(argument, weights[argument], colours)
     mixed = [np.zeros_like(values) for values in next(iter(layers.values())).values()]
     for layer, values in layers.items():
         for i, colour in enumerate(colours):
@@ -56,16 +65,20 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
             pixels = np.stack([*mixed, channels["A"]] if has_alpha else mixed, axis=-1).astype(np.float32)
     except FloatingPointError as error:
         layer = max(factors, key=lambda name: factors[name].max())
+        argument = own.get(layer, layer)
         raise CommandError(
-            f"{layer}={own.get(layer, 1)!r}: the image exceeds 3.4e38, the largest number of single "
-            "precision; give smaller weights"
+            f"{argument}={_shown(weights.get(argument, 1))}: the image exceeds 3.4e38, the largest number of "
+            "single precision; give smaller weights"
         ) from error
+    kind, names = mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB, []
     if colours != list("RGB"):
-        return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, colours + ["A"] * has_alpha)
-    return mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA if has_alpha else mi.Bitmap.PixelFormat.RGB)
+        kind, names = mi.Bitmap.PixelFormat.MultiChannel, colours + ["A"] * has_alpha
+    result = mi.Bitmap(pixels, kind, names)
+    result.metadata()[WEIGHTS] = json.dumps({prefix + layer: list(factors[layer]) for layer in own})
+    return result
 
 
-def _partitions(channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
+def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
     """Return the layers of each partition of an image, by prefix: those with the image's colours."""
     image = {channel for channel in channels if "." not in channel} - {"A"}
     colours = set("RGB") if image in ({"Y"}, set("XYZ")) else image
@@ -77,50 +90,67 @@ def _partitions(channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
                 found.setdefault(prefix, {}).setdefault(layer, {})[colour] = values
     for prefix, layers in found.items():
         found[prefix] = {name: layer for name, layer in layers.items() if name and set(layer) == colours}
-    return {prefix: layers for prefix, layers in found.items() if layers}
+    found = {prefix: layers for prefix, layers in found.items() if layers}
+    if not found and all(re.fullmatch(r"ch\d+", channel) for channel in channels):
+        raise CommandError(
+            f"{image_name} has no names of channels, so that its layers are unknown; pass film().bitmap() "
+            "after the render, or the EXR, not a bitmap of the tensor"
+        )
+    if not found:
+        raise CommandError(
+            f"{image_name} has no layers of light groups or paths; render it with light_groups=auto or "
+            "path_layers=true"
+        )
+    return found
 
 
 def _chosen(
     image: str, partitions: dict[str, _Layers], weights: Mapping[str, Weight]
-) -> tuple[_Layers, dict[str, Weight]]:
-    """Return the partition to which all names of ``weights`` belong, and its weights by layer."""
-    if not partitions:
-        raise CommandError(
-            f"{image} has no layers of light groups or paths; render it with light_groups=auto or "
-            "path_layers=true"
-        )
-    chosen, own = next(iter(partitions)), {}
-    for number, (name, weight) in enumerate(weights.items()):
-        prefix, layer = _found(image, partitions, name)
-        if number and prefix != chosen:
+) -> tuple[str, dict[str, str]]:
+    """Return the prefix of the partition to which all names of ``weights`` belong, and the name by layer.
+
+    Exact names win over patterns.
+    """
+    found = {name: _found(image, partitions, name) for name in weights}
+    chosen = next((prefix for prefix, _ in found.values()), next(iter(partitions)))
+    for name, (prefix, _) in found.items():
+        if prefix != chosen:
             raise CommandError(
                 f"{next(iter(weights))!r} is one of the {_KINDS[chosen]} and {name!r} one of the "
                 f"{_KINDS[prefix]}, which divide the same light; mix one kind at a time"
             )
-        if layer in own:
-            raise CommandError(f"{layer} has two weights; give it one")
-        chosen, own[layer] = prefix, weight
-    return partitions[chosen], own
+    own: dict[str, str] = {}
+    for name in sorted(found, key=is_pattern):
+        for layer in found[name][1]:
+            other = own.setdefault(layer, name)
+            if other != name and is_pattern(other) == is_pattern(name):
+                raise CommandError(f"{layer} has two weights, by {other!r} and {name!r}; give it one")
+    return chosen, own
 
 
-def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, str]:
-    """Return the prefix of the partition and the layer of this ``name``."""
-    fitting = [
-        (prefix, layer)
-        for prefix, layers in partitions.items()
-        for layer in layers
-        if name in (layer, prefix + layer)
-    ]
-    if len(fitting) > 1:
-        either = " or ".join(prefix + layer for prefix, layer in fitting)
+def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, list[str]]:
+    """Return the prefix of the partition and the layers of this ``name``, id or pattern."""
+
+    def fitting(fits: Callable[[str, str], bool]) -> dict[str, list[str]]:
+        text = name if isinstance(name, str) else ""
+        found = {
+            prefix: [layer for layer in partitions[prefix] if fits(layer, text.removeprefix(prefix))]
+            for prefix in partitions
+        }
+        return {prefix: layers for prefix, layers in found.items() if layers}
+
+    found = fitting(str.__eq__) or fitting(lambda layer, text: matches(layer, layer_name(text, keep="*?")))
+    if len(found) > 1:
+        either = " or ".join(prefix + name for prefix in found)
         raise CommandError(f"{image} has a light group and a path layer {name!r}; write {either}")
-    if not fitting:
+    if not found:
         there = "; ".join(
             f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
         )
         names = [layer for layers in partitions.values() for layer in layers]
-        raise CommandError(f"{image} has no layer {name!r}; {did_you_mean(str(name), names)}{there}")
-    return fitting[0]
+        question = did_you_mean(str(name), names, parts=True)
+        raise CommandError(f"{image} has no layer {name!r}; {question}{there}")
+    return next(iter(found.items()))
 
 
 def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
@@ -138,19 +168,26 @@ def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
     return {channel.name: pixels[..., i] for i, channel in enumerate(image.struct_())}
 
 
-def _factors(layer: str, weight: Weight, colours: list[str]) -> np.ndarray:
-    """Return a layer's weight of each colour."""
+def _factors(name: str, weight: Weight, colours: list[str]) -> np.ndarray:
+    """Return the weight of each colour that ``name`` is given."""
     try:
         values = np.atleast_1d(np.asarray(weight))
     except ValueError:  # a ragged list
         values = np.array([None])
+    if values.ndim == 2 and values.shape[1] == 1:  # a colour of a vectorised variant
+        values = values[:, 0]
     if values.dtype.kind not in "iuf":
-        raise CommandError(f"{layer}={weight!r} must be a number, or {len(colours)} for {', '.join(colours)}")
+        raise CommandError(f"{name}={weight!r} must be a number, or {len(colours)} for {', '.join(colours)}")
     if values.shape not in ((1,), (len(colours),)):
         raise CommandError(
-            f"{layer}={weight!r} has {values.size} numbers; give one, or {len(colours)} for "
+            f"{name}={_shown(weight)} has {values.size} numbers; give one, or {len(colours)} for "
             f"{', '.join(colours)}"
         )
     if not all(math.isfinite(value) and value >= 0 for value in values):
-        raise CommandError(f"{layer}={weight!r} must be 0 or greater, and finite")
+        raise CommandError(f"{name}={_shown(weight)} must be 0 or greater, and finite")
     return np.broadcast_to(values.astype(np.float64), len(colours))
+
+
+def _shown(weight: Weight) -> str:
+    """Return a weight as on the command line."""
+    return ",".join(f"{value:g}" for value in np.ravel(np.asarray(weight)))
