@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
+import variants
 from mitsuba_bdpt.cli import render
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import CommandError, FailureError, UnsupportedError
@@ -570,6 +571,8 @@ def wrapped(error):
         (wrapped(RuntimeError("jit_malloc(): out of memory! Could not allocate 9 bytes.")), 1),
         (MemoryError(), 1),
         (wrapped(MemoryError()), 1),
+        (RuntimeError("[BitmapTextureImpl[float32]] eval(): queried\nfor a spectrum"), 2),
+        (wrapped(RuntimeError("[GridVolume] the grid is empty")), 2),
     ],
 )
 def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, error, status):
@@ -582,12 +585,21 @@ def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, 
     monkeypatch.setattr(render, "render", broken)
     assert main(["render", str(scene), "-o", "a.exr"]) == status
     *_, last = capsys.readouterr().err.splitlines()
-    assert last.startswith("error: ") and "Traceback" not in last
+    assert last.startswith("error: ") and "Traceback" not in last and "see above" not in last
     lacking = any("memory" in repr(found).lower() for found in (error, error.__cause__))
     assert ("not enough memory" in last) == lacking
 
 
-@pytest.mark.parametrize("error", [KeyError("bug"), RuntimeError("bug"), wrapped(RuntimeError("bug"))])
+@pytest.mark.parametrize(
+    "error",
+    [
+        KeyError("bug"),
+        RuntimeError("bug"),
+        wrapped(RuntimeError("bug")),
+        RuntimeError("[ImageBlock] put(): bug"),
+        RuntimeError("[Lamp] eval(): Traceback (most recent call last):\nKeyError: bug"),
+    ],
+)
 def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
     """Rationale: a bug in the code that Dr.Jit records is a RuntimeError, too. Expected: an error that names
     nothing of the user's, nor a lack of memory, is raised as it is."""
@@ -599,6 +611,26 @@ def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
     with pytest.raises(type(error)) as caught:
         main(["render", str(scene), "-o", "a.exr"])
     assert caught.value is error
+
+
+@pytest.mark.parametrize("kind", ["bdpt", "path"])
+def test_an_error_of_a_plugin_is_one_line(tmp_path, capsys, kind):
+    """Rationale: Mitsuba finds while rendering that a lamp's texture has no spectra. Expected: its whole
+    message in one line, and a usage error."""
+    mi.Bitmap(np.ones((2, 2, 3), dtype=np.float32)).write(str(tmp_path / "t.exr"))
+    text = (
+        '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" '
+        'value="4"/><integer name="height" value="4"/></film><transform name="to_world"><lookat '
+        'origin="0,0,3" target="0,0,0" up="0,1,0"/></transform></sensor><shape type="rectangle"><emitter '
+        'type="area"><texture type="bitmap" name="radiance"><string name="filename" value="t.exr"/><boolean '
+        'name="raw" value="true"/></texture></emitter></shape></scene>'
+    )
+    (tmp_path / "a.xml").write_text(text)
+    variant = variants.of("spectral")
+    arguments = ["--spp", "1", "-m", variant, "--integrator", kind, "-o", str(tmp_path / "a.exr")]
+    assert main(["render", str(tmp_path / "a.xml"), *arguments]) == 2
+    *_, last = capsys.readouterr().err.splitlines()
+    assert last.startswith("error: [BitmapTexture") and last.endswith("explicitly disabled! (raw=true)")
 
 
 @pytest.mark.parametrize("kind", ["path", "ptracer"])

@@ -8,6 +8,7 @@ Usage errors, `USAGE`, concern the user's input; the same command would fail aga
 * ``OSError`` about a path that is missing or cannot be written (`PATHS`).
 * ``RuntimeError`` of Mitsuba's parser: about a scene file, an unknown plugin, or its parameters; with the
   traceback of a Python plugin, only if that ends in one of the first.
+* ``RuntimeError`` of a plugin of the scene while rendering (`OF_PLUGIN`), such as a texture without spectra.
 
 Failures, `FAILURE`, may be transient: `errors.FailureError`, other ``OSError``, ``MemoryError`` and Dr.Jit's
 ``RuntimeError`` about memory.
@@ -52,6 +53,16 @@ STATUSES = (
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
 
+OF_PLUGIN = re.compile(
+    r"\[(?!\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct)\])[A-Z]\w*(\[\w+\])?\] (?!.*Traceback)",
+    re.DOTALL,
+)
+"""What an error of a plugin in C++ begins with: its class in brackets.
+
+Without classes that `bdpt` calls with data of its own: their errors may be bugs.
+"""
+
+
 def answered(main: Callable[[], int | None], interrupted: str = "interrupted") -> int | None:
     """Return the exit status of ``main``; prints its error, if any, or ``interrupted``."""
     try:
@@ -90,7 +101,7 @@ def in_words(error: BaseException) -> str:
     if (lacking := of_memory(error)) is not None:
         return f"not enough memory ({message(lacking) or 'no more was given'}); {MEMORY_REMEDY}"
     if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
-        return message(error)
+        return message(behind_plugin(error) or error)
     remedy = REMEDIES.get(error.errno or 0)
     return f"{str(error.filename)!r}: {error.strerror}" + (f"; {remedy}" if remedy else "")
 
@@ -112,6 +123,12 @@ def of_memory(error: BaseException) -> BaseException | None:
     return next(filter(is_lack, chain(error)), None)
 
 
+def behind_plugin(error: BaseException) -> BaseException | None:
+    """Return the exception of a plugin that ``error`` is or wraps, see `OF_PLUGIN`."""
+    errors = (found for found in chain(error) if isinstance(found, RuntimeError))
+    return next((found for found in errors if OF_PLUGIN.match(str(found))), None)
+
+
 def status_of(error: BaseException) -> int | None:
     """Return the exit status after an ``error``, see above; None for a bug."""
     if is_mistake(error):
@@ -127,6 +144,8 @@ def is_mistake(error: BaseException) -> bool:
     if isinstance(error, argparse.ArgumentTypeError):
         return True
     if behind(error, UsageError, UnsupportedError) is not None:
+        return True
+    if behind_plugin(error) is not None:
         return True
     if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
         return False
