@@ -41,7 +41,7 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
-from mitsuba_bdpt.measure.tables import ratio, replace_part, table
+from mitsuba_bdpt.measure.tables import met_text, ratio, replace_part, table
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -501,9 +501,12 @@ def goals(record: dict) -> str:
         words, figure = FIGURES[goal.figure]
         size = f"{goal.size:,}" if isinstance(goal.size, int) else goal.size
         what = f"{goal.kind}, {size}, {words}" + (", path tracing alone" if goal.method == "alone" else "")
-        measured = f"{figure(rows, found, goal.method):.3g}" if found else "not measured"
-        lines.append([what, f"{goal.most:g}", measured])
-    return table(["over `path`", "at most", "measured"], lines)
+        value = figure(rows, found, goal.method) if found else None
+        measured, met = (
+            ("not measured", "–") if value is None else (f"{value:.3g}", met_text(value <= goal.most))
+        )
+        lines.append([what, f"{goal.most:g}", measured, met])
+    return table(["over `path`", "at most", "measured", "met"], lines)
 
 
 def write(record: dict) -> None:

@@ -272,55 +272,64 @@ def test_tables_say_what_the_rows_say(results):
 
 
 def test_goals_stand_beside_what_is_measured(results):
+    """Expected: a row per goal: its bound, its aim, the figure, and whether all numbers meet the bound,
+    of several each its own; without a number, no verdict."""
     goals = [
         {
             "what": "box",
-            "at_least": "1.4x",
+            "at_least": 1.4,
             "aim": "2x",
             "measure": "efficiency",
             "scene": "box",
         },
-        {"what": "worst", "at_least": "0.97x", "measure": "worst"},
-        {"what": "near", "at_least": "0.96x", "measure": "near one", "scene": "box"},
-        {"what": "cost", "at_least": "3x", "measure": "cost", "scene": "box"},
-        {"what": "alone", "at_least": "1x", "measure": "alone", "scene": "box"},
-        {"what": "none", "at_least": "2x", "measure": "against none"},
-        {"what": "aimed", "at_least": "2x", "measure": "not aimed", "scene": "box"},
-        {"what": "merged", "at_least": "9x", "measure": "merging raw", "scene": "box"},
-        {"what": "cold", "at_least": "4x", "measure": "coldstart"},
-        {"what": "memory", "at_least": "1 GiB", "measure": "memory"},
-        {"what": "floor", "at_least": "1x", "measure": "floor"},
-        {"what": "nothing", "at_least": "1x"},
-        {"what": "dark", "at_least": "1x", "measure": "efficiency", "scene": "dark"},
+        {"what": "worst", "at_least": 0.97, "measure": "worst"},
+        {"what": "near", "at_least": 0.96, "measure": "near one", "scene": "box"},
+        {"what": "cost", "at_most": [3, 1.4], "text": "{}x / {}x", "measure": "cost", "scene": "box"},
+        {"what": "alone", "at_least": 1, "measure": "alone", "scene": "box"},
+        {"what": "none", "at_least": 2, "measure": "against none"},
+        {"what": "aimed", "at_least": 2, "measure": "not aimed", "scene": "box"},
+        {"what": "merged", "at_least": 9, "measure": "merging raw", "scene": "box"},
+        {"what": "cold", "at_most": [4, 2], "text": "{} s and {}x", "measure": "coldstart"},
+        {"what": "memory", "at_most": 1, "text": "{} GiB", "measure": "memory"},
+        {"what": "floor", "at_most": 1.35, "measure": "floor"},
+        {"what": "nothing", "at_least": 1},
+        {"what": "dark", "at_least": 1, "measure": "efficiency", "scene": "dark"},
     ]
     text = report.goals_table(results, goals)
-    assert cells(text, "box") == ["1.4x", "2x", "0.8x (0.8–0.8)"]
+    assert cells(text, "box") == ["1.4x", "2x", "0.8x (0.8–0.8)", "**no**"]
     near = "0.800x, interval 0.800–0.800, 16 pairs"
-    assert cells(text, "worst") == ["0.97x", "–", f"`box` of 2 scenes: {near}"]
+    assert cells(text, "worst") == ["0.97x", "–", f"`box` of 2 scenes: {near}", "**no**"]
     assert cells(text, "near") == [
         "0.96x",
         "–",
         f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
+        "**no**",
     ]
-    assert cells(text, "cost") == ["3x", "–", "3x (3–3) / 1.5x (1.5–1.5)"]
+    assert cells(text, "cost") == ["3x / 1.4x at most", "–", "3x (3–3) / 1.5x (1.5–1.5)", "**no**"]
     assert cells(text, "alone") == [
         "1x",
         "–",
         ", ".join(f"fewer than two renders: seeds = 2 or more at {budget} spp" for budget in (64, 256)),
+        "–",
     ]
-    assert cells(text, "none") == ["2x", "–", "3x trimmed, 3x raw, 2 of 2 scenes"]
+    assert cells(text, "none") == ["2x", "–", "3x trimmed, 3x raw, 2 of 2 scenes", "yes"]
     fog = noisy("bdpt", 16) + noisy("bdpt skip=none", 16, seconds=24.0) + noisy("volpath", 16)
     with_fog = Results(results.rows + [r | {"scene": "fog"} for r in fog], results.references, {})
     assert (
         cells(report.goals_table(with_fog, goals), "none")[2]
         == "6x trimmed, 6x raw, 3 of 3 scenes; without media: 3x trimmed, 3x raw, 2 of 2 scenes"
     )
-    assert cells(text, "merged") == ["9x", "–", "20x (20–20) over path, 8x (8–8) over path multijitter"]
-    assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5) trimmed, 1x (1–1) raw"]
-    assert cells(text, "cold") == ["4x", "–", "4.00 s, 2x (2–2) `path`'s"]
-    assert cells(text, "memory") == ["1 GiB", "–", "not measured"]
-    assert cells(text, "floor") == ["1x", "–", "1.3x (1.2–1.4) `box`"]
-    assert cells(text, "nothing") == ["1x", "–", "not measured yet"]
+    assert cells(text, "merged") == [
+        "9x",
+        "–",
+        "20x (20–20) over path, 8x (8–8) over path multijitter",
+        "**no**",
+    ]
+    assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"]
+    assert cells(text, "cold") == ["4 s and 2x at most", "–", "4.00 s, 2x (2–2) `path`'s", "yes"]
+    assert cells(text, "memory") == ["1 GiB at most", "–", "not measured", "–"]
+    assert cells(text, "floor") == ["1.35x at most", "–", "1.3x (1.2–1.4) `box`", "yes"]
+    assert cells(text, "nothing") == ["1x", "–", "not measured yet", "–"]
     dark = cells(text, "dark")[2]
     assert dark.startswith("≥ 0.8x (0.8–0.8); `path`: ") and "% of the energy is missing" in dark
 
@@ -358,7 +367,7 @@ def test_choices_and_the_cost_of_the_pilot():
     assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
     assert found[1] == "t<=1" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and len(found) == 4
-    assert report.OF_A_SCENE["pilot"](results, "box") == "20.0 % at 64 spp"
+    assert report.OF_A_SCENE["pilot"](results, "box") == report.Measured("20.0 % at 64 spp", [20.0])
     with pytest.raises(Refused, match="remembered no pilots"):
         report.OF_A_SCENE["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
@@ -408,12 +417,15 @@ def test_names_are_those_of_the_preset():
         ("goal = 3", "goal=3 must be a list .* tables"),
         ("x = 3", "goal=None must be a list"),
         ("[[goal]]\nwhat = 3", r"what of a \[\[goal\]\]=3 must be a text in quotes"),
-        ('[[goal]]\nwhat = "x"', r"at_least of a \[\[goal\]\]=None must be a text"),
-        ('[[goal]]\nwhat = "x"\nat_least = "1"\naim = 2', "aim of 'x'=2 must be a text"),
-        ('[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "speed"', "measure='speed' of 'x' must be one of"),
-        ('[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "cost"', "measure='cost' of 'x' needs a scene"),
+        ('[[goal]]\nwhat = "x"', "'x' needs one of at_least, at_most"),
+        ('[[goal]]\nwhat = "x"\nat_least = 1\nat_most = 2', "'x' needs one of at_least, at_most"),
+        ('[[goal]]\nwhat = "x"\nat_least = "1x"', "at_least='1x' of 'x' must be a number or a list"),
+        ('[[goal]]\nwhat = "x"\nat_most = [1, 2]', r"text=None of 'x' needs a \{\} for each bound"),
+        ('[[goal]]\nwhat = "x"\nat_least = 1\naim = 2', "aim of 'x'=2 must be a text"),
+        ('[[goal]]\nwhat = "x"\nat_least = 1\nmeasure = "speed"', "measure='speed' of 'x' must be one of"),
+        ('[[goal]]\nwhat = "x"\nat_least = 1\nmeasure = "cost"', "measure='cost' of 'x' needs a scene"),
         (
-            '[[goal]]\nwhat = "x"\nat_least = "1"\nmeasure = "worst"\nscene = "a"',
+            '[[goal]]\nwhat = "x"\nat_least = 1\nmeasure = "worst"\nscene = "a"',
             "measure='worst' of 'x' is no figure of one scene: leave out scene",
         ),
     ],
@@ -429,6 +441,13 @@ def test_the_goals_of_the_project_can_be_measured(results):
     file = ROOT / "docs" / "reports" / "benchmark" / "goals.toml"
     goals = report.checked_goals(file, tomllib.loads(file.read_text()))
     assert report.goals_table(results, goals).count("\n") == len(goals) + 2
+
+
+def test_a_goal_has_a_bound_for_each_number(results):
+    """Expected: the goal is named that has two bounds for one number."""
+    goal = {"what": "x", "at_least": [1, 2], "text": "{} {}", "measure": "efficiency", "scene": "box"}
+    with pytest.raises(CommandError, match="'x' has 2 bounds for 1 numbers"):
+        report.goals_table(results, [goal])
 
 
 def test_a_sweep_that_was_cut_has_figures():
@@ -553,7 +572,7 @@ def test_a_report_is_written(results, tmp_path):
     table = [r | {"reference_sha256": digest(file)} for r in only]
     pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
     (tmp_path / "probes.json").write_text(json.dumps(results.probes))
-    (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = "1x"\n')
+    (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = 1\n')
     (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
     readme.write_text(
@@ -567,7 +586,7 @@ def test_a_report_is_written(results, tmp_path):
     (tmp_path / "README.md").unlink()
     assert [report.run(options), report.run(options)] == [0, 0]
     page = (tmp_path / "README.md").read_text()
-    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet"]
+    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet", "–"]
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
     for text, message in (

@@ -58,8 +58,9 @@ def test_figures_are_ratios_over_path():
     assert scale.cells(rows, rows[0])[7] == "–" and scale.cells(rows, rows[1])[5] == "4.5x"
     filters = [row("filters", "box", 1, 2), row("filters", "gaussian", 2, 5)]
     text = scale.goals({"rows": filters})
-    assert "| filters, gaussian, ratio over that of the box filter | 1.1 | 1.25 |" in text
-    assert "| lamps, 1,000, warm render | 1.5 | not measured |" in text
+    assert "| filters, gaussian, ratio over that of the box filter | 1.1 | 1.25 | **no** |" in text
+    assert "| 1.1 | 1 | yes |" in scale.goals({"rows": [filters[0], row("filters", "gaussian", 2, 4)]})
+    assert "| lamps, 1,000, warm render | 1.5 | not measured | – |" in text
 
 
 def test_what_a_pixel_takes_to_an_error():

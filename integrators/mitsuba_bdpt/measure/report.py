@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ from .project import Project
 from .record import Error, Row
 from .reference import Reference
 from .results import load, missing_of
-from .tables import by_scene, ranged, ratio, relative, replace_part, said, table
+from .tables import by_scene, met_text, ranged, ratio, relative, replace_part, said, table
 
 # -- tables -----------------------------------------------------------------------------------
 
@@ -274,7 +275,7 @@ def choices_table(results: Results) -> str:
     columns: dict[str, Callable[[str], object]] = {
         "chosen (number of renders)": chosen,
         "left out in the first render": left_out,
-        "share of the pilot in the first render": lambda scene: _pilot_share(rows(scene)),
+        "share of the pilot in the first render": lambda scene: f"{_pilot_percent(rows(scene)):.1f} %",
         "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
         f"the same, {NONE}": lambda scene: _rays_per_sample(results.of(scene, NONE, results.deciding)),
     }
@@ -292,14 +293,16 @@ def _chosen(row: Row) -> str:
     return f"light_paths={light_paths}, connections={last['connections']}"
 
 
-def _pilot_share(rows: Sequence[Row]) -> str:
-    """Return the pilots' share of a scene's first render; later ones reuse them."""
+def _pilot_percent(rows: Sequence[Row]) -> float:
+    """Return the pilots' share of a scene's first render in percent; later ones reuse them."""
     shares: list[float] = []
     for row in rows:
         if (first := row.get("seconds_pilot")) is None:
             raise Refused("rows of a version that remembered no pilots")
         shares.append(first / (first + row["seconds"]))
-    return f"{100 * np.median(shares):.1f} %" if shares else "–"
+    if not shares:
+        raise Refused("–")
+    return 100 * float(np.median(shares))
 
 
 def _rays_per_sample(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -369,11 +372,41 @@ Goal = dict[str, Any]
 # -- goals ------------------------------------------------------------------------------------
 
 
-def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> str:
+@dataclass(frozen=True)
+class Measured:
+    """What a goal measures: a text, and the numbers that must reach its bound; NaN where one is missing."""
+
+    text: str
+    values: Sequence[float]
+
+
+def _measured(
+    figures: Mapping[str, Callable[[], Summary]],
+    show: Callable[[Summary], str] = ranged,
+    value: Callable[[Summary], float] = attrgetter("median"),
+    join: str = ", ",
+) -> Measured:
+    """Collect named ``figures``, or why there is none; judged by ``value``."""
+    texts: list[str] = []
+    values: list[float] = []
+    for name, figure in figures.items():
+        try:
+            found = figure()
+        except Refused as why:
+            texts.append(f"{why} {name}")
+            values.append(np.nan)
+        else:
+            texts.append(f"{show(found)} {name}")
+            values.append(value(found))
+    return Measured(join.join(texts), values)
+
+
+def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> Measured:
     """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
     lacks = results.path_lacks(scene)
     rival = results.tracer(scene)
-    return ranged(results.against_path(scene, error)) + (f"; `{rival}`: {lacks}" if lacks else "")
+    found = results.against_path(scene, error)
+    return Measured(ranged(found) + (f"; `{rival}`: {lacks}" if lacks else ""), [found.median])
 
 
 # Pairs required near 1, until the interval of their median is this narrow.
@@ -387,17 +420,14 @@ def _near(found: Summary) -> str:
     return text + (f" (not narrower than {NARROW})" if wide else "")
 
 
-def _near_one(results: Results, scene: str) -> str:
-    """Efficiency over each of `Results.standard`."""
-
-    def near(rival: str) -> str:
-        return _near(results.efficiency(scene, rival))
-
+def _near_one(results: Results, scene: str) -> Measured:
+    """Efficiency over each of `Results.standard`, judged by the lower end of its interval."""
     rivals = results.standard_in(scene) or RIVALS
-    return "; ".join(f"{said(near, rival)} over {rival}" for rival in rivals)
+    figures = {f"over {rival}": partial(results.efficiency, scene, rival) for rival in rivals}
+    return _measured(figures, _near, attrgetter("low"), "; ")
 
 
-def _worst(results: Results) -> str:
+def _worst(results: Results) -> Measured:
     """Smallest efficiency over all scenes."""
     found: dict[str, Summary] = {}
     for scene in results.scenes:
@@ -408,18 +438,21 @@ def _worst(results: Results) -> str:
     if not found:
         raise Refused("not rendered")
     worst = min(found, key=lambda scene: found[scene].median)
-    return f"`{worst}` of {len(found)} scenes: {_near(found[worst])}"
+    return Measured(f"`{worst}` of {len(found)} scenes: {_near(found[worst])}", [found[worst].median])
 
 
-def _against_none(results: Results) -> str:
+def _against_none(results: Results) -> Measured:
+    """Geometric means over all scenes, by which it is judged, and over those without media."""
     plain = [scene for scene in results.scenes if not any(results.of(scene, name) for name in MEDIA_RIVALS)]
-    sets = {"": results.scenes} | ({"without media: ": plain} if 0 < len(plain) < len(results.scenes) else {})
-    return "; ".join(f"{name}{_mean_over_none(results, scenes)}" for name, scenes in sets.items())
+    every = _mean_over_none(results, results.scenes)
+    if not 0 < len(plain) < len(results.scenes):
+        return every
+    return Measured(f"{every.text}; without media: {_mean_over_none(results, plain).text}", every.values)
 
 
-def _mean_over_none(results: Results, scenes: list[str]) -> str:
+def _mean_over_none(results: Results, scenes: list[str]) -> Measured:
     """Geometric means over the scenes, trimmed and raw."""
-    found: list[str] = []
+    found: dict[str, float] = {}
     medians: list[float] = []
     for error, kind in KINDS.items():
         medians = []
@@ -430,62 +463,67 @@ def _mean_over_none(results: Results, scenes: list[str]) -> str:
                 continue
         if not medians:
             raise Refused("not rendered")
-        found.append(f"{ratio(geometric_mean(medians))} {kind}")
-    return f"{', '.join(found)}, {len(medians)} of {len(scenes)} scenes"
+        found[kind] = geometric_mean(medians)
+    text = ", ".join(f"{ratio(mean)} {kind}" for kind, mean in found.items())
+    return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", list(found.values()))
 
 
-def _unaimed(results: Results, scene: str) -> str:
-    return ", ".join(
-        f"{said(results.efficiency, scene, UNAIMED, error)} {kind}" for error, kind in KINDS.items()
-    )
+def _unaimed(results: Results, scene: str) -> Measured:
+    """Efficiency of guided emission, trimmed, by which it is judged, and raw."""
+    found = _measured({kind: partial(results.efficiency, scene, UNAIMED, e) for e, kind in KINDS.items()})
+    return Measured(found.text, found.values[:1])
 
 
-def _merged(results: Results, scene: str) -> str:
+def _merged(results: Results, scene: str) -> Measured:
     """Raw efficiency of `merging` over each of `Results.standard`, biased or not."""
-
-    def over(rival: str) -> Summary:
-        return results.efficiency(scene, rival, "rel_mse", first=MERGING)
-
-    return ", ".join(f"{said(over, rival)} over {rival}" for rival in results.standard_in(scene) or RIVALS)
+    rivals = results.standard_in(scene) or RIVALS
+    over = partial(results.efficiency, scene, error="rel_mse", first=MERGING)
+    return _measured({f"over {rival}": partial(over, rival) for rival in rivals})
 
 
-def _alone(results: Results, scene: str) -> str:
-    return ", ".join(
-        f"{said(efficiency, *(results.of(scene, way, budget) for way in (ALONE, RIVALS[1])))} at {budget} spp"
-        for budget in (results.deciding, 4 * results.deciding)
-    )
+def _alone(results: Results, scene: str) -> Measured:
+    budgets = (results.deciding, 4 * results.deciding)
+    sides = {n: [results.of(scene, way, n) for way in (ALONE, RIVALS[1])] for n in budgets}
+    return _measured({f"at {n} spp": partial(efficiency, *rows) for n, rows in sides.items()})
 
 
-def _cost(results: Results, scene: str) -> str:
+def _cost(results: Results, scene: str) -> Measured:
     path, *sides = (results.of(scene, way, results.deciding) for way in (RIVALS[0], NONE, IMPOSSIBLE))
-    return " / ".join(ranged(cost(side, path)) for side in sides)
+    found = [cost(side, path) for side in sides]
+    return Measured(" / ".join(map(ranged, found)), [one.median for one in found])
 
 
-def _pilot(results: Results, scene: str) -> str:
-    shares: dict[int, str] = {}
+def _pilot(results: Results, scene: str) -> Measured:
+    """The pilot's share of renders, judged by the longest."""
+    shares: dict[int, float] = {}
     for budget in (results.deciding, 4 * results.deciding):
         if rows := results.of(scene, results.methods[0], budget):
-            shares[budget] = _pilot_share(rows)
+            shares[budget] = _pilot_percent(rows)
     if not shares:
         raise Refused(f"no render of {scene}")
-    return ", ".join(f"{share} at {budget} spp" for budget, share in shares.items())
+    text = ", ".join(f"{share:.1f} % at {budget} spp" for budget, share in shares.items())
+    return Measured(text, [shares[max(shares)]])
 
 
-def _floor(results: Results) -> str:
-    return ", ".join(f"{ranged(summary(v))} `{name}`" for name, v in results.probed("floor").items())
+def _floor(results: Results) -> Measured:
+    found = {name: summary(v) for name, v in results.probed("floor").items()}
+    text = ", ".join(f"{ranged(one)} `{name}`" for name, one in found.items())
+    return Measured(text, [one.median for one in found.values()])
 
 
-def _coldstart(results: Results) -> str:
+def _coldstart(results: Results) -> Measured:
     values = results.probed("coldstart")
     ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
-    return f"{np.median(values['bdpt']):.2f} s, {ranged(ratios)} `path`'s"
+    seconds = float(np.median(values["bdpt"]))
+    return Measured(f"{seconds:.2f} s, {ranged(ratios)} `path`'s", [seconds, ratios.median])
 
 
-def _memory(results: Results) -> str:
-    return ", ".join(f"{np.median(v):.2f} GiB for {name}" for name, v in results.probed("memory").items())
+def _memory(results: Results) -> Measured:
+    found = {name: float(np.median(v)) for name, v in results.probed("memory").items()}
+    return Measured(", ".join(f"{v:.2f} GiB for {name}" for name, v in found.items()), [*found.values()])
 
 
-OF_A_SCENE: dict[str, Callable[[Results, str], object]] = {
+OF_A_SCENE: dict[str, Callable[[Results, str], Measured]] = {
     "efficiency": _scene_goal,
     "efficiency raw": partial(_scene_goal, error="rel_mse"),
     "near one": _near_one,
@@ -495,7 +533,7 @@ OF_A_SCENE: dict[str, Callable[[Results, str], object]] = {
     "cost": _cost,
     "pilot": _pilot,
 }
-OF_ALL: dict[str, Callable[[Results], object]] = {
+OF_ALL: dict[str, Callable[[Results], Measured]] = {
     "worst": _worst,
     "against none": _against_none,
     "floor": _floor,
@@ -505,14 +543,18 @@ OF_ALL: dict[str, Callable[[Results], object]] = {
 """What goals can measure: figures of a scene, and others."""
 
 
+BOUNDS = {"at_least": "", "at_most": " at most"}
+"""Keys of a goal's bound, one of which it has, and what its text ends in."""
+
+
 def checked_goals(file: Path, data: dict[str, Any]) -> list[Goal]:
     """Return the entries [[goal]] of goals.toml; raises ``CommandError`` if invalid."""
     if not data:
         return []
     goals = list_of(file, "goal", data.get("goal"), dict, "tables: write [[goal]] and the keys of each below")
     for goal in goals:
-        for key in ("what", "at_least"):
-            text_of(file, f"{key} of a [[goal]]", goal.get(key))
+        text_of(file, "what of a [[goal]]", goal.get("what"))
+        _check_bound(file, goal)
         if "aim" in goal:
             text_of(file, f"aim of {goal['what']!r}", goal["aim"])
         measure, scene = goal.get("measure"), goal.get("scene")
@@ -526,16 +568,63 @@ def checked_goals(file: Path, data: dict[str, Any]) -> list[Goal]:
     return goals
 
 
+def _check_bound(file: Path, goal: Goal) -> None:
+    """Raise ``CommandError`` unless a goal has one bound, of a number or several, that its text fits."""
+    keys = BOUNDS.keys() & goal.keys()
+    if len(keys) != 1:
+        raise CommandError(f"{file}: {goal['what']!r} needs one of {', '.join(BOUNDS)}")
+    (key,) = keys
+    if not all(isinstance(bound, int | float) for bound in _bounds(goal)):
+        raise CommandError(
+            f"{file}: {key}={goal[key]!r} of {goal['what']!r} must be a number or a list of some"
+        )
+    if text_of(file, f"text of {goal['what']!r}", goal.get("text", "{}")).count("{}") != len(_bounds(goal)):
+        raise CommandError(
+            f"{file}: text={goal.get('text')!r} of {goal['what']!r} needs a {{}} for each bound"
+        )
+
+
+def _bounds(goal: Goal) -> list[Any]:
+    bound: Any = goal["at_least" if "at_least" in goal else "at_most"]
+    return [*bound] if isinstance(bound, list) else [bound]
+
+
+def _bound_text(goal: Goal) -> str:
+    """Format a goal's bound by its ``text``, which has a `{}` for each number; default: a ratio."""
+    (key,) = (key for key in BOUNDS if key in goal)
+    return goal.get("text", "{}x").format(*_bounds(goal)) + BOUNDS[key]
+
+
+def _met(goal: Goal, values: Sequence[float]) -> str:
+    """Whether all ``values`` meet a goal's bound, or each its own; intervals do not matter."""
+    if not values or any(np.isnan(value) for value in values):
+        return "–"
+    bounds = _bounds(goal)
+    if len(bounds) == 1:
+        bounds *= len(values)
+    if len(bounds) != len(values):
+        raise CommandError(f"goals.toml: {goal['what']!r} has {len(bounds)} bounds for {len(values)} numbers")
+    pairs = zip(values, bounds, strict=True)
+    return met_text(all(value >= bound if "at_least" in goal else value <= bound for value, bound in pairs))
+
+
 def goals_table(results: Results, goals: list[Goal]) -> str:
-    """Table of goals and measurements."""
+    """Table of goals and measurements, and whether they are met."""
 
-    def figure(measure: str | None = None, scene: str | None = None, **_) -> str:
+    def figure(measure: str | None = None, scene: str | None = None, **_) -> Measured:
         if measure is None:
-            return "not measured yet"
-        return said(OF_ALL[measure], results) if scene is None else said(OF_A_SCENE[measure], results, scene)
+            return Measured("not measured yet", [])
+        try:
+            return OF_ALL[measure](results) if scene is None else OF_A_SCENE[measure](results, scene)
+        except Refused as why:
+            return Measured(str(why), [])
 
-    lines = [[goal["what"], goal["at_least"], goal.get("aim", "–"), figure(**goal)] for goal in goals]
-    return table(["what", "at least", "aim", "measured"], lines)
+    lines: list[list[str]] = []
+    for goal in goals:
+        found = figure(**goal)
+        met = _met(goal, found.values)
+        lines.append([goal["what"], _bound_text(goal), goal.get("aim", "–"), found.text, met])
+    return table(["what", "bound", "aim", "measured", "met"], lines)
 
 
 # -- files ------------------------------------------------------------------------------------

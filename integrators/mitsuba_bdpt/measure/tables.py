@@ -32,6 +32,11 @@ def by_scene(scenes: Iterable[str], columns: Mapping[str, Callable[[str], object
     return table(["scene", *columns], rows)
 
 
+def met_text(met: bool) -> str:
+    """Return whether a goal is met, as text of a table."""
+    return "yes" if met else "**no**"
+
+
 def ratio(x: float) -> str:
     """Format a ratio with three digits."""
     return f"{x:.3g}x" if x < 999.5 else f"{round(x, -1):.0f}x"
