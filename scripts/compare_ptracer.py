@@ -524,7 +524,7 @@ def page(rows) -> str:
     """The table in Markdown."""
 
     def number(value):
-        return "refused" if value is None else f"{value:.4g}"
+        return "raises an error" if value is None else f"{value:.4g}"
 
     return table(
         ["what goes wrong", "number", "right", "`ptracer`", "`bdpt`"],

@@ -91,6 +91,16 @@ def test_pages_are_short(page):
     assert str(page.relative_to(ROOT)).startswith(MADE) or len(words) < 2500
 
 
+def test_merged_images_are_named():
+    """Rationale: the command beside the gallery rendered other images than seven of its own. Expected: the
+    page names the scenes that `make gallery` renders with `merging`."""
+    makefile = (ROOT / "Makefile").read_text()
+    recipe = re.search(r"for scene in (.*); do.*\n(?:.*\n)?.*-P merging=true", makefile)[1]
+    page = (ROOT / "docs" / "reports" / "figures.md").read_text()
+    named = re.search(r"with `-P merging=true`:\n(.*?)\.", page, re.DOTALL)[1]
+    assert re.findall(r"`(\w+)`", named) == recipe.split() and len(recipe.split()) == 7
+
+
 def test_the_readme_is_short():
     """Expected: below 100 lines, and six parameters in its table; the rest is in docs/."""
     text = (ROOT / "README.md").read_text()
