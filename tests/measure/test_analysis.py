@@ -185,7 +185,10 @@ def results():
     kept = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
     probes = {"coldstart": {"versions": kept, "values": values}}
     probes["floor"] = {"versions": kept, "values": {"box": [1.4, 1.2, 1.3]}}
-    return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes)
+    return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes, ASIDE)
+
+
+ASIDE = "bdpt skip=none", "ptracer", "bdpt skip=impossible", "bdpt guiding=photons", "bdpt merging"
 
 
 def test_the_stronger_path_decides(results):
@@ -241,7 +244,7 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
         + runs("volpathmis", 3, rel_mse_trimmed=0.06)
     )
     rows = results.rows + [r | {"scene": "fog"} for r in fog]
-    both = Results(rows, results.references | {"fog": KNOWN}, results.probes)
+    both = replace(results, rows=rows, references=results.references | {"fog": KNOWN})
     text = report.efficiency_table(both)
     assert text.startswith(report.efficiency_table(results).rstrip("\n"))
     assert "| scene | over volpath, trimmed | over volpath, raw | over volpathmis, trimmed |" in text
@@ -450,6 +453,26 @@ def test_a_goal_has_a_bound_for_each_number(results):
         report.goals_table(results, [goal])
 
 
+def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
+    """Rationale: `bdpt merging` and `ptracer` of somebody's preset were in no table and no figure, since the
+    benchmark has integrators of these names. Expected: all are compared, but those that goals.toml names."""
+    every = replace(results, aside=())
+    assert every.rivals[:2] == ["path", "path multijitter"]
+    assert set(every.rivals) == {*every.methods[1:]} and "ptracer" in every.rivals
+    text = report.efficiency_table(every)
+    assert "| over bdpt merging, trimmed |" in text and text.count("over bdpt skip=none, trimmed |") == 1
+    assert "efficiency over ptracer" not in report.checks_table(every, MADE, {})
+    assert "efficiency over ptracer" in report.checks_table(results, MADE, {})
+
+
+def test_a_report_says_where_times_are_equal(results):
+    """Expected: at the largest budget, and where a limit of time allowed a smaller one only, at which."""
+    assert "Times are equal at the largest budget, and nearly" in report._introduction(results)
+    rows = [r | {"equal_time_spp": 16 if r["scene"] == "dark" else 64} for r in results.rows]
+    said = report._introduction(replace(results, rows=rows))
+    assert "Times are equal at the largest budget, for lack of time at 16 spp in `dark`, and nearly" in said
+
+
 def test_a_sweep_that_was_cut_has_figures():
     """Rationale: a sweep without time for a second render of the largest budget reported "fewer than two
     renders" in every cell. Expected: figures are of the largest budget of two renders of each integrator,
@@ -459,6 +482,9 @@ def test_a_sweep_that_was_cut_has_figures():
     assert Results([*small, *large], {}, {}).deciding == 64
     assert Results([*small, *large, row("bdpt skip=none", 1, budget=16)], {}, {}).deciding == 64
     assert Results([*large[:1], *large[2:3], row(budget=4)], {}, {}).deciding == 64
+    assert Results([*small, *large], {}, {}, compared=16).deciding == 16
+    with pytest.raises(CommandError, match="spp=32 must be one of 16, 64"):
+        _ = Results([*small, *large], {}, {}, compared=32).deciding
 
 
 def test_cells_are_numbers_where_nothing_is_wrong():

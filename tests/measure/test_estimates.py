@@ -162,6 +162,19 @@ def test_rare_light_that_was_not_met_is_a_lower_bound():
     assert alone.bound == "" and alone.median == pytest.approx(25, rel=0.05)
 
 
+@pytest.mark.parametrize(("lacks", "differs"), [(0.03, True), (0.0, False)])
+def test_a_bias_shows_in_few_renders_too(lacks, differs):
+    """Rationale: of an integrator that lacks light, three renders had a raw error below the trimmed one,
+    without a mark: the bias check hardly ever rejects three. Expected: variance 0.01 and squared bias 0.0009
+    times the share of weights, marked; without bias the variance alone."""
+    reference = halves(0.003)
+    images = [(1 - lacks) * TRUTH + noise(seed) for seed in range(3)]
+    raw, trimmed = (cell(images, reference, error) for error in ("rel_mse", "rel_mse_trimmed"))
+    assert raw.bound == ("≥" if differs else "")
+    assert raw.total.value == pytest.approx(raw.variance + (raw.squared_bias.value if differs else 0))
+    assert raw.total.value > trimmed.total.value
+
+
 def test_what_both_lack_is_no_difference():
     """Two integrators without a tenth of the light, of 10 % and 20 % noise. Expected: raw, the ratio of the
     variances, 4, without a bound; by the errors to the truth it would be (4 + 1) / (1 + 1)."""

@@ -3,6 +3,7 @@
 import itertools
 import re
 from argparse import Namespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,7 +131,7 @@ def test_crops_are_of_the_sweep(tmp_path):
     """Expected: the images of the first seed at the deciding budget, rivals first, with their samples and
     seconds; integrators without images are left out, and a scene without any is an error."""
     rows = [row | {"key": f"{row['method']}{row['seed']}"} for row in results(("b",)).rows]
-    found = Results(rows, {"b": KNOWN}, {})
+    found = Results(rows, {"b": KNOWN}, {}, compared=64)
     kept = Namespace(image=np.ones((8, 8, 3)))
     with pytest.raises(CommandError, match="no image of b is there; run the sweep again"):
         figures.cropped(tmp_path, found, kept, "b")
@@ -144,7 +145,7 @@ def test_crops_are_of_the_sweep(tmp_path):
     ]
     np.testing.assert_allclose(made.columns[1].errors, 0.25 / 1.01, rtol=1e-3)
     rows = [row | ({"match": "spp"} if row["method"] == "path" else {}) for row in found.rows]
-    made = figures.cropped(tmp_path, Results(rows, found.references, {}), kept, "b")
+    made = figures.cropped(tmp_path, replace(found, rows=rows), kept, "b")
     assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
 
 
@@ -253,25 +254,62 @@ def test_the_legend_of_efficiencies_has_the_markers_of_the_data(monkeypatch):
     assert "95 % interval" in handles and handles[f"over {METHODS[-1]}"].get_marker() not in (".", ",")
 
 
+ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}
+"""Options of figures by default."""
+
+
+def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
+    """Rationale: both windows of a picture lay on the floor, none on its caustic. Expected: the integrators
+    that are named, and the first; windows about the places, within the image; what is wrong is named."""
+    kept = replace(results(("b",)), aside=(METHODS[1],))
+    assert METHODS[1] not in figures._among(kept, None).methods
+    assert figures._among(kept, METHODS[1:2]).rivals == [METHODS[1]]
+    with pytest.raises(CommandError, match="--integrators pat: not in the sweep, which has bdpt, "):
+        figures._among(kept, ["pat"])
+    places = crops.centres(["0.5,0.25", "1,0"])
+    assert crops._around(places, 60, 120) == [(55, 10, 10), (110, 0, 10)]
+    assert crops.centres(None) is None
+    for wrong in (["0.5", "1,0"], ["2,0", "1,0"], ["a,b", "1,0"], ["nan,0", "1,0"]):
+        with pytest.raises(CommandError, match="must be X,Y, shares of the image"):
+            crops.centres(wrong)
+    with pytest.raises(CommandError, match="must be 2 places"):
+        crops.centres(["0.5,0.5"])
+    found = saved(monkeypatch, crops)
+    crops.draw([block(2, 60, 60)], None, 2, places)
+    frames = [patch.get_xy() for patch in found[0].axes[0].patches]
+    assert frames == [(24.5, 9.5), (49.5, -0.5)]
+
+
+def test_single_renders_among_several_have_no_point():
+    """Rationale: a budget whose second render was cut looked as certain as the others. Expected: points of
+    two renders or more; where all are single, all."""
+    kept = results(("b",))
+    few = replace(kept, rows=[row for row in kept.rows if row["budget"] < 256 or not row["seed"]])
+    points, _ = figures._points(few, "b", "bdpt", "spp", "rel_mse")
+    assert points[:, 0].tolist() == [4, 16, 64]
+    one = replace(kept, rows=[row for row in kept.rows if not row["seed"]])
+    assert len(figures._points(one, "b", "bdpt", "spp", "rel_mse")[0]) == 4
+
+
 def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
     """Rationale: an empty plot, and status 0. Expected: what is missing, and the key that mends it."""
     kept = results(("b",))
     one = Results([row for row in kept.rows if not row["seed"]], kept.references, {})
-    monkeypatch.setattr(figures, "load", lambda project, folder: (one, {}))
+    monkeypatch.setattr(figures, "load", lambda *_: (one, {}))
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "efficiency"}
     with pytest.raises(CommandError, match="two renders of each integrator; set seeds = 2 or more"):
-        figures.run(Namespace(**words, scenes=None, columns=1))
+        figures.run(Namespace(**ALL | words, columns=1))
 
 
 def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
     """Expected: a warning with the height and the option that mends it; none for one scene. The scale of
     errors has the same name at each width."""
     kept, found = results(("a", "b")), saved(monkeypatch, crops)
-    monkeypatch.setattr(figures, "load", lambda project, folder: (kept, dict.fromkeys("ab")))
+    monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab")))
     monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "crops"}
     for scenes in (None, ["b"]):
-        figures.run(Namespace(**words, scenes=scenes, columns=2))
+        figures.run(Namespace(**ALL | words | {"scenes": scenes}, columns=2))
     assert re.search(r"a.pdf is 4\d cm tall, more .*: draw fewer scenes by --scenes", capsys.readouterr().out)
     assert found[1].get_size_inches()[1] * 2.54 < figures.PAGE
     crops.draw([block(3)], None, 1)

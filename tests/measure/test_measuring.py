@@ -335,7 +335,7 @@ def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
 
     monkeypatch.setattr(report, "run", interrupted)
     assert measuring.run(parsed) == measuring.mistakes.INTERRUPTED
-    assert capsys.readouterr().err == "interrupted; what was finished is kept\n"
+    assert capsys.readouterr().err == "interrupted; what was finished is kept, and the same command goes on\n"
 
 
 def test_the_frame_of_the_page_is_in_the_package():

@@ -23,6 +23,7 @@ from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import (
     agreement,
     analysis,
+    limited,
     making,
     metrics,
     probes,
@@ -276,7 +277,7 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
     made = making.obtained(job(2, seconds=266.0))
     assert [spp for _, spp in seen] == [4, 16, *[16] * 14] and clock[0] <= 266
     assert made.provenance["spp"] == 224 and made.means.columns.freedom == 13
-    assert "as many as fit into 266 s: go on by" in capsys.readouterr().out
+    assert "as many as fit into 266 s: more are added by" in capsys.readouterr().out
     for sums in (True, False):
         if not sums:
             (project.renders / "reference_cornell_box_8_2.npz").unlink()
@@ -1097,21 +1098,51 @@ def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
 
 
 def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
-    """Expected: a scene that is complete takes no share, and what one leaves goes to the next ones."""
+    """Expected: a scene that is complete takes no share, what one leaves goes to the next, and what is left
+    at the end to those that still lack renders, until nothing more fits. Advised is what these need, and a
+    quarter more."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
     made = sweep.Sweep(REPOSITORY, read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
     made._todo[1], clock, shares = [], [0.0], []
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
 
-    def in_time(self, cells, missing, seconds):
-        shares.append(seconds)
-        clock[0] += 10 if missing else 0
-        return missing[:1], 7.0
+    class Scene:
+        """Renders four times for 10 s each, but no more than twice in a share."""
 
-    monkeypatch.setattr(sweep.Sweep, "_in_time", in_time)
-    made.run(showing.Renders(), seconds=60)
-    assert shares[::2] == [30, 50]
-    assert made.wanted == 18  # of two scenes that share it, each 7 s and a quarter more
+        needed, text = 7.0, "text"
+
+        def __init__(self, cells, missing):
+            self.cells, self.done = cells, 0
+
+        @property
+        def late(self):
+            return [None] * (4 - self.done)
+
+        def render(self, rendered, seconds):
+            shares.append(seconds)
+            count = min(int(seconds // 10), 2, 4 - self.done)
+            self.done, clock[0] = self.done + count, clock[0] + 10 * count
+
+    monkeypatch.setattr(sweep, "Pending", Scene)
+    made.run(showing.Renders(), seconds=74)
+    assert shares[:4] == [37, 54, 17, 24] and made.wanted == 9  # of one scene, 7 s and a quarter more
+    assert made.cut == {"furnace_emission": "text"} or made.cut == {"cornell_box": "text"}
+
+
+def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
+    """Expected: a render of 0.5 s and 0.1 s per sample: of the first budget in proportion, of two by the line
+    through both; at least half of the proportion, for noise; that of a known budget is the last one."""
+    preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
+    cells = sweep.Cells(REPOSITORY, preset, preset.subjects[0])
+    made = limited.Pending(cells, cells.planned())
+    assert made._seconds_of("ours", 4) == 0
+    made._seconds["ours"] = {2: 0.7}
+    assert made._seconds_of("ours", 4) == pytest.approx(0.7 + 0.35 * 2)
+    made._seconds["ours"] = {2: 0.7, 4: 0.9}
+    assert made._seconds_of("ours", 16) == pytest.approx(0.9 + max(0.1, 0.5 * 0.9 / 4) * 12)
+    assert made._seconds_of("ours", 4) == 0.9 and made._seconds_of("ours", 2) == 0.7
+    made._seconds["ours"] = {4: 0.8}
+    assert made._seconds_of("ours", 2) == pytest.approx(0.4)
 
 
 def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
@@ -1126,8 +1157,11 @@ def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch
     for seconds, budget in ((0.016, 4), (1.6, 40), (None, 400)):
         bench = Clock(cells, folder / f"{budget}", seconds)
         assert bench.spp_of(cells.of(4, 1)[1]) == 16
-        assert [int(text.split()[-2]) for text in bench.notes] == [budget] * (budget < 400)
+        assert [f"equal at {budget} spp, the largest" in text for text in bench.notes] == [True] * (
+            budget < 400
+        )
         assert bench.spp_of(cells.of(400, 1)[1]) == 1600 and len(bench.notes) == (budget < 400)
+        assert [bench.equal_time_spp(cell) for cell in cells.of(4, 1)] == [None, budget]
 
 
 PER = {"ours": 1e-3, "path": 0.25e-3}

@@ -29,7 +29,7 @@ def run(arguments: Namespace) -> int | None:
         module = COMMANDS[arguments.command][1]
         return importlib.import_module(f"..measure.{module}", __package__).run(arguments)
 
-    return mistakes.answered(measured, "interrupted; what was finished is kept")
+    return mistakes.answered(measured, "interrupted; what was finished is kept, and the same command goes on")
 
 
 def check_installed(command: str) -> None:
@@ -100,7 +100,7 @@ COMMANDS: dict[str, tuple] = {
     "report": (
         "tables and plots of a sweep, as Markdown",
         "report",
-        None,
+        options.Report,
         _FOLDER,
         ("--readme", {"type": Path, "help": "a Markdown file whose parts are filled"}),
     ),
@@ -113,7 +113,7 @@ COMMANDS: dict[str, tuple] = {
     "page": (
         "a sweep as one HTML file, with images to compare",
         "page",
-        None,
+        options.Report,
         _FOLDER,
         ("-o", "--output", {"type": Path, "help": "default: FOLDER/page.html"}),
     ),

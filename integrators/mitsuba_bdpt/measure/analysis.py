@@ -37,10 +37,6 @@ UNAIMED = "bdpt guiding=photons"
 MERGING = "bdpt merging"
 LIGHT_TRACER = "ptracer"
 
-# Samples per pixel of the first integrator at which efficiencies are compared, if available.
-DECIDING = 64
-
-
 ALONE_HERE = "fewer than two renders: seeds = 2 or more"
 """Why there is no figure, with the preset's key that mends it."""
 
@@ -251,11 +247,16 @@ def _paired_budgets(counts: Iterable[Counter[int]]) -> set[int]:
 
 @dataclass(frozen=True)
 class Results:
-    """Rows of a sweep, tile means of its references by scene, and results of probes."""
+    """Rows of a sweep, tile means of its references by scene, and results of probes.
+
+    ``aside``: integrators of which efficiencies are not compared; ``compared``: the budget of comparisons.
+    """
 
     rows: list[Row]
     references: dict[str, Means]
     probes: dict[str, Any]
+    aside: tuple[str, ...] = ()
+    compared: int | None = None
 
     @cached_property
     def scenes(self) -> list[str]:
@@ -273,10 +274,8 @@ class Results:
 
         Mitsuba's path tracers first, then others.
         """
-        tracers = *RIVALS, *MEDIA_RIVALS
-        known = {*tracers, NONE, IMPOSSIBLE, INDEPENDENT, ALONE, UNAIMED, MERGING, LIGHT_TRACER}
-        others = self.methods[1:]
-        return [name for name in tracers if name in others] + [name for name in others if name not in known]
+        others = [name for name in self.methods[1:] if name not in self.aside]
+        return sorted(others, key=lambda name: name not in (*RIVALS, *MEDIA_RIVALS))
 
     @cached_property
     def at_equal_samples(self) -> list[str]:
@@ -330,7 +329,7 @@ class Results:
 
     @cached_property
     def deciding(self) -> int:
-        """The budget of comparisons: `DECIDING`, or the largest that every scene has.
+        """The budget of comparisons: ``compared``, or the largest that every scene has.
 
         Where a time limit left single renders at some budgets, only budgets with two renders of each
         integrator count.
@@ -339,7 +338,12 @@ class Results:
         for row in self.rows:
             counts[row["scene"]].setdefault(row["method"], Counter())[row["budget"]] += 1
         common = set[int].intersection(*(_paired_budgets(of.values()) for of in counts.values()))
-        return DECIDING if DECIDING in common or not common else max(common)
+        every = common or {row["budget"] for row in self.rows}
+        if self.compared is None:
+            return max(every)
+        if self.compared not in every:
+            raise CommandError(f"spp={self.compared} must be one of {', '.join(map(str, sorted(every)))}")
+        return self.compared
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[Row]:
         """Return the rows of an integrator in a scene."""

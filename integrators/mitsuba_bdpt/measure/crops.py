@@ -16,6 +16,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from ..errors import CommandError
 from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
 from .paper import PAPER, WIDTHS, save
 
@@ -66,12 +67,13 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
     score = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
     chosen: list[tuple[int, int, int]] = []
     for _ in COLOURS:
+        for left, top, _ in chosen:
+            # Neighbours would show the same: they come after all others, and what overlaps never.
+            far = 2 * side
+            score[max(0, top - far) : top + far, max(0, left - far) : left + far] -= score.max() + 1
+            score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -np.inf
         top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
         chosen.append((left, top, side))
-        # Neighbours would show the same: they come after all others, and what overlaps never.
-        far = 2 * side
-        score[max(0, top - far) : top + far, max(0, left - far) : left + far] -= score.max() + 1
-        score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -np.inf
     return chosen
 
 
@@ -108,10 +110,43 @@ class _Layout:
         return self.head + self.height + self.window + max(self.height, SCALE) + 3 * GAP
 
 
-def draw(blocks: Sequence[Block], file: Path, columns: int) -> float:
+def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:
+    """Return the centres of two windows, from texts "X,Y" in shares of the image; None: to be chosen."""
+    if given is None:
+        return None
+    found: list[tuple[float, float]] = []
+    for text in given:
+        try:
+            x, y = (float(part) for part in text.split(","))
+        except ValueError:
+            x = y = math.nan
+        if not (0 <= x <= 1 and 0 <= y <= 1):
+            raise CommandError(
+                f"windows={text!r} must be X,Y, shares of the image from 0 to 1, such as 0.5,0.3"
+            )
+        found.append((x, y))
+    if len(found) != len(COLOURS):
+        raise CommandError(f"windows={' '.join(given)!r} must be {len(COLOURS)} places X,Y")
+    return found
+
+
+def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> list[tuple[int, int, int]]:
+    """Return windows (left, top, side) about these places, within the image."""
+    side = max(4, min(height, width) // WINDOW)
+
+    def start(share: float, size: int) -> int:
+        return min(max(round(share * size - side / 2), 0), size - side)
+
+    return [(start(x, width), start(y, height), side) for x, y in places]
+
+
+def draw(
+    blocks: Sequence[Block], file: Path, columns: int, places: Sequence[tuple[float, float]] | None = None
+) -> float:
     """Draw the ``blocks`` under each other, as wide as so many columns; return the height in inches.
 
-    In each, a column per image, the reference last: image, windows, errors in false colours.
+    In each, a column per image, the reference last: image, windows, errors in false colours. ``places``:
+    centres of the windows, see `centres`; None: where errors differ most.
     """
     wide = WIDTHS[columns]
     layouts = [_Layout.of(block, wide) for block in blocks]
@@ -120,7 +155,9 @@ def draw(blocks: Sequence[Block], file: Path, columns: int) -> float:
         figure = plt.figure(figsize=(wide, tall))
         top = tall
         for block, layout in zip(blocks, layouts, strict=True):
-            _block(figure, block, layout, top)
+            height, width = block.target.shape[:2]
+            chosen = windows(block.columns[0].errors, block.columns[-1].errors)
+            _block(figure, block, layout, top, _around(places, height, width) if places else chosen)
             top -= layout.whole
         save(figure, file)
     return tall
@@ -134,10 +171,11 @@ def _axis(figure: Figure, left: float, top: float, width: float, height: float) 
     return axis
 
 
-def _block(figure: Figure, block: Block, layout: _Layout, top: float) -> None:
-    """Draw a block below the height ``top``."""
+def _block(
+    figure: Figure, block: Block, layout: _Layout, top: float, chosen: Sequence[tuple[int, int, int]]
+) -> None:
+    """Draw a block below the height ``top``, with these windows."""
     wide, tall = figure.get_size_inches()
-    chosen = windows(block.columns[0].errors, block.columns[-1].errors)
     exposure = math.log2(0.9 / max(float(np.quantile(block.target.max(axis=-1), 0.95)), 1e-9))
     figure.text(GAP / wide, (top - 0.2 * LINE) / tall, block.title, va="top", weight="bold")
     images = [*(column.image for column in block.columns), block.target]

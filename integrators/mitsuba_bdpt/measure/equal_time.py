@@ -96,11 +96,12 @@ def pictured(
     file = project.scene(scene)
     output = options.output or project.renders / f"equal_time_{file.name}.png"
     check_figure(output)
+    places = crops.centres(options.windows)
     loaded, target, depth = subject(project, file, options)
     ways = dict(integrators) or {kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")}
     found = shots(loaded, target, ways, depth, options.spp)
     columns = [crops.judged(shot.name, shot.spp, shot.seconds, shot.image, target) for shot in found]
-    crops.draw([crops.Block(file.name, tuple(columns), target)], output, options.columns)
+    crops.draw([crops.Block(file.name, tuple(columns), target)], output, options.columns, places)
     return output, found
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -174,7 +176,10 @@ def _points(
     """Return an integrator's points (n, 4), abscissa and quantiles of positive errors, and their bounds."""
     points: list[list[float]] = []
     bounds: list[Bound] = []
-    for budget in sorted({row["budget"] for row in results.of(scene, method)}):
+    counts = Counter(row["budget"] for row in results.of(scene, method))
+    # Where time was too short for a second render, a single one would look as certain as the others.
+    several = [budget for budget in counts if counts[budget] > 1]
+    for budget in sorted(several or counts):
         rows = results.of(scene, method, budget)
         errors, bound = seed_errors(rows, error, results.differs(scene, method, budget))
         low, middle, high = np.quantile(errors, BAND)
@@ -231,10 +236,10 @@ def efficiencies(
             Line2D([], [], label="trimmed", **plain),
             Line2D([], [], label="raw", markerfacecolor="white", **plain),
             Line2D([], [], label="95 % interval", color="#666666", linewidth=0.8),
-            Line2D(
-                [], [], label="at least, at most", **plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
-            ),
         ]
+        if axis.texts:
+            arrows = plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
+            handles.append(Line2D([], [], label="at least, at most", **arrows))
         _legend(figure, handles)
         save(figure, path)
 
@@ -300,7 +305,7 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
     """Return the images of a scene's first seed at the deciding budget, rivals first, and the reference.
 
-    Captions say which integrators have equal samples in place of equal time.
+    Captions have median seconds, and say which integrators have equal samples in place of equal time.
     """
     columns: list[crops.Column] = []
     for method in [*results.rivals, results.methods[0]]:
@@ -310,10 +315,24 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
             continue
         (image,), _ = read_layers(file, "")
         called = f"{method} (equal spp)" if method in results.at_equal_samples else method
-        columns.append(crops.judged(called, rows[0]["spp"], rows[0]["seconds"], image, kept.image))
+        seconds = float(np.median([row["seconds"] for row in rows]))
+        columns.append(crops.judged(called, rows[0]["spp"], seconds, image, kept.image))
     if not columns:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
     return crops.Block(scene, tuple(columns), kept.image)
+
+
+def _among(results: Results, names: Sequence[str] | None) -> Results:
+    """Return the results of the first integrator and of these others; None: all that are compared."""
+    if names is None:
+        return replace(results, rows=[row for row in results.rows if row["method"] not in results.aside])
+    for name in names:
+        if name not in results.methods:
+            raise CommandError(
+                f"--integrators {name}: not in the sweep, which has {', '.join(results.methods)}"
+            )
+    kept = {results.methods[0], *names}
+    return replace(results, rows=[row for row in results.rows if row["method"] in kept], aside=())
 
 
 def run(options: Namespace) -> int:
@@ -322,7 +341,8 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     output = options.output or folder / f"{options.plot}.pdf"
     check_figure(output)
-    results, made = load(project, folder)
+    results, made = load(project, folder, options.spp)
+    results = _among(results, options.integrators)
     for scene in options.scenes or ():
         if scene not in results.scenes:
             raise CommandError(f"--scenes {scene}: not in the sweep, which has {', '.join(results.scenes)}")
@@ -336,7 +356,7 @@ def run(options: Namespace) -> int:
         )
     if options.plot == "crops":
         blocks = [cropped(folder, results, made[scene], scene) for scene in scenes]
-        tall = 2.54 * crops.draw(blocks, output, options.columns)
+        tall = 2.54 * crops.draw(blocks, output, options.columns, crops.centres(options.windows))
         if tall > PAGE:
             print(
                 f"warning: {output} is {tall:.0f} cm tall, more than a page (A4 has {PAGE:g} cm): draw fewer "

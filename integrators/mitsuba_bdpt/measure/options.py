@@ -84,9 +84,21 @@ def _width(default: int | None = RESOLUTION) -> Any:
     return option(default, WIDTH, text, metavar="PIXELS")
 
 
-def _reference_seconds() -> Any:
+def _reference_seconds(default: float = REFERENCE_SECONDS) -> Any:
     text = "seconds that making a reference may take where there is none, per scene; default: %(default)g"
-    return option(REFERENCE_SECONDS, SECONDS, text, metavar="SECONDS")
+    return option(default, SECONDS, text, metavar="SECONDS")
+
+
+def _windows() -> Any:
+    text = "centres of the two magnified windows, in shares of width and height, such as 0.3,0.6 0.8,0.2; "
+    text += "default: where the errors of the first and the last image differ most"
+    return option(None, str, text, nargs=2, metavar="X,Y")
+
+
+def _budget() -> Any:
+    text = "samples per pixel of the first integrator, one of the sweep's, at which all are compared; "
+    text += "default: the largest of which all scenes have two renders"
+    return option(None, WHOLE, text)
 
 
 def _columns(default: int) -> Any:
@@ -171,6 +183,22 @@ class Figure(Options):
     scenes: tuple[str, ...] | None = option(
         None, str, "scenes to draw; default: all", nargs="+", metavar="SCENE"
     )
+    integrators: tuple[str, ...] | None = option(
+        None,
+        str,
+        "integrators to draw beside the first one, by their names in the preset; default: all",
+        nargs="+",
+        metavar="NAME",
+    )
+    spp: int | None = _budget()
+    windows: tuple[str, ...] | None = _windows()
+
+
+@dataclass(frozen=True)
+class Report(Options):
+    """Options of reports and pages of a sweep."""
+
+    spp: int | None = _budget()
 
 
 @dataclass(frozen=True)
@@ -217,7 +245,8 @@ class EqualTime(Options):
         metavar="EXR",
     )
     resolution: int | None = _width(None)
-    reference_seconds: float = _reference_seconds()
+    reference_seconds: float = _reference_seconds(60.0)
+    windows: tuple[str, ...] | None = _windows()
     output: Path | None = option(
         None,
         Path,

@@ -180,7 +180,7 @@ def run(options: Namespace) -> int:
     output = options.output or folder / "page.html"
     check_output(output, ".html")
     check_own(output, f"<title>{TITLE}", "move it away, or name another output by -o")
-    text = page(folder, Report.of(project, folder))
+    text = page(folder, Report.of(project, folder, options.spp))
     write_text(output, text)
     print(f"{output}: {len(text) / 2**20:.1f} MiB")
     return 0

@@ -136,7 +136,7 @@ class Preset:
     ``clock``: one of `CLOCKS`, whose seconds decide. ``first_images``: processes that render the first image
     of each scene and integrator. ``scenes``: names of all scenes of the preset, also of those that are not
     rendered now; None where the command names them. ``left_out``: scenes that cannot be measured, with the
-    reason.
+    reason. ``resolution``: the width that is asked for.
     """
 
     subjects: tuple
@@ -147,6 +147,16 @@ class Preset:
     first_images: int
     scenes: tuple[str, ...] | None
     left_out: tuple[str, ...]
+    resolution: int
+
+    def resized(self) -> list[str]:
+        """Return a message about each scene that is not rendered at the width that is asked for."""
+        return [
+            f"{one.name}: rendered with {' x '.join(map(str, one.scene.size(one.resolution)))} pixels: "
+            f"resolution={self.resolution} does not divide it into {TILES} x {TILES} tiles"
+            for one in self.subjects
+            if one.resolution != self.resolution
+        ]
 
 
 DEFAULTS: dict[str, Any] = {
@@ -203,7 +213,7 @@ def preset_of(
     subjects, left_out = _subjects(path, data, scenes)
     clock, first = _timing(path, data, project)
     order = None if is_open else tuple(names)
-    return Preset(subjects, methods, more, measured, clock, first, order, left_out)
+    return Preset(subjects, methods, more, measured, clock, first, order, left_out, data["resolution"])
 
 
 def _timing(path, data, project) -> tuple[str, int]:

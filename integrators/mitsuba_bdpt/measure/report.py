@@ -72,7 +72,7 @@ def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Callable
     for rival in rivals:
         columns[f"over {rival}, trimmed"] = partial(results.efficiency, rival=rival)
         columns[f"over {rival}, raw"] = partial(results.efficiency, rival=rival, error="rel_mse")
-    if NONE in results.methods[1:]:
+    if NONE in results.aside and NONE in results.methods:
         columns[f"over {NONE}, trimmed"] = partial(results.efficiency, rival=NONE)
     if any(results.lacks(scene, rival) for scene in results.scenes for rival in rivals):
         columns["bias of rivals"] = partial(_lacking, results, rivals)
@@ -215,9 +215,10 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         "slope": partial(_slope, results, notes),
         "slope, independent points": partial(results.convergence, method=INDEPENDENT),
         "bias check": bias,
-        LIGHT_TRACER: lambda scene: _with_bias(results, scene, LIGHT_TRACER),
+        f"efficiency over {LIGHT_TRACER}": lambda scene: _with_bias(results, scene, LIGHT_TRACER),
     }
-    of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT, LIGHT_TRACER: LIGHT_TRACER}
+    of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT}
+    of[f"efficiency over {LIGHT_TRACER}"] = LIGHT_TRACER
     return by_scene(results.scenes, _rendered(results, columns, of))
 
 
@@ -228,8 +229,9 @@ def _without_verdict(results: Results, scene: str, method: str, why: Refused) ->
 def _rendered(
     results: Results, columns: dict[str, Callable[[str], object]], of: Mapping[str, str]
 ) -> dict[str, Callable[[str], object]]:
-    """Return the ``columns`` without those ``of`` integrators that were not rendered."""
-    return {name: made for name, made in columns.items() if of.get(name) in (None, *results.methods)}
+    """Return the ``columns`` without those ``of`` rivals, or of integrators that were not rendered."""
+    there = {None, *results.methods} - {*results.rivals}
+    return {name: made for name, made in columns.items() if of.get(name) in there}
 
 
 def _with_bias(results: Results, scene: str, rival: str) -> str:
@@ -680,6 +682,22 @@ def _clock(results: Results) -> str:
     return "Seconds are processor seconds, of all threads together.\n" if processor else ""
 
 
+def _equal_times(results: Results) -> str:
+    """Describe the budgets at which times are equal."""
+    found: dict[int, list[str]] = {}
+    for scene in results.scenes:
+        rows = [row for row in results.rows if row["scene"] == scene]
+        largest, at = max(row["budget"] for row in rows), [row.get("equal_time_spp") for row in rows]
+        for spp in {n for n in at if n is not None and n < largest}:
+            found.setdefault(spp, []).append(f"`{scene}`")
+    few = "; ".join(f"at {spp} spp in {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
+    few = f", for lack of time {few}" if few else ""
+    return (
+        f"Times are equal at the largest budget{few}, and nearly at others; unequal ones\nare compared as if "
+        "errors fell with 1 / time."
+    )
+
+
 def _equal_samples(results: Results) -> str:
     """Name the integrators that are not at equal time."""
     names = ", ".join(f"`{name}`" for name in results.at_equal_samples)
@@ -708,9 +726,8 @@ without the worst 0.1 % of values, {results.deciding} samples per pixel unless s
 of the reference's noise: raw, it is the variance over seeds; trimmed, the error against the reference less
 the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
 the figure is a bound, since rare light that was not met is in no variance: ≥ where the other integrator's
-error is at least the one measured, ≤ where the first integrator's is, ~ where both are. Times are equal at
-the largest budget, or the largest that a limit of time allowed, and at others nearly; seconds are those
-measured, so that unequal times are compared as if errors fell with 1 / time.
+error is at least the one measured, ≤ where the first integrator's is, ~ where both are.
+{_equal_times(results)}
 {_equal_samples(results)}Where seeds were added until an interval was narrow enough, it is slightly too
 narrow (it holds the median in 90 % of cases, not 95 %).
 {_clock(results)}"""
@@ -793,9 +810,9 @@ class Report:
     missing: str = ""
 
     @staticmethod
-    def of(project: Project, folder: Path) -> Report:
+    def of(project: Project, folder: Path, spp: int | None = None) -> Report:
         """Read a folder; raises ``CommandError`` like `results.load`, or for invalid goals and notes."""
-        results, made = load(project, folder)
+        results, made = load(project, folder, spp)
         files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
         kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
         for scene, text in kept["notes"].items():
@@ -821,7 +838,7 @@ def run(options: Namespace) -> int:
     project = Project(options.project)
     folder = project.results(options.folder)
     check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
-    found = Report.of(project, folder)
+    found = Report.of(project, folder, options.spp)
     write_text(folder / "README.md", found.text())
     found.draw(folder)
     if options.readme:

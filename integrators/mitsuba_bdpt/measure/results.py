@@ -18,7 +18,7 @@ import pyarrow.parquet
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
-from ..files.texts import read_json, write_json
+from ..files.texts import list_of, read_json, read_toml, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
 from .preset import FIRST_SEED, Cell, Cells, Preset
@@ -202,7 +202,7 @@ def lost(table: list[Row], output: Path) -> list[str]:
     file = output / "rows.parquet"
     if not table or not file.exists():
         return []
-    keys = ["scene", "method", "budget", "seed"]
+    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
     try:
         before = pyarrow.parquet.read_table(file, columns=keys).to_pylist()
     except pyarrow.ArrowInvalid:  # damaged: it is written anew
@@ -258,6 +258,7 @@ COLUMNS: dict[str, Callable[[Row], object]] = {
 
 NUMBERS = {
     "budget": "budget",
+    "equal_time_spp": "equal_time_spp",
     "seconds": "seconds",
     "cpu_seconds": "cpu_seconds",
     "seconds_compile": "seconds_compile",
@@ -353,11 +354,14 @@ def decisive(rows: list[Row]) -> list[Row]:
     return [{**row, "seconds": decided(row)} for row in rows]
 
 
-def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
+def load(
+    project: Project, folder: Path, spp: int | None = None
+) -> tuple[analysis.Results, dict[str, Reference]]:
     """Return the results in a folder, and the references of its scenes by name.
 
-    Raises ``CommandError`` if there are none, or if errors are against other references than the
-    ``project``'s.
+    ``spp``: the budget of comparisons; default: the largest that all have. The integrators that goals.toml
+    lists as ``aside`` are not compared. Raises ``CommandError`` if there are no results, or if errors are
+    against other references than the ``project``'s.
     """
     try:
         rows = decisive(pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist())
@@ -384,4 +388,10 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
     file = folder / "probes.json"
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
-    return analysis.Results(rows, means, measured), made
+    goals = folder / "goals.toml"
+    given = read_toml(goals) if goals.exists() else {}
+    aside = list_of(goals, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
+    found = analysis.Results(rows, means, measured, tuple(aside), spp)
+    if spp is not None:
+        _ = found.deciding  # raises for a budget that is not there
+    return found, made

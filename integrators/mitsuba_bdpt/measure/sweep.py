@@ -20,11 +20,10 @@ import math
 import tempfile
 import time
 from argparse import Namespace
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from functools import cache, lru_cache, partial
-from itertools import chain, groupby
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +38,7 @@ from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from . import analysis, probes
 from .estimates import seed_errors
+from .limited import Pending
 from .making import Job, check, obtained
 from .options import REFERENCE_SECONDS, VARIANT
 from .options import Sweep as Asked
@@ -124,34 +124,46 @@ class Bench:
         first = self.cells.of(cell.budget, cell.seed)[0]
         if cell.match == "spp" or cell.method == first.method:
             return self._possible(cell.sampler, cell.budget)
-        if cell.method not in self._spp:
-            self._spp[cell.method] = self._samples_in_equal_time(first, cell)
-        wanted = cell.budget * self._spp[cell.method]
+        wanted = cell.budget * self._equal(first, cell)["samples"]
         if cell.sampler == "independent":
             return max(round(wanted), 1)
         # Mitsuba's stratified samplers are a tenth slower per sample far from a power of two.
         return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
 
-    def _samples_in_equal_time(self, first: Cell, cell: Cell) -> float:
-        """Return the samples of an integrator in the seconds of one sample of the ``first``.
+    def equal_time_spp(self, cell: Cell) -> int | None:
+        """Return the budget at which the seconds of a cell's integrator equal the first one's, if they do."""
+        first = self.cells.of(cell.budget, cell.seed)[0]
+        if cell.match == "spp" or cell.method == first.method:
+            return None
+        return int(self._equal(first, cell)["spp"])
+
+    def _equal(self, first: Cell, cell: Cell) -> dict[str, float]:
+        """Return the ``samples`` of an integrator in the time of one of the ``first``, and at which ``spp``.
 
         Measured once, at the largest budget, or the largest that the limit of time allows, and kept in a
         file.
         """
-        largest = max(self.cells.subject.spp)
-        one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
-        kept = self.output / "ratios" / f"{one.key}.json"
-        if not kept.exists():
-            budget = self._calibrated(first, cell)
-            if budget < largest:
-                self.notes.append(f"{cell.scene}: equal time of {cell.method} was measured at {budget} spp")
-            for one_of_both in (first, cell):
-                self.compile_seconds(one_of_both, budget)
-            both = [partial(self.timed, c, budget) for c in (first, cell)]
-            turns = alternating(both, CALIBRATIONS, is_warm=True)
-            seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
-            write_json(kept, float(np.median([ours / theirs for ours, theirs in seconds])))
-        return read_json(kept, "delete it, to measure it anew")
+        if cell.method not in self._spp:
+            largest = max(self.cells.subject.spp)
+            one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
+            kept = self.output / "ratios" / f"{one.key}.json"
+            if not kept.exists():
+                budget = self._calibrated(first, cell)
+                if budget < largest:
+                    name = f"{cell.scene}: times of {cell.method} and {first.method}"
+                    self.notes.append(f"{name} are equal at {budget} spp, the largest that time allowed")
+                write_json(kept, {"samples": self._measured(first, cell, budget), "spp": budget})
+            self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
+        return self._spp[cell.method]
+
+    def _measured(self, first: Cell, cell: Cell, budget: int) -> float:
+        """Return the seconds of the ``first`` integrator over a cell's, at equal samples."""
+        for one in (first, cell):
+            self.compile_seconds(one, budget)
+        both = [partial(self.timed, c, budget) for c in (first, cell)]
+        turns = alternating(both, CALIBRATIONS, is_warm=True)
+        seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
+        return float(np.median([ours / theirs for ours, theirs in seconds]))
 
     def _calibrated(self, first: Cell, cell: Cell) -> int:
         """Return the budget at which equal time is measured."""
@@ -192,6 +204,7 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "started": started,
         # A target error or timeout may end a render early.
         "spp": sum(statistics.get("passes", ())) or spp,
+        "equal_time_spp": bench.equal_time_spp(cell),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_compile": compile_seconds,
@@ -329,50 +342,26 @@ class Sweep:
                 missing = []
 
     def _limited(self, seconds: float):
-        """Render seed by seed, all budgets of each, until the ``seconds`` are over.
-
-        Two seeds of the smallest budget are rendered in any case: with fewer there is no figure.
-        """
+        """Render what fits into the ``seconds``, see `Pending`, of which the scenes have equal shares."""
         end = time.monotonic() + seconds
-        wanted = list[float]()
-        short = [bool(missing) for missing in self._todo]
-        for i, (cells, missing) in enumerate(zip(self.scenes, self._todo, strict=True)):
+        lacking = [
+            (cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing
+        ]
+        pending = [Pending(*one) for one in lacking]
+        benches = [Bench(cells, self.output, seconds / len(lacking)) for cells, _ in lacking]
+        for cells in self.scenes:
             self._first_images(cells)
-            share = (end - time.monotonic()) / max(sum(short[i:]), 1)
-            late, needed = self._in_time(cells, missing, max(share, 0.0))
-            if late:
-                self.cut[cells.subject.name] = _cut_text(late, missing)
-                wanted.append(needed)
-        self.wanted = math.ceil(ROOM * len(wanted) * max(wanted, default=0.0))
-
-    def _in_time(self, cells: Cells, missing: list[Cell], seconds: float) -> tuple[list[Cell], float]:
-        """Render those of the ``missing`` cells that fit; returns the others, and the seconds they need.
-
-        Integrators of one budget and seed are rendered together or not at all.
-        """
-        bench, end = Bench(cells, self.output, seconds), time.monotonic() + seconds
-        taken, known = dict[str, float](), set[tuple[str, int]]()
-
-        def predicted(group: list[Cell]) -> float:
-            # The first render of a budget compiles, in a render that is not measured.
-            renders = [(c.method, c.budget, 1 + ((c.method, c.budget) not in known)) for c in group]
-            return sum(n * budget * taken.get(method, 0.0) for method, budget, n in renders)
-
-        def fits(group: list[Cell]) -> bool:
-            is_least = group[0].budget == min(cells.subject.spp) and group[0].seed < FIRST_SEED + 2
-            left = end - time.monotonic()
-            return is_least or (left > 0 and predicted(group) <= left)
-
-        ordered = sorted(missing, key=lambda cell: (cell.seed, cell.budget))
-        groups = [list(group) for _, group in groupby(ordered, key=lambda cell: (cell.seed, cell.budget))]
-        while group := next(filter(fits, groups), None):
-            groups.remove(group)
-            for cell in group:
-                if rendered := self._cell(bench, cell):
-                    taken[cell.method] = rendered / cell.budget
-                known.add((cell.method, cell.budget))
-        self.notes += bench.notes
-        return list(chain.from_iterable(groups)), sum(map(predicted, groups))
+        before = -1
+        # What a scene leaves goes to the others, until nothing more fits.
+        while before < (before := sum(one.done for one in pending)):
+            for i, (one, bench) in enumerate(zip(pending, benches, strict=True)):
+                sharing = sum(bool(other.late) for other in pending[i:])
+                share = (end - time.monotonic()) / max(sharing, 1)
+                one.render(partial(self._cell, bench), max(share, 0.0))
+        late = [one for one in pending if one.late]
+        self.cut = {one.cells.subject.name: one.text for one in late}
+        self.notes = [text for bench in benches for text in bench.notes]
+        self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
 
     def _first_images(self, cells: Cells):
         """Render the missing first images of a scene, at its smallest budget."""
@@ -485,13 +474,6 @@ def _description(cell: Cell) -> str:
     return f"{cell.scene}, {cell.budget} spp, seed {cell.seed}, {cell.method}"
 
 
-def _cut_text(late: list[Cell], missing: list[Cell]) -> str:
-    """Return how many of the ``missing`` renders were cut, and at which budgets."""
-    counts = Counter(cell.budget for cell in late)
-    at = ", ".join(f"{count} at {budget} spp" for budget, count in sorted(counts.items()))
-    return f"{len(late)} of {len(missing)} renders: {at}"
-
-
 def _work(cell: Cell) -> float:
     """Return what a render takes, in proportion: equal for all integrators at equal time."""
     return float(cell.budget) * cell.resolution**2
@@ -553,7 +535,7 @@ def swept(
     whole, output, text = _read(project, preset, options)
     _check_cluster(project, preset, whole, options)
     check_output(output / "rows.csv", ".csv")  # fail before rendering
-    for told in whole.left_out:
+    for told in (*whole.left_out, *whole.resized()):
         print(told, flush=True)
     sweep = Sweep(project, whole, output)
     sweep.prepare(options.reference_seconds, options.seconds)
@@ -626,7 +608,7 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
     for text in sweep.notes:
-        print(f"{text}, the largest that time allowed; delete {sweep.output / 'ratios'} to measure it anew")
+        print(f"{text}; a sweep into another folder (-o) with more --seconds measures it at more")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
