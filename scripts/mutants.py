@@ -147,11 +147,13 @@ MUTANTS = (
         ("tests/image/test_aovs.py::test_features_are_those_of_aov[plain]",),
     ),
     Mutant(
-        "lost light: one and a half hundredths are not said",
-        "planning/lost_light.py",
+        "unsampled light: one and a half hundredths are not said",
+        "planning/unsampled_light.py",
         "if all_of_it < WORTH_A_WORD:",
         "if all_of_it < 1.5 * WORTH_A_WORD:",
-        ("tests/planning/test_lost_light.py::test_a_share_of_a_hundredth_is_said_before_the_first_pass",),
+        (
+            "tests/planning/test_unsampled_light.py::test_a_share_of_a_hundredth_is_said_before_the_first_pass",
+        ),
     ),
     Mutant(
         "near-specular lobes: a nested BSDF has none",
@@ -224,25 +226,25 @@ MUTANTS = (
         ("tests/planning/test_undersampled.py::test_more_samples_find_it",),
     ),
     Mutant(
-        "lost light: lamps that rays hit lack light",
+        "unsampled light: lamps that rays hit lack light",
         "transport/photons/photon_pass.py",
         "active=walk.active & e.delta)",
         "active=walk.active)",
-        ("tests/planning/test_lost_light.py::test_only_lamps_that_no_ray_hits_lack_light",),
+        ("tests/planning/test_unsampled_light.py::test_only_lamps_that_no_ray_hits_lack_light",),
     ),
     Mutant(
-        "lost light: photons have no emitter",
+        "unsampled light: photons have no emitter",
         "transport/photons/photon_pass.py",
         "y.edges, lanes, e.index\n",
         "y.edges, lanes, mi.UInt32(0)\n",
-        ("tests/planning/test_lost_light.py::test_lamps_of_several_colours_are_lost_together",),
+        ("tests/planning/test_unsampled_light.py::test_lamps_of_several_colours_are_lost_together",),
     ),
     Mutant(
-        "lost light: said after the last pass",
+        "unsampled light: said after the last pass",
         "run/rendering.py",
-        "messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())",
+        "messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_loss())",
         "pass",
-        ("tests/planning/test_lost_light.py::test_it_is_said_before_the_samples_are_traced[pilot]",),
+        ("tests/planning/test_unsampled_light.py::test_it_is_said_before_the_samples_are_traced[pilot]",),
     ),
     Mutant(
         "sensors: views of a batch are not checked",
@@ -1601,7 +1603,7 @@ MUTANTS = (
     ),
     Mutant(
         "merging: what merging finds is called lost",
-        "planning/lost_light.py",
+        "planning/unsampled_light.py",
         "    if plan.merging:  # which",
         "    if False:  # which",
         (
@@ -1867,14 +1869,14 @@ MUTANTS = (
     ),
     Mutant(
         "joined light subpaths: guesses leave out the weight",
-        "transport/sketches.py",
+        "transport/proxy_vertices.py",
         "size = size_z * size_y * inverse / (kernel.kappa.inner + others * inverse)",
         "size = size_z * size_y * inverse",
         ("tests/images/test_joined_light_paths.py::test_guesses_are_about_right[diffuse-1.1]",),
     ),
     Mutant(
         "joined light subpaths: guesses leave out the lobe",
-        "transport/sketches.py",
+        "transport/proxy_vertices.py",
         "size + self.lobes.peak * shape,",
         "size,",
         ("tests/images/test_joined_light_paths.py::test_guesses_are_about_right[roughconductor-1.25]",),

@@ -147,7 +147,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
             self.statistics = statistics(render)
             messages.warn_of_non_finite(self.statistics, scene)
         messages.log(self.statistics)
-        self.statistics["lost_light"] = render.lost_light()
+        self.statistics["unsampled_light"] = render.unsampled_light()
         messages.warn_of_late_decisions(self.settings.decisions, len(self.statistics["passes"]))
         return _result(render.sensor.film(), develop, evaluate)
 
@@ -228,7 +228,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
-        self.statistics["lost_light"] = render.lost_light()
+        self.statistics["unsampled_light"] = render.unsampled_light()
         return _result(render.sensor.film(), develop, evaluate)
 
     def aov_names(self) -> list[str]:

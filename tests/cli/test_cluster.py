@@ -116,7 +116,7 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     pilot that the client asked; with decisions by hand there are none."""
     lost = Planner.lost_by_pilots
     monkeypatch.setattr(
-        Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.asked > 0)
+        Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.requested > 0)
     )
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
     statistics = rendered.image(tmp_path / "a.exr", "RGB")[1]

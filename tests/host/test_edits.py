@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.notices import State, _checksum
-from mitsuba_bdpt.planning import budget, lost_light, pilot
+from mitsuba_bdpt.planning import budget, pilot, unsampled_light
 
 SPP = budget.LEAST_SAMPLES // 32**2
 
@@ -55,7 +55,7 @@ def test_pilots_are_remembered(traced):
     for seed in range(4):
         images.append(np.array(integrator.render(scene, seed=seed, spp=SPP)))
         decided += integrator.statistics["decisions"]
-        assert integrator.statistics["pilots"] == {"asked": 1, "remembered": int(seed > 0)}
+        assert integrator.statistics["pilots"] == {"rendered": int(seed == 0), "cached": int(seed > 0)}
     assert len(traced) == 1 and decided == 4 * decided[:1]
     again = np.array(integrator.render(cornell(), seed=3, spp=SPP))
     assert len(traced) == 2 and traced[0] == traced[1]
@@ -200,7 +200,7 @@ def test_scenes_that_are_gone_are_forgotten():
     del other, others
     integrator.render(scene, spp=SPP)
     assert len(notices._scenes) <= before
-    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
+    assert integrator.statistics["pilots"] == {"rendered": 0, "cached": 1}
 
 
 def behind_glass(**shapes):
@@ -211,7 +211,7 @@ def behind_glass(**shapes):
 
 
 def test_parameters_are_read_once(monkeypatch):
-    """Rationale: it takes up to 8 ms; pilot and look for lost light both need them. Expected: once
+    """Rationale: it takes up to 8 ms; pilot and look for unsampled light both need them. Expected: once
     in a render, twice where ``on_pass`` was called, which may edit them; beside those of shapes alone."""
     read, original = [], State.of
 
@@ -222,7 +222,7 @@ def test_parameters_are_read_once(monkeypatch):
     monkeypatch.setattr(State, "of", of)
     integrator = bdpt()
     integrator.render(behind_glass(), spp=SPP)
-    assert integrator.statistics["pilots"]["asked"] == 1 == len(read)
+    assert integrator.statistics["pilots"]["rendered"] == 1 == len(read)
     integrator.on_pass = lambda report: None
     integrator.render(behind_glass(), spp=SPP)
     assert len(read) == 3
@@ -235,9 +235,9 @@ def test_edits_during_a_render_are_seen(monkeypatch):
 
     def look(prepared, plan, *others):
         looks.append(plan)
-        return lost_light.LostLight({})
+        return unsampled_light.UnsampledLight({})
 
-    monkeypatch.setattr(lost_light, "estimate", look)
+    monkeypatch.setattr(unsampled_light, "estimate", look)
     texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
     painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
     scene, integrator = behind_glass(painted=painted), bdpt()

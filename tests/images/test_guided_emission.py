@@ -411,9 +411,9 @@ def test_light_that_path_tracing_would_find_alone(monkeypatch):
         _, method = rendered(scene, spp=16, guiding=guiding)
         decision = method.statistics["decisions"][0]
         ways[guiding] = decision["light_paths"], decision["emission"] is not None
-        asked = method.statistics["pilots"]["asked"]
+        pilots = method.statistics["pilots"]["rendered"]
     assert ways["photons"] == (0.0, False)
-    assert ways["auto"][0] > 0 and ways["auto"][1] and asked == 2
+    assert ways["auto"][0] > 0 and ways["auto"][1] and pilots == 2
 
 
 def test_where_nothing_is_gained_nothing_changes():
@@ -454,7 +454,10 @@ def test_a_decision_is_done_again():
     decisions = method.statistics["decisions"]
     again, other = rendered(scene, decisions=json.dumps(decisions))
     np.testing.assert_allclose(again, image, **ROUNDING)
-    assert other.statistics["decisions"] == decisions and other.statistics["pilots"]["asked"] == 0
+    assert other.statistics["decisions"] == decisions and other.statistics["pilots"] == {
+        "rendered": 0,
+        "cached": 0,
+    }
 
 
 def test_tables_of_another_scene():
@@ -496,5 +499,5 @@ def test_later_pilots_refine_the_tables():
     scene = spotlit(16)
     _, method = rendered(scene, spp=256, spp_per_pass=32)
     statistics = method.statistics
-    assert statistics["pilots"]["asked"] >= 2
+    assert statistics["pilots"]["rendered"] >= 2
     assert all(d["emission"] for d in statistics["decisions"])

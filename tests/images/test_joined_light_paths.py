@@ -13,7 +13,7 @@ import variants
 import welch as st
 from mitsuba_bdpt.planning import choice, planner
 from mitsuba_bdpt.planning.configuration import Configuration
-from mitsuba_bdpt.transport import connections, sketches
+from mitsuba_bdpt.transport import connections, proxy_vertices
 from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
 
@@ -174,7 +174,7 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
     vertices, or all, where inner connections have most of the weight and many are drawn evenly.
     """
     scene = cornell(16)
-    true = sketches.guess
+    true = proxy_vertices.guess
 
     def wild(kernel, z, y):
         place = y.p.x * 977

@@ -559,7 +559,7 @@ def test_what_a_render_says():
     mi.render(scene, integrator=merged, spp=4)
     found = merged.statistics
     assert not found["unbiased"] and found["merging"]["photons"] and found["merging"]["merges"]
-    assert found["rays"]["photon"] and found["lost_light"] == {}
+    assert found["rays"]["photon"] and found["unsampled_light"] == {}
     mi.render(scene, integrator=plain, spp=4)
     assert plain.statistics["unbiased"] and "merging" not in plain.statistics
     assert "photon" not in plain.statistics["rays"]
@@ -568,13 +568,13 @@ def test_what_a_render_says():
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
 def test_no_light_is_called_lost_that_merging_finds(kind):
     """Rationale: paths of more than 64 edges, and those through the lens itself, are lost with merging too,
-    and the share of lost light was estimated by all. Expected: no share, at any depth.
+    and the share of unsampled light was estimated by all. Expected: no share, at any depth.
     """
     scene = mi.load_dict(under_glass(point(), kind=kind))
     more = {"light_paths": 0} if kind == "thinlens" else {}  # without light subpaths no t = 0
     method = mi.load_dict({"type": "bdpt", "merging": True, **more})
     mi.render(scene, integrator=method, spp=4)
-    assert method.statistics["lost_light"] == {}
+    assert method.statistics["unsampled_light"] == {}
 
 
 def test_merges_do_not_outweigh_what_is_better(monkeypatch):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import variants
 import welch as st
-from mitsuba_bdpt.planning import lost_light, sds_light
+from mitsuba_bdpt.planning import sds_light, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport import light_path, sds, walk
@@ -218,7 +218,7 @@ def test_guided_light_is_not_undersampled():
     for guiding in ("always", "never"):
         settings = internals.bdpt(max_depth=6, guiding=guiding).settings
         render = Render(described, described.sensors()[0], settings, 0, 64)
-        lost = lost_light.estimate(render.prepared, render.plan, render.settings)
+        lost = unsampled_light.estimate(render.prepared, render.plan, render.settings)
         assert bool(lost.radiance) == (guiding == "never")
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import variants
 from mitsuba_bdpt.merging import undersampled, unsampled
-from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import aim
 
@@ -63,8 +63,8 @@ def said(scene, mean=MEAN, spp=64, **parameters):
     lost = render._lost()
     if lost is None:
         return ""
-    shares = lost_light.shares(lost, mean)
-    return lost_light.in_words(render.prepared, render.plan, shares, lost, spp)
+    shares = unsampled_light.shares(lost, mean)
+    return unsampled_light.in_words(render.prepared, render.plan, shares, lost, spp)
 
 
 @pytest.mark.parametrize(
@@ -123,12 +123,12 @@ def test_the_expected_number_of_samples_is_that_of_a_render(alpha, monkeypatch):
     scene = slab(frosted(alpha), size=64)
     image = np.array(bdpt().render(scene, spp=16))[..., 0]
     lit = -np.log(np.mean(image < 0.1 * MEAN))
-    monkeypatch.setattr(lost_light, "PREVIEW", 16)
+    monkeypatch.setattr(unsampled_light, "PREVIEW", 16)
     found = []
     for bound in (1.0, lit, lit / 8):
         monkeypatch.setattr(undersampled, "FEWEST", bound)
         render = render_of(scene, 16)
-        found.append(share_of(lost_light.estimate(render.prepared, render.plan, render.settings, 16)))
+        found.append(share_of(unsampled_light.estimate(render.prepared, render.plan, render.settings, 16)))
     whole, more, less = found
     assert less < whole / 2 < more
 
@@ -158,11 +158,11 @@ def test_the_aim_of_photons_changes_nothing(monkeypatch):
     monkeypatch.setattr(unsampled, "RADIUS", 10.0)
 
     def part(subpaths):
-        monkeypatch.setattr(lost_light, "SUBPATHS", subpaths)
+        monkeypatch.setattr(unsampled_light, "SUBPATHS", subpaths)
         render, sizes = render_of(slab(frosted(0.03), lamp=far)), []
         for bound in (0.04, 1.0):
             monkeypatch.setattr(undersampled, "FEWEST", bound)
-            sizes.append(share_of(lost_light.estimate(render.prepared, render.plan, render.settings)))
+            sizes.append(share_of(unsampled_light.estimate(render.prepared, render.plan, render.settings)))
         return sizes[0] / sizes[1]
 
     aimed = part(1 << 12)
@@ -317,7 +317,7 @@ def test_no_near_specular_estimate_of_other_scenes(scene):
     have the estimate of before, and so do those in which none is narrow enough to leave light undersampled,
     or all emitters are large."""
     render = render_of(scene())
-    assert not lost_light.is_undersampling_possible(render.prepared, render.settings)
+    assert not unsampled_light.is_undersampling_possible(render.prepared, render.settings)
 
 
 def sphere(radius):
@@ -351,7 +351,7 @@ def test_lamps_behind_smooth_glass_are_not_undersampled_lamps():
         "bsdf": {"type": "roughconductor", "alpha": 0.01},
     }
     scene = slab({"type": "dielectric"}, lamp=sphere(0.01), ball=ball)
-    assert lost_light.is_undersampling_possible(render_of(scene).prepared, bdpt().settings)
+    assert unsampled_light.is_undersampling_possible(render_of(scene).prepared, bdpt().settings)
     assert share_of(lost_in(scene)) == 0
 
 

@@ -104,7 +104,7 @@ def test_an_edited_medium_is_asked_anew():
     target, integrator = ball(4.0), bdpt()
     before = np.array(integrator.render(target, seed=1, spp=SPP))
     integrator.render(target, seed=2, spp=SPP)
-    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 1}
+    assert integrator.statistics["pilots"] == {"rendered": 0, "cached": 1}
     parameters = mi.traverse(target)
     (name,) = (name for name in parameters.keys() if name.endswith("sigma_t.value.value"))
     parameters[name] = (
@@ -112,7 +112,7 @@ def test_an_edited_medium_is_asked_anew():
     )
     parameters.update()
     after = np.array(integrator.render(target, seed=1, spp=SPP))
-    assert integrator.statistics["pilots"] == {"asked": 1, "remembered": 0}
+    assert integrator.statistics["pilots"] == {"rendered": 1, "cached": 0}
     anew = np.array(bdpt().render(ball(0.5), seed=1, spp=SPP))
     np.testing.assert_allclose(after, anew, **ROUNDING)
     assert np.abs(after - before).mean() > 0.05 * before.mean()

@@ -72,9 +72,8 @@ def _image(integrator, scene, **keywords) -> np.ndarray:
 
 
 def _traced_pilots(bdpt) -> int:
-    """Pilots of its last render, but for those that were remembered."""
-    pilots = bdpt.statistics["pilots"]
-    return pilots["asked"] - pilots["remembered"]
+    """Pilots of its last render, but for those whose results were cached."""
+    return bdpt.statistics["pilots"]["rendered"]
 
 
 def _decided(integrator) -> list[dict]:

@@ -25,8 +25,8 @@ from ..transport.inputs import Kernel, Observer
 from ..transport.photons import unsampled
 from ..transport.plan import Plan
 from .findings import Findings
-from .lost_light import NAMED, called, delta_kernel, points
 from .possible import Rest, Start, UnsampledPaths, unsampled_paths
+from .unsampled_light import NAMED, called, delta_kernel, points
 
 # Points on the sensor to which each emitter is connected.
 POINTS = 1 << 10

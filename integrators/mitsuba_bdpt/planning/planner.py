@@ -62,13 +62,13 @@ NOT_FINITE = "the pilot found only invalid samples (NaN or infinite)"
 
 
 class Pilots(NamedTuple):
-    """Number of pilots that ran, and when the next one is due.
+    """Number of pilots that were requested, and when the next one is due.
 
-    ``remembered``: cached ones among them; ``repeat``: samples per pixel after which the next one is due.
+    ``cached``: those with cached results; ``repeat``: samples per pixel after which the next one is due.
     """
 
-    asked: int = 0
-    remembered: int = 0
+    requested: int = 0
+    cached: int = 0
     repeat: int = FIRST_REPEAT
 
 
@@ -92,14 +92,14 @@ class _Result:
     """Result of a pilot.
 
     ``table`` of predictions, the best first, and what the best leaves out; ``moments`` that they follow from,
-    and those of the pilot ``with_tables`` of emission, if one ran; number of pilots ``asked``.
+    and those of the pilot ``with_tables`` of emission, if one ran; number of pilots ``requested``.
     """
 
     table: tuple[choice.Prediction, ...]
     left_out: tuple[dict[str, str], ...]
     moments: Moments
     with_tables: Moments | None
-    asked: int
+    requested: int
 
 
 class Planner:
@@ -149,13 +149,13 @@ class Planner:
     def run_pilot(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
-        if self.decided.pilots.asked:
+        if self.decided.pilots.requested:
             result = self._result(samples)
         else:  # the first pilot of all renders of the scene
             key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
             result, is_known = self._findings.find("results", key, lambda: self._result(samples))
             if is_known:
-                pilots = self.decided.pilots._replace(asked=result.asked, remembered=result.asked)
+                pilots = self.decided.pilots._replace(requested=result.requested, cached=result.requested)
                 self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
                 self._with_tables = result.with_tables
         if result.table:
@@ -183,7 +183,7 @@ class Planner:
                 *UNMEASURED * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
-        return _Result(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.asked)
+        return _Result(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.requested)
 
     def _with_guided_emission(
         self, table: list[choice.Prediction], moments: Moments, samples: int
@@ -239,7 +239,7 @@ class Planner:
         def learn() -> Learnt:
             return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
-        if self.decided.pilots.asked > 1:
+        if self.decided.pilots.requested > 1:
             return learn()
         return self._findings.find("emission", (self._settings, self.pilot_seed, samples), learn)[0]
 
@@ -249,21 +249,21 @@ class Planner:
         Cached for later renders until an edit.
         """
         count, pilots = budget.lanes(samples), self.decided.pilots
-        pilots = pilots._replace(asked=pilots.asked + 1)
+        pilots = pilots._replace(requested=pilots.requested + 1)
         self.decided = replace(self.decided, pilots=pilots)
         stands_for = samples / count
         plan = replace(self.full, emission=tables)
         guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
 
         def trace() -> Moments:
-            seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.asked)
+            seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.requested)
             flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
             with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
                 return pilot.measure(self._prepared, plan, self._settings, seed, count, stands_for, guiding)
 
-        key = self._settings, self.pilot_seed, pilots.asked, count, stands_for, tables, guiding
+        key = self._settings, self.pilot_seed, pilots.requested, count, stands_for, tables, guiding
         found, is_known = self._findings.find("pilots", key, trace)
-        pilots = pilots._replace(remembered=pilots.remembered + is_known)
+        pilots = pilots._replace(cached=pilots.cached + is_known)
         self.decided = replace(self.decided, pilots=pilots)
         return found
 

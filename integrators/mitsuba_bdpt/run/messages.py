@@ -80,10 +80,10 @@ def warn_of_media(prepared, sensor):
         warn_once(prepared.scene, sensor, f"bdpt: {text}")
 
 
-def warn_of_lost_light(prepared, plan, text: str):
+def warn_of_unsampled_light(prepared, plan, text: str):
     """Warn once per scene and ``plan`` of unsampled light, unless ``text`` is empty."""
     if text:
-        warn_once(prepared.scene, prepared.camera.sensor, text, ("lost light", plan.splat, plan.direct))
+        warn_once(prepared.scene, prepared.camera.sensor, text, ("unsampled light", plan.splat, plan.direct))
 
 
 def _some(found: list[str]) -> str:

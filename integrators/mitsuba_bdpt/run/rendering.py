@@ -22,12 +22,12 @@ from ..host.notices import warn_once
 from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
-from ..planning import lost_light, missed_direct
+from ..planning import missed_direct, unsampled_light
 from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE
 from ..planning.findings import Findings
-from ..planning.lost_light import LostLight
 from ..planning.planner import Planner
+from ..planning.unsampled_light import UnsampledLight
 from ..progress import Report
 from ..properties import check_film, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
@@ -148,13 +148,13 @@ class Render:
                     break
                 self._decide_again()
                 if not number:
-                    messages.warn_of_lost_light(self.prepared, self.plan, self.predicted_loss())
+                    messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_loss())
                     missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
                     for text in filter(None, missed):
                         warn_once(self.prepared.scene, self.sensor, text)
                 self._pass(step)
                 if not number:
-                    self.lost_light()
+                    self.unsampled_light()
                 # Records the second pass while the first, a short one, runs.
                 if watched or number > 0:
                     self.meter.wait()
@@ -361,7 +361,7 @@ class Render:
         self.meter.resume(progress.work, snapshot.spp)
         self._small_first = progress.small_first
 
-    def lost_light(self) -> dict[int, float]:
+    def unsampled_light(self) -> dict[int, float]:
         """Return shares of the image's light that are not sampled, by emitter index.
 
         Warns of large shares, once per scene and plan.
@@ -369,23 +369,23 @@ class Render:
         lost = self._lost() if self.passes else None
         if lost is None:
             return {}
-        shares = lost_light.shares(lost, number(self.accumulator.mean()))
-        text = lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
-        messages.warn_of_lost_light(self.prepared, self.plan, text)
+        shares = unsampled_light.shares(lost, number(self.accumulator.mean()))
+        text = unsampled_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+        messages.warn_of_unsampled_light(self.prepared, self.plan, text)
         return shares
 
-    def _lost(self) -> LostLight | None:
+    def _lost(self) -> UnsampledLight | None:
         """Return the unsampled light transport; None if there is none.
 
         Estimated once per scene and plan, and again after edits.
         """
         prepared, plan, settings = self.prepared, self.plan, self.settings
-        if not lost_light.is_possible(prepared, plan, settings):
+        if not unsampled_light.is_possible(prepared, plan, settings):
             return None
         samples = self._samples()
-        look = partial(lost_light.estimate, prepared, plan, settings, samples)
-        key = lost_light.key(prepared, plan, settings, samples)
-        lost, _ = self.findings.find("lost light", key, look)
+        look = partial(unsampled_light.estimate, prepared, plan, settings, samples)
+        key = unsampled_light.key(prepared, plan, settings, samples)
+        lost, _ = self.findings.find("unsampled light", key, look)
         return lost if lost.colours else None
 
     def predicted_loss(self) -> str:
@@ -397,19 +397,19 @@ class Render:
         lost = None if mean is None else self._lost()
         if lost is None:
             return ""
-        shares = lost_light.predicted_shares(lost, mean)
-        return lost_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+        shares = unsampled_light.predicted_shares(lost, mean)
+        return unsampled_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
 
     def explained_loss(self) -> str:
         """Return `predicted_loss`, or what is undersampled though there is no warning."""
         if text := self.predicted_loss():
             return text
-        undersampled = lost_light.is_undersampling_possible(self.prepared, self.settings)
+        undersampled = unsampled_light.is_undersampling_possible(self.prepared, self.settings)
         lost = self._lost() if undersampled else None
         if lost is None:
             return ""
         mean = self._predicted_mean()
-        return lost_light.explained(self.prepared, self.plan, lost, self._samples(), mean)
+        return unsampled_light.explained(self.prepared, self.plan, lost, self._samples(), mean)
 
     def _predicted_mean(self) -> float | None:
         """Return the image's mean as the last decision has estimated it, None if none has."""

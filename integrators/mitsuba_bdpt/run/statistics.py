@@ -140,14 +140,14 @@ class Statistics(TypedDict):
     no_pilot: str
     """Why no pilot ran, or none decided. Empty where one did, and where ``decisions`` were given."""
     pilots: dict[str, int]
-    """How many pilots were ``asked`` for, and how many results were ``remembered`` from earlier renders."""
+    """Number of pilots that were ``rendered``, and of results that were ``cached`` by earlier renders."""
     passes: list[int]
     """Samples per pixel of each pass."""
     non_finite: int
     """Contributions that were NaN or infinite and count as zero."""
     non_finite_in_pilot: int
     """The same in the pilots."""
-    lost_light: NotRequired[dict[int, float]]
+    unsampled_light: NotRequired[dict[int, float]]
     """Estimated share of the image's light that no strategy samples, by index of the emitter."""
     error: NotRequired[float | None]
     """Estimated relMSE, with ``variance``."""
@@ -172,9 +172,10 @@ def rays(render) -> dict[str, int]:
 
 
 def statistics(render) -> Statistics:
-    """Return the statistics of a `Render` so far, without ``lost_light``."""
+    """Return the statistics of a `Render` so far, without ``unsampled_light``."""
     work, planner, accumulator = render.meter.work, render.planner, render.accumulator
     decided, counts = planner.decided, work.counts
+    pilots = decided.pilots
     connections = {name: counts[name] for name in ("evaluated", "zero", "rouletted")}
     connections["traced"] = counts["shadow_inner"]
     found: Statistics = {
@@ -190,7 +191,7 @@ def statistics(render) -> Statistics:
         "skipped": [dict(left_out) for left_out in render.plan.skipped],
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,
-        "pilots": {"asked": decided.pilots.asked, "remembered": decided.pilots.remembered},
+        "pilots": {"rendered": pilots.requested - pilots.cached, "cached": pilots.cached},
         "passes": list(accumulator.passes),
         "non_finite": counts["non_finite"],
         "non_finite_in_pilot": planner.lost_by_pilots(),

@@ -25,8 +25,8 @@ from .contribution import (
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .path_layers import INDIRECT
+from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
-from .sketches import Sketch, guess
 from .visibility import ShadowRay, guessed, seen
 from .walk import Vertex, hard_merges, is_lit, newest_coefficient, where_lit
 
@@ -104,7 +104,7 @@ def connect_one(
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
-    if path.sketches is None:
+    if path.proxies is None:
         drawn = _draw(kernel, z, path, candidates, u)
     else:
         drawn = _draw_by_guess(kernel, z, path, candidates, u, stream)
@@ -217,12 +217,12 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
 def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, stream: Stream) -> _Drawn:
     """Like `_draw`, from several light subpaths, by approximate size.
 
-    Sizes: `sketches.guess`. Evaluates only the BSDFs of the drawn connection. Draws uniformly with
+    Sizes: `proxy_vertices.guess`. Evaluates only the BSDFs of the drawn connection. Draws uniformly with
     probability `EVENLY`, and where all approximations are 0. ``total`` is the size of the estimate.
     """
     some = candidates > 0
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-    at_z = Sketch.of(kernel, z, newest, some, alone=False)
+    at_z = ProxyVertex.of(kernel, z, newest, some, alone=False)
     count = mi.Float(candidates)
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_GUESSES))
     u_evenly, word = sequential(word)
@@ -234,7 +234,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     while dr.hint(
         slot < candidates, label="guess inner connections", exclude=[kernel, z, path, candidates, at_z, even]
     ):
-        y = path.sketches.read(path.si[slot].p, slot)
+        y = path.proxies.read(path.si[slot].p, slot)
         reached = z.edges + path.s[slot] <= kernel.last_inner
         size = dr.select(reached, guess(kernel, at_z, y), 0)
         total, take, u = offer(total, size, u)
@@ -277,6 +277,6 @@ def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     are no edges), or slots of several light subpaths, several vertices may have the same number.
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
-    if kernel.space is not None or path.sketches is not None:
+    if kernel.space is not None or path.proxies is not None:
         return dr.select(possible, path.count, 0)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

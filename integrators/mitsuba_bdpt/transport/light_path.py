@@ -11,8 +11,8 @@ import mitsuba as mi
 from ..geometry import polarization, rays
 from . import mis
 from .inputs import KEPT, Kernel
+from .proxy_vertices import ProxyVertex, ProxyVertices
 from .sds import State
-from .sketches import Sketch, Sketches
 from .walk import Vertex, newest_coefficient, volume_cosine
 
 
@@ -124,7 +124,7 @@ class LightPath:
     light_groups: dr.Local[mi.UInt32] | None = None
     layers: dr.Local[mi.UInt32] | None = None
     thinning: Any = None  # a `Thinning`, in scenes with media
-    sketches: Any = None  # `Sketches`, for draws by approximation
+    proxies: Any = None  # `ProxyVertices`, for draws by approximation
     flags: dr.Local[mi.UInt32] | None = None
 
 
@@ -146,7 +146,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
         light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
         layers=dr.alloc_local(mi.UInt32, size) if layered else None,
-        sketches=Sketches.allocate(kernel, size) if several else None,
+        proxies=ProxyVertices.allocate(kernel, size) if several else None,
         flags=dr.alloc_local(mi.UInt32, size) if kernel.guides_near_specular else None,
     )
 
@@ -188,9 +188,9 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         path.light_groups.write(path.light_group, slot, keep)
     if path.layers is not None:
         path.layers.write(y.layer, slot, keep)
-    if path.sketches is not None:
+    if path.proxies is not None:
         newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
-        path.sketches.write(Sketch.of(kernel, vertex, newest, keep, alone=True), slot, keep)
+        path.proxies.write(ProxyVertex.of(kernel, vertex, newest, keep, alone=True), slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 

@@ -63,7 +63,7 @@ _PLUGINS = {
 
 
 @dataclass(frozen=True)
-class LostLight:
+class UnsampledLight:
     """Unsampled and undersampled light: mean over the film by emitter index.
 
     ``through``: names of the shapes through which most of it is seen, the brightest first. In scenes with
@@ -130,7 +130,9 @@ def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -
     return *known, *strategies, plan.emission is None, plan.guided > 0, max(samples, PREVIEW)
 
 
-def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW) -> LostLight:
+def estimate(
+    prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW
+) -> UnsampledLight:
     """Estimate the light that a render of ``samples`` per pixel lacks.
 
     Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
@@ -160,12 +162,14 @@ def estimate(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
     shapes = _brightest(np.array(found.through), np.array(found.size))
     through = _names(shapes)
     if found.kinds is None or not colours:
-        return LostLight(colours, through)
+        return UnsampledLight(colours, through)
     never, rare, few = np.array(found.kinds)
     size = max(never + rare, np.finfo(np.float32).tiny)
     meant = {id(bsdf) for bsdf in prepared.near_specular}
     seen, others = ([s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene)))
-    return LostLight(colours, through, float(never / size), float(few / size), _names(seen or others)[:NAMED])
+    return UnsampledLight(
+        colours, through, float(never / size), float(few / size), _names(seen or others)[:NAMED]
+    )
 
 
 def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
@@ -227,7 +231,7 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
-def shares(lost: LostLight, mean: float) -> dict[int, float]:
+def shares(lost: UnsampledLight, mean: float) -> dict[int, float]:
     """Shares of the image's light by emitter index.
 
     ``mean`` of the image's brightest colour, which includes light that is not absent.
@@ -237,7 +241,7 @@ def shares(lost: LostLight, mean: float) -> dict[int, float]:
     return {i: radiance / whole for i, radiance in lost.radiance.items()}
 
 
-def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
+def predicted_shares(lost: UnsampledLight, mean: float) -> dict[int, float]:
     """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light."""
     share = lost.intensity / (mean + (1 + lost.few) * lost.intensity)
     whole = sum(lost.radiance.values())
@@ -245,7 +249,7 @@ def predicted_shares(lost: LostLight, mean: float) -> dict[int, float]:
 
 
 def in_words(
-    prepared: PreparedScene, plan: Plan, shares: dict[int, float], lost: LostLight, samples: int
+    prepared: PreparedScene, plan: Plan, shares: dict[int, float], lost: UnsampledLight, samples: int
 ) -> str:
     """Warning about unsampled light with its remedy; empty where it is not worth a word.
 
@@ -258,7 +262,9 @@ def in_words(
     return _in_words(prepared, plan, shares, lost, samples, f"{share} of the image's light")
 
 
-def explained(prepared: PreparedScene, plan: Plan, lost: LostLight, samples: int, mean: float | None) -> str:
+def explained(
+    prepared: PreparedScene, plan: Plan, lost: UnsampledLight, samples: int, mean: float | None
+) -> str:
     """`in_words` of undersampled light of any share; its radiance if the image's ``mean`` is not known."""
     if not lost.is_undersampled:
         return ""
@@ -271,7 +277,12 @@ def explained(prepared: PreparedScene, plan: Plan, lost: LostLight, samples: int
 
 
 def _in_words(
-    prepared: PreparedScene, plan: Plan, parts: dict[int, float], lost: LostLight, samples: int, share: str
+    prepared: PreparedScene,
+    plan: Plan,
+    parts: dict[int, float],
+    lost: UnsampledLight,
+    samples: int,
+    share: str,
 ) -> str:
     """`in_words` of this ``share``; ``parts`` of it by emitter index."""
     emitters = prepared.scene.emitters()
@@ -296,7 +307,7 @@ def _in_words(
     return f"bdpt: not sampled, {share}: {what} ({why}); {remedy}"
 
 
-def _undersampled(what: str, lost: LostLight, samples: int, remedy: str) -> str:
+def _undersampled(what: str, lost: UnsampledLight, samples: int, remedy: str) -> str:
     """The rest of the warning about light of which a few samples are expected."""
     objects = " and ".join(lost.sharp)
     off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-from mitsuba_bdpt.planning import lost_light
+from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
 
@@ -99,12 +99,14 @@ def mean(scene, integrator, spp, seed=0):
 
 def estimate(scene, monkeypatch):
     """What is lost, by four times 2^17 subpaths from either end, where a render takes 2^13."""
-    monkeypatch.setattr(lost_light, "SUBPATHS", 1 << 17)
+    monkeypatch.setattr(unsampled_light, "SUBPATHS", 1 << 17)
     render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
     total = 0
     for seed in range(4):
-        monkeypatch.setattr(lost_light, "SEED", seed)
-        total += sum(lost_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
+        monkeypatch.setattr(unsampled_light, "SEED", seed)
+        total += sum(
+            unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance.values()
+        )
     return total / 4
 
 
@@ -131,7 +133,7 @@ def test_a_sensor_of_one_ray_finds_photons():
     eye = {"type": "radiancemeter", "film": film(1), "to_world": T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0])}
     scene = scene_of(LAMPS["spot"], eye, sheet=sheet({"type": "null"}))
     render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-    found = lost_light.estimate(render.prepared, render.plan, render.settings).radiance
+    found = unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance
     expected = mean(scene_of(LAMPS["spot"], eye), mi.load_dict({"type": "path", "max_depth": 2}), 64)
     assert sum(found.values()) == pytest.approx(expected, rel=0.5)
 
@@ -201,9 +203,9 @@ def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
             integrator.render(scene, spp=4, seed=seed)
     assert len(warnings) == len(said), warnings
     for text, pattern in zip(warnings, said, strict=True):
-        share = sum(integrator.statistics["lost_light"].values())
+        share = sum(integrator.statistics["unsampled_light"].values())
         assert re.search(pattern, text) and text.startswith("not sampled, "), text
-        assert lost_light.WORTH_A_WORD < share <= 1
+        assert unsampled_light.WORTH_A_WORD < share <= 1
 
 
 def said_before(integrator, scene, spp, monkeypatch):
@@ -240,7 +242,7 @@ def test_it_is_said_before_the_samples_are_traced(parameters, spp, long, passes,
     begun, warnings = said_before(integrator, scene, spp, monkeypatch)
     assert begun == passes and len(warnings) == 1
     share = float(re.search("about ([0-9]+) %", warnings[0])[1]) / 100
-    assert share == pytest.approx(sum(integrator.statistics["lost_light"].values()), rel=0.2)
+    assert share == pytest.approx(sum(integrator.statistics["unsampled_light"].values()), rel=0.2)
 
 
 def test_explain_knows_the_share():
@@ -274,12 +276,12 @@ def test_a_share_of_a_hundredth_is_said_before_the_first_pass():
     """
     scene = scene_of(LAMPS["point"], block=BLOCK)
     render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-    lost = lost_light.LostLight({0: np.array([0.02, 0.02, 0.02])})
+    lost = unsampled_light.UnsampledLight({0: np.array([0.02, 0.02, 0.02])})
     for share, said in ((0.011, True), (0.009, False)):
         mean = 0.02 / share - 0.02
-        for shares in (lost_light.predicted_shares(lost, mean), lost_light.shares(lost, mean)):
+        for shares in (unsampled_light.predicted_shares(lost, mean), unsampled_light.shares(lost, mean)):
             assert shares == {0: pytest.approx(share)}
-            assert bool(lost_light.in_words(render.prepared, render.plan, shares, lost, 16)) == said
+            assert bool(unsampled_light.in_words(render.prepared, render.plan, shares, lost, 16)) == said
 
 
 def test_red_light_on_a_blue_floor_is_no_loss():
@@ -290,8 +292,8 @@ def test_red_light_on_a_blue_floor_is_no_loss():
         lamp = {"type": "point", "position": [0.5, 3, 0], "intensity": {"type": "rgb", "value": red}}
         scene = scene_of(lamp, block=BLOCK, floor=floor() | {"bsdf": blue})
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found = sum(lost_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
-        assert found > lost_light.WORTH_A_WORD if lost else found == 0
+        found = sum(unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
+        assert found > unsampled_light.WORTH_A_WORD if lost else found == 0
 
 
 def test_a_mask_reflects_what_its_opacity_says(monkeypatch):
@@ -330,7 +332,7 @@ def test_what_is_not_finite_is_said(lamp, called):
             integrator.render(scene, spp=4, seed=seed)
     said = [text for text in warnings if "is unknown, since" in text]
     assert len(said) == 1 and f"how much light of {called} is not sampled is unknown" in said[0], warnings
-    assert integrator.statistics["lost_light"] == {}
+    assert integrator.statistics["unsampled_light"] == {}
 
 
 def test_what_is_not_finite_out_of_view_is_not_said():
@@ -349,14 +351,14 @@ def test_a_lens_finds_it():
     scene, integrator = scene_of(LAMPS["point"], eye, block=BLOCK), bdpt()
     with Warned() as warnings:
         integrator.render(scene, spp=4)
-    assert not warnings and integrator.statistics["lost_light"] == {}
+    assert not warnings and integrator.statistics["unsampled_light"] == {}
 
 
 def test_another_share_is_not_said_anew(monkeypatch):
     """Rationale: the share in the text is of the image's mean, which has noise. Expected: one warning for two
     renders of a scene that find different shares."""
     numbers = itertools.count(30)
-    monkeypatch.setattr(lost_light, "in_words", lambda *_: f"bdpt: about {next(numbers)} %")
+    monkeypatch.setattr(unsampled_light, "in_words", lambda *_: f"bdpt: about {next(numbers)} %")
     scene = scene_of(LAMPS["point"], block=BLOCK)
     with Warned() as warnings:
         for seed in range(2):
@@ -380,7 +382,7 @@ def test_an_edited_lamp_is_looked_at_anew():
     shares = []
     for _ in range(2):
         integrator.render(scene, spp=16)
-        shares.append(sum(integrator.statistics["lost_light"].values()))
+        shares.append(sum(integrator.statistics["unsampled_light"].values()))
         params[key] = params[key] * 100
         params.update()
     assert shares[0] > 0.1 and shares[1] == pytest.approx(shares[0], rel=0.1)
@@ -390,8 +392,8 @@ def test_it_is_looked_for_once(monkeypatch):
     """Rationale: the look takes some ten milliseconds, and its kernels are compiled. Expected: one for three
     renders of a scene where such paths are possible, none where they are not."""
     looked = []
-    original = lost_light.estimate
-    monkeypatch.setattr(lost_light, "estimate", lambda *a: looked.append(a) or original(*a))
+    original = unsampled_light.estimate
+    monkeypatch.setattr(unsampled_light, "estimate", lambda *a: looked.append(a) or original(*a))
     for lamp, count in ((LAMPS["point"], 1), (lamp_with_area([0.5, 3, 0], 0.1), 0)):
         scene = scene_of(lamp, block=BLOCK)
         for seed in range(3):
@@ -416,14 +418,14 @@ def test_what_the_committed_scenes_lack(name, share, said, monkeypatch):
     Expected: a word about those that lack more than a hundredth of the light, and none about the others.
     The share is that of 2^18 subpaths, which three seeds agree about to a tenth; 2^13 are off by a third, the
     2^15 of this test by a sixth."""
-    monkeypatch.setattr(lost_light, "SUBPATHS", 1 << 15)
+    monkeypatch.setattr(unsampled_light, "SUBPATHS", 1 << 15)
     scene = mi.load_file(str(SCENES / f"{name}.xml"), resolution=24, integrator="bdpt")
     integrator = scene.integrator()
     with Warned() as warnings:
         integrator.render(scene, spp=16)
     found = [text.partition(": ")[2].partition(" on what")[0] for text in warnings]
     assert found == [f"{text} or mirrors" for text in said]
-    assert sum(integrator.statistics["lost_light"].values()) == pytest.approx(share, rel=0.4)
+    assert sum(integrator.statistics["unsampled_light"].values()) == pytest.approx(share, rel=0.4)
 
 
 def test_other_committed_scenes_are_not_looked_at():
@@ -432,7 +434,7 @@ def test_other_committed_scenes_are_not_looked_at():
     for path in sorted(SCENES.glob("*.xml")):
         scene = mi.load_file(str(path), resolution=8, integrator="bdpt")
         render = Render(scene, scene.sensors()[0], scene.integrator().settings, 0, 16)
-        if lost_light.is_possible(render.prepared, render.plan, render.settings):
+        if unsampled_light.is_possible(render.prepared, render.plan, render.settings):
             lacking.add(path.stem)
     assert lacking == {
         *("lamp_behind_glass", "projector_through_glass", "smallvcm_cornell_point", "smallvcm_cornell_sun"),
@@ -460,7 +462,7 @@ def test_only_lamps_that_no_ray_hits_lack_light():
     for others in ({}, {"second": lamp}):
         scene = scene_of(LAMPS["point"], block=BLOCK, **others)
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        found.append(lost_light.estimate(render.prepared, render.plan, render.settings).radiance)
+        found.append(unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance)
     alone, beside = found
     assert len(alone) == len(beside) == 1
     assert sum(beside.values()) == pytest.approx(sum(alone.values()), rel=0.15)
@@ -490,7 +492,7 @@ def test_in_fog_the_direct_light_is_lost(monkeypatch):
         found = mean(scene, integrator, 4)
     assert len(warnings) == 1 and "spot 'lamp' shines through glass" in warnings[0], warnings
     assert "merging" not in warnings[0] and "small area" in warnings[0]
-    share = sum(integrator.statistics["lost_light"].values())
+    share = sum(integrator.statistics["unsampled_light"].values())
     assert share == pytest.approx(expected / (expected + found), rel=0.15)
 
 
@@ -502,7 +504,7 @@ def test_nothing_is_estimated_where_sensor_and_boundaries_contradict_each_other(
     with Warned() as warnings:
         integrator.render(scene, spp=1)
     assert len(warnings) == 1 and "declares no medium" in warnings[0], warnings
-    assert integrator.statistics["lost_light"] == {}
+    assert integrator.statistics["unsampled_light"] == {}
 
 
 def test_lamps_of_several_colours_are_lost_together():
@@ -518,7 +520,7 @@ def test_lamps_of_several_colours_are_lost_together():
     shares = []
     for scene in (one, three):
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
-        shares.append(lost_light.estimate(render.prepared, render.plan, render.settings).radiance)
+        shares.append(unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance)
     white, coloured = shares
     assert len(coloured) == 3
     assert sum(coloured.values()) == pytest.approx(sum(white.values()), rel=0.2)
@@ -533,14 +535,14 @@ def test_edits_of_what_is_around_a_lamp_are_seen():
     ball = {"type": "sphere", "center": [5, 3, 0], "radius": 0.5, "bsdf": {"type": "dielectric"}}
     scene, integrator = scene_of(LAMPS["point"], ball=ball, floor=floor()), bdpt()
     integrator.render(scene, spp=16)
-    assert sum(integrator.statistics["lost_light"].values()) == 0
+    assert sum(integrator.statistics["unsampled_light"].values()) == 0
     parameters = mi.traverse(scene)
     parameters["ball.to_world"] = mi.Transform4f().translate([0.5, 1, 0]).scale(0.5)
     parameters.update()
     shares = []
     for made in (scene, scene_of(LAMPS["point"], ball=ball | {"center": [0.5, 1, 0]}, floor=floor())):
         integrator.render(made, spp=16)
-        shares.append(sum(integrator.statistics["lost_light"].values()))
+        shares.append(sum(integrator.statistics["unsampled_light"].values()))
     assert shares[0] == pytest.approx(shares[1], rel=0.1) and shares[1] > 0.001
 
 
@@ -557,7 +559,7 @@ def test_each_render_of_a_scene_has_its_own_hidden_emitters():
         lost = render._lost()
         found.append(sum(lost.radiance.values()) if lost else 0.0)
     render = Render(alone, alone.sensors()[0], bdpt().settings, 0, 16)
-    expected = lost_light.estimate(render.prepared, render.plan, render.settings).radiance
+    expected = unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance
     assert found[0] == 0 and found[1] == pytest.approx(sum(expected.values()), rel=0.15)
 
 
@@ -569,4 +571,4 @@ def test_nothing_is_looked_for_where_no_light_subpath_starts():
     scene = scene_of(parts.EMITTERS["own lamp"](), glass=glass)
     integrator = bdpt()
     integrator.render(scene, spp=4)
-    assert integrator.statistics["lost_light"] == {}
+    assert integrator.statistics["unsampled_light"] == {}

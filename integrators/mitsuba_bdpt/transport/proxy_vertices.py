@@ -55,7 +55,7 @@ class Lobes:
 
 
 @dataclass
-class Sketch:
+class ProxyVertex:
     """Proxy of a vertex.
 
     ``p``: position; ``n``: geometric normal on the incident side; ``both``: scatters to both sides; ``wi``:
@@ -74,7 +74,7 @@ class Sketch:
     peak_others: mi.Float
 
     @staticmethod
-    def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> Sketch:
+    def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> ProxyVertex:
         """The proxy of ``vertex``; ``coefficient`` of its newest alternative's class.
 
         ``alone``: the brightness matters, as it is not common to all compared connections.
@@ -84,7 +84,7 @@ class Sketch:
         glossy = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Glossy)
         lobes = _lobes(kernel, vertex, glossy, active, alone)
         density = partial.d_vc * vertex.cos
-        return Sketch(
+        return ProxyVertex(
             p=mi.Point3f(si.p),
             n=dr.mulsign(n, dr.dot(n, wi)),
             both=mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Transmission),
@@ -124,7 +124,7 @@ class Sketch:
         )
 
 
-def guess(kernel, z: Sketch, y: Sketch) -> mi.Float:
+def guess(kernel, z: ProxyVertex, y: ProxyVertex) -> mi.Float:
     """Approximate size of the connection of ``z`` and ``y``, up to a factor of ``z``."""
     between = y.p - z.p
     dist2 = dr.squared_norm(between)
@@ -177,7 +177,7 @@ def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
 
 
 @dataclass
-class Sketches:
+class ProxyVertices:
     """Proxies of a lane's light vertices in local memory, without positions.
 
     No field is a Bool (LLVM code generation aborts). ``normal`` with the diffuse brightness, negative if it
@@ -192,15 +192,15 @@ class Sketches:
     shading: Any = None
 
     @staticmethod
-    def allocate(kernel, size: int) -> Sketches:
+    def allocate(kernel, size: int) -> ProxyVertices:
         """Local memory for ``size`` proxies."""
-        made = Sketches(dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Float, size))
+        made = ProxyVertices(dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Float, size))
         if kernel.traits.glossy:
             made.lobe, made.wi = dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Vector4f, size)
             made.shading = dr.alloc_local(mi.Vector3f, size)
         return made
 
-    def write(self, y: Sketch, slot: mi.UInt32, keep: mi.Bool):
+    def write(self, y: ProxyVertex, slot: mi.UInt32, keep: mi.Bool):
         """Store a proxy in ``slot`` where ``keep``."""
         size, n = dr.maximum(y.lobes.diffuse, _LEAST_SIZE), y.n  # its sign is a flag
         self.normal.write(mi.Vector4f(n.x, n.y, n.z, dr.select(y.both, -size, size)), slot, keep)
@@ -213,7 +213,7 @@ class Sketches:
             self.shading.write(y.shading, slot, keep)
         self.others.write(others, slot, keep)
 
-    def read(self, p: mi.Point3f, slot: mi.UInt32) -> Sketch:
+    def read(self, p: mi.Point3f, slot: mi.UInt32) -> ProxyVertex:
         """The proxy in ``slot`` of a vertex at ``p``."""
         normal, others = self.normal[slot], self.others[slot]
         lobes, wi, shading, peak_others = Lobes.plain(), mi.Vector3f(0), mi.Vector3f(0), mi.Float(0)
@@ -222,7 +222,7 @@ class Sketches:
             lobe, wi, shading = self.lobe[slot], self.wi[slot], self.shading[slot]
             lobes = Lobes(lobes.diffuse, wi.w, lobe.x, lobe.y, lobe.z)
             wi, peak_others = mi.Vector3f(wi.x, wi.y, wi.z), lobe.w
-        return Sketch(
+        return ProxyVertex(
             p=p,
             n=mi.Vector3f(normal.x, normal.y, normal.z),
             both=normal.w < 0,
