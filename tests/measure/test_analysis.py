@@ -470,7 +470,7 @@ def test_a_report_says_where_times_are_equal(results):
     assert "Times are equal at the largest budget, and nearly" in report._introduction(results)
     rows = [r | {"equal_time_spp": 16 if r["scene"] == "dark" else 64} for r in results.rows]
     said = report._introduction(replace(results, rows=rows))
-    assert "Times are equal at the largest budget, for lack of time at 16 spp in `dark`, and nearly" in said
+    assert "Times are equal at the largest budget (for lack of time at 16 spp: `dark`), and nearly" in said
 
 
 def test_a_sweep_that_was_cut_has_figures():

@@ -690,8 +690,8 @@ def _equal_times(results: Results) -> str:
         largest, at = max(row["budget"] for row in rows), [row.get("equal_time_spp") for row in rows]
         for spp in {n for n in at if n is not None and n < largest}:
             found.setdefault(spp, []).append(f"`{scene}`")
-    few = "; ".join(f"at {spp} spp in {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
-    few = f", for lack of time {few}" if few else ""
+    few = "; ".join(f"at {spp} spp: {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
+    few = f" (for lack of time {few})" if few else ""
     return (
         f"Times are equal at the largest budget{few}, and nearly at others; unequal ones\nare compared as if "
         "errors fell with 1 / time."
