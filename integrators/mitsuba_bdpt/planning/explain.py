@@ -82,7 +82,9 @@ def explain(
     ]
     lines += [f"used: {name}" for name in used]
     if p.merging:
-        merged = "SDS and hard paths" if prepared.near_specular else "SDS paths"
+        merged = (
+            "SDS paths and of paths that connections rarely sample" if prepared.near_specular else "SDS paths"
+        )
         lines.append(
             f"used: vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)"
         )
