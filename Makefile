@@ -48,14 +48,21 @@ gallery: $(INSTALLED)
 			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
 
+# The caustic below the glass ball, and what is seen in it.
+CAUSTICS := 0.28,0.86 0.3,0.7
+
 # The pictures of docs/reports/pictures.md.
 pictures: $(INSTALLED)
 	mkdir -p docs/images
 	$(VENV)/bin/mitsuba-bdpt equal-time veach_bidir --spp 25 -o docs/images/veach_bidir_equal_time.png
-	$(VENV)/bin/mitsuba-bdpt equal-time glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png
+	$(VENV)/bin/mitsuba-bdpt equal-time glass_caustics --spp 64 -o docs/images/glass_caustics_equal_time.png \
+		--windows $(CAUSTICS)
 	$(VENV)/bin/python scripts/polarization.py
-	for scene in glass_caustics pool_floor lamp_in_glass_seen \
-			rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
+	for scene in glass_caustics rough_glass_caustics frosted_glass_caustics; do \
+		$(VENV)/bin/mitsuba-bdpt equal-time $$scene --spp 64 -o docs/images/$${scene}_merging.png \
+			-i bdpt path "bdpt merging=true" --windows $(CAUSTICS) || exit 1; \
+	done
+	for scene in pool_floor lamp_in_glass_seen pane frosted_bulb polished_metal; do \
 		$(VENV)/bin/mitsuba-bdpt equal-time $$scene --spp 64 -o docs/images/$${scene}_merging.png \
 			-i bdpt path "bdpt merging=true" || exit 1; \
 	done
