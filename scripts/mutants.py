@@ -119,6 +119,27 @@ MUTANTS = (
         ("tests/cli/test_mix.py::test_the_command_scales_the_layers[False]",),
     ),
     Mutant(
+        "light groups: a made name wins over an id",
+        "emitters/light_groups.py",
+        "own = [i for i, ids in enumerate(real) if pattern in ids]",
+        "own = [i for i, ids in enumerate(known) if pattern in map(layer_name, ids)]",
+        ("tests/images/test_light_groups.py::test_an_id_wins_over_a_made_name",),
+    ),
+    Mutant(
+        "light groups: names of layers go to ids that become them",
+        "emitters/light_groups.py",
+        "if ids[i] and layer_name(ids[i][0]) == ids[i][0] != REST:",
+        "if ids[i] and layer_name(ids[i][0]) != REST:",
+        ("tests/images/test_light_groups.py::test_an_id_wins_over_a_made_name",),
+    ),
+    Mutant(
+        "light groups: an id in a mix is the first lamp like it",
+        "files/mixing.py",
+        "    if candidates:\n",
+        "    if False:\n",
+        ("tests/cli/test_mix.py::test_an_id_does_not_switch_another_lamp",),
+    ),
+    Mutant(
         "light groups: splats have none",
         "image/accumulator.py",
         "[layer * self._down for layer in self.indices(c.layers)]",

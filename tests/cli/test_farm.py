@@ -250,7 +250,7 @@ def test_frames_go_on_where_they_were(capsys, monkeypatch):
     assert main(arguments) == 0
     said = capsys.readouterr()
     assert said.out.startswith("shot.0000.exr: rendered before by the same command\nshot.0001.exr: ")
-    assert said.err.count("resume: goes on from 2 of 8") == 1
+    assert said.err.count("resume: the checkpoint has 2 of 8") == 1
     assert Path("shot.0000.exr").stat().st_mtime_ns == first
     assert json.loads(Path("shot.0001.json").read_text())["spp"] == 8
     for others in (["--seed", "1"], ["-D", "none=1"], ["--resume", "never"]):

@@ -89,6 +89,57 @@ def test_names_may_be_patterns_and_ids(tmp_path):
     assert (np.array(mix(tmp_path / "a.exr", {"c*": 2, "*direct": 0})) == 17).all()
 
 
+def test_an_id_does_not_switch_another_lamp(tmp_path):
+    """Rationale: of the ids A.1 and A_1, ``auto`` names the layers A_1_2 and A_1. Expected: the name of a
+    layer is that layer; an id that may be one of several is an error with their names."""
+    names = ("A_1", "A_1_2", "B_1", "B_1_001", "C_1", "rest")
+    layers = rendered(tmp_path / "a.exr", groups=names)
+    only = sum((np.float64(layers[name]) for name in names if name != "A_1"), np.zeros((3, 4, 3)))
+    np.testing.assert_allclose(np.array(mix(tmp_path / "a.exr", {"A_1": 0})), only, rtol=1e-6)
+    for name, words in (("A.1", "A_1 or A_1_2;"), ("groups.A 1", "A_1 or A_1_2;"), ("C.1", "C_1 or rest;")):
+        with pytest.raises(
+            CommandError, match=f"{name!r} may be the id of the light of {words} write the name"
+        ):
+            mix(tmp_path / "a.exr", {name: 0})
+    np.testing.assert_allclose(
+        np.array(mix(tmp_path / "a.exr", {"B.1": 0})),
+        sum((np.float64(layers[name]) for name in names if name != "B_1"), np.zeros((3, 4, 3))),
+        rtol=1e-6,
+    )
+
+
+def test_ids_may_have_equals_signs(tmp_path):
+    """Expected: the weight follows the last =."""
+    layers = rendered(tmp_path / "a.exr", groups=("Lamp_1", "sky"))
+    assert main(["mix", str(tmp_path / "a.exr"), "Lamp=1=0", "-o", str(tmp_path / "b.exr")]) == 0
+    assert np.array_equal(np.array(mi.Bitmap(str(tmp_path / "b.exr"))), layers["sky"])
+
+
+def test_a_pattern_may_match_no_layer(tmp_path, capsys):
+    """Rationale: one command mixes all shots. Expected: a warning, and the mix of the other weights, whose
+    kind counts; errors if no name has a layer, for a name in full, and for an invalid weight."""
+    layers = rendered(tmp_path / "a.exr", groups=("key", "rest"), paths=PATHS)
+    output = ["-o", str(tmp_path / "b.exr")]
+    assert main(["mix", str(tmp_path / "a.exr"), "torch*=2", "key=0", *output]) == 0
+    error = capsys.readouterr().err
+    assert error.startswith("warning: bdpt: ") and error.count("\n") == 1
+    assert (
+        "'torch*' changes nothing: " in error and "no layer 'torch*'; Light groups: key, rest; Path" in error
+    )
+    assert np.array_equal(np.array(mi.Bitmap(str(tmp_path / "b.exr"))), layers["rest"])
+    assert json.loads(attribute(tmp_path / "b.exr", "bdptMix") or "") == {"groups.key": [0, 0, 0]}
+    for weights, words in (
+        (
+            {"torch*": 2, "x?": 1},
+            r"no layer 'torch\*'; .*indirect; the light of emitters in no other group is in rest",
+        ),
+        ({"torch": 2, "key": 1}, "no layer 'torch'"),
+        ({"torch*": -1, "key": 1}, r"torch\*=-1 must be 0 or greater"),
+    ):
+        with pytest.raises(CommandError, match=words):
+            mix(tmp_path / "a.exr", weights)
+
+
 def test_a_mix_records_its_weights(tmp_path):
     """Expected: the header of a mixed EXR has the weights of each layer that an argument names."""
     rendered(tmp_path / "a.exr")
@@ -124,7 +175,7 @@ def test_weights_may_be_colours(tmp_path):
         ({"caustics": 2}, "no layer 'caustics'; did you mean caustic. Light groups: direct, sky; Path l"),
         ({"caustic": 2, "path.caustic": 1}, "caustic has two weights, by 'caustic' and 'path.caustic'; give"),
         ({"c*": 2, "*ic": 1}, r"caustic has two weights, by 'c\*' and '\*ic'"),
-        ({"d*": 2}, r"has a light group and a path layer 'd\*'; write groups.d\* or path.d\*"),
+        ({"*": 0}, r"'\*' matches light groups and path layers; write groups.\* or path.\*"),
         ({"x*": 2}, r"has no layer 'x\*'; Light groups"),
         ({"st": 2}, "has no layer 'st'; did you mean caustic"),
     ],

@@ -203,6 +203,48 @@ def test_names_of_layers_are_names_of_emitters():
     assert LightGroups.of(target, "key: key.1").of_emitters.count(0) == 1
 
 
+def _points(*ids):
+    """A scene of point lights with these ids."""
+    lamps = "".join(f'<emitter type="point" id="{i}"/>' for i in ids)
+    return mi.load_string(f'<scene version="3.0.0">{lamps}</scene>')
+
+
+def _ids_of(target, made, group):
+    """The ids of the emitters in a group."""
+    of_emitters = zip(target.emitters(), made.of_emitters, strict=True)
+    return {e.id() for e, number in of_emitters if made.names[number] == group}
+
+
+def test_an_id_wins_over_a_made_name():
+    """Rationale: ids may differ only in a character that becomes _. Expected: a text that is an id means
+    that emitter alone; in ``auto`` an id that is a layer's name is the name of its emitter, whichever ids
+    become it or a numbered one."""
+    target = _points("Screen.A", "Screen_A", "Screen_A_2", "Screen A", "rest", "rest_2")
+    for own in ("Screen.A", "Screen_A", "Screen_A_2", "Screen A"):
+        assert _ids_of(target, LightGroups.of(target, f"x: {own}"), "x") == {own}
+    made = LightGroups.of(target, "byid: Screen_A; dot: Screen.A")
+    assert _ids_of(target, made, "byid") == {"Screen_A"} and _ids_of(target, made, "dot") == {"Screen.A"}
+    made = LightGroups.of(target, "auto")
+    for own in ("Screen_A", "Screen_A_2", "rest_2"):
+        assert _ids_of(target, made, own) == {own}
+    assert _ids_of(target, made, "Screen_A_3") | _ids_of(target, made, "Screen_A_4") == {
+        "Screen.A",
+        "Screen A",
+    }
+    assert _ids_of(target, made, "rest_3") == {"rest"}
+
+
+def test_messages_list_each_emitter_once():
+    """Expected: an emitter is listed by its id, and by the name that it is given only without one; signs
+    that separate ids have a remedy where an id has them."""
+    target = _points("key.1", "fill light", "a,b")
+    with pytest.raises(ValueError, match=r"Emitters: a,b, fill light, key.1; for , and ; in an id write \?$"):
+        LightGroups.of(target, "x: zz")
+    assert _ids_of(target, LightGroups.of(target, "x: a?b"), "x") == {"a,b"}
+    with pytest.raises(ValueError, match=r"Emitters: bulb, globe, panel, sky$"):
+        LightGroups.of(scene(), "x: zz")
+
+
 def test_brackets_in_ids_are_themselves():
     """Rationale: names of copies have numbers in brackets or after a point. Expected: only * and ? stand for
     other characters; a text that is an id matches this one alone."""
@@ -260,7 +302,7 @@ def test_groups_without_any_emitter():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("panel", "'panel' has no group; write it like"),
+        ("panel", "'panel' has no group; write it like .*; for , and ; in an id write"),
         ("a b: panel", "'a b' cannot be a layer's name; use letters"),
         ("a:", "the group a has no emitters; write it like"),
         ("a: panel; a: globe", "there are two groups a; list"),

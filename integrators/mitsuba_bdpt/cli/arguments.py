@@ -190,8 +190,8 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "write a checkpoint beside the image every MINUTES; deleted when the render is finished"
     add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
     text = (
-        "continue from the checkpoint of an interrupted render: auto (default with --checkpoint) if there is "
-        "one, must (also --resume alone) or end with an error, never (begin anew, in place of it)"
+        "with --checkpoint MINUTES: continue from the checkpoint of an interrupted render, auto (default) if "
+        "there is one, must (also --resume without WHEN) or end with an error, never (begin anew)"
     )
     add("--resume", nargs="?", type=resume, const="must", metavar="WHEN", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"

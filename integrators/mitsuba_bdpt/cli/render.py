@@ -297,7 +297,8 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     kept, limit = None, options.time
     start = checkpoints.start(options, options.output)
     if start is not None:
-        print(f"resume: goes on from {start.spp} of {spp} samples per pixel", file=sys.stderr)
+        total = start.identity["spp"]
+        print(f"resume: the checkpoint has {start.spp} of {total} samples per pixel", file=sys.stderr)
         limit = limit and limit + start.progress.work.seconds
     if options.checkpoint is not None:
         kept = checkpoints.Checkpoints(options, options.output)

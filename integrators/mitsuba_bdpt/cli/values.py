@@ -50,8 +50,8 @@ def whole(text: str) -> int:
 
 
 def weight(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer."""
-    name, equals, values = text.partition("=")
+    """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer; ids may have ``=``."""
+    name, equals, values = text.rpartition("=")
     with contextlib.suppress(ValueError):
         if name.strip() and equals:
             return name.strip(), tuple(float(value) for value in values.split(","))

@@ -36,6 +36,7 @@ MOST_GROUPS = 16
 REST = "rest"
 
 _EXAMPLE = "write it like 'key: lamp1, lamp2; sky: envmap'"
+_SEPARATORS = "for , and ; in an id write ?"
 
 
 def parsed(text: str) -> dict[str, list[str]]:
@@ -50,7 +51,7 @@ def parsed(text: str) -> dict[str, list[str]]:
         name, colon, listed = (word.strip() for word in part.partition(":"))
         patterns = [pattern.strip() for pattern in listed.split(",") if pattern.strip()]
         if not colon:
-            raise _error(text, f"{name!r} has no group; {_EXAMPLE}, or use {AUTO}")
+            raise _error(text, f"{name!r} has no group; {_EXAMPLE}, or use {AUTO}; {_SEPARATORS}")
         if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
             raise _error(text, f"{name!r} cannot be a layer's name; use letters, digits, _ and -")
         if not patterns:
@@ -95,7 +96,7 @@ def _ids(emitter: mi.Emitter) -> list[str]:
 def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
     """Return a name for each emitter that a layer can have: its id or, if it has none, its plugin's name.
 
-    Of equal names, later ones have a number.
+    An id that is a layer's name is the name of its emitter alone; other names that are taken get a number.
     """
     ids = [_ids(emitter) for emitter in emitters]
 
@@ -104,8 +105,14 @@ def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
         shape = emitters[i].get_shape()
         return not ids[i], ids[i], str(emitters[i]) if shape is None else str(shape.bbox())
 
-    found, last = {}, Counter({REST: 1})
-    for i in sorted(range(len(emitters)), key=order):
+    in_order = sorted(range(len(emitters)), key=order)
+    own: dict[str, int] = {}
+    for i in in_order:
+        if ids[i] and layer_name(ids[i][0]) == ids[i][0] != REST:
+            own.setdefault(ids[i][0], i)
+    found = {i: name for name, i in own.items()}
+    last = Counter({REST: 1} | {emitter_id: 1 for of_one in ids for emitter_id in of_one})
+    for i in (i for i in in_order if i not in found):
         plugin = emitters[i].class_name()
         base = layer_name((ids[i] or [PLUGINS.get(plugin, plugin)])[0])
         name = base
@@ -160,12 +167,16 @@ def _matched(
     """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`."""
     names = _layer_names(emitters)
     known = [list(dict.fromkeys([*_ids(e), own])) for e, own in zip(emitters, names, strict=True)]
+    real = [set(_ids(e)) for e in emitters]
     every = sorted({n for names in known for n in names})
-    there = f"Emitters: {', '.join(every[:20])}" + (", ..." if len(every) > 20 else "")
+    one_each = sorted({names[0] for names in known})
+    there = f"Emitters: {', '.join(one_each[:20])}" + (", ..." if len(one_each) > 20 else "")
+    there += f"; {_SEPARATORS}" if re.search("[,;]", "".join(every)) else ""
     found: dict[int, str] = {}
     unmatched: list[tuple[str, str]] = []
     for name, pattern in ((name, pattern) for name, patterns in groups.items() for pattern in patterns):
-        own = [i for i, names in enumerate(known) if pattern in names]
+        own = [i for i, ids in enumerate(real) if pattern in ids]
+        own = own or [i for i, made in enumerate(names) if made == pattern]
         own = own or [i for i, names in enumerate(known) if any(matches(n, pattern) for n in names)]
         if not own and is_pattern(pattern):
             unmatched.append((name, pattern))
@@ -188,8 +199,10 @@ def _matched(
 
 def _own(emitters: Sequence[mi.Emitter]) -> dict[int, str]:
     """Return a name for each of the first `MOST_OWN` emitters by name, by index."""
+    named = sorted(enumerate(_layer_names(emitters)), key=lambda item: by_numbers(item[1]))
+    return dict(named[:MOST_OWN])
 
-    def by_numbers(name: tuple[int, str]):
-        return [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", name[1])]
 
-    return dict(sorted(enumerate(_layer_names(emitters)), key=by_numbers)[:MOST_OWN])
+def by_numbers(name: str) -> list[int | str]:
+    """Return the key of an order of names by their characters, but with numbers as such."""
+    return [int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", name))]

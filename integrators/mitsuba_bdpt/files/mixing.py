@@ -11,7 +11,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.light_groups import is_pattern, layer_name, matches
+from ..emitters.light_groups import REST, by_numbers, is_pattern, layer_name, matches
 from ..errors import CommandError, UsageTypeError, did_you_mean
 from ..image.layers import GROUP, PATH
 
@@ -34,9 +34,9 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
     ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
     for layers that are left out. ``groups.NAME``, ``path.NAME`` and ids of emitters are names too; in names
-    ``*`` and ``?`` stand for any characters. The result has the layers' colours, the image's alpha if it has
-    one, in single precision, and the weights as JSON in the metadata ``bdptMix``. Raises ``CommandError``,
-    and ``UsageTypeError`` for other types.
+    ``*`` and ``?`` stand for any characters; a pattern that matches no layer is a warning. The result has the
+    layers' colours, the image's alpha if it has one, in single precision, and the weights as JSON in the
+    metadata ``bdptMix``. Raises ``CommandError``, and ``UsageTypeError`` for other types.
     """
     if not isinstance(image, (mi.Bitmap, Path, str)):
         raise UsageTypeError(f"image={type(image).__name__} must be an mi.Bitmap or the path of an EXR")
@@ -50,9 +50,9 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     colours = list(next(iter(layers.values())))
     if set(colours) == set("RGB"):  # files have them in another order
         colours = list("RGB")
+    given = {argument: _factors(argument, weight, colours) for argument, weight in weights.items()}
     factors = {layer: np.ones(len(colours)) for layer in layers}
-    for layer, argument in own.items():
-        factors[layer] = _factors(argument, weights[argument], colours)
+    factors |= {layer: given[argument] for layer, argument in own.items()}
     mixed = [np.zeros_like(values) for values in next(iter(layers.values())).values()]
     for layer, values in layers.items():
         for i, colour in enumerate(colours):
@@ -109,9 +109,15 @@ def _chosen(
 ) -> tuple[str, dict[str, str]]:
     """Return the prefix of the partition to which all names of ``weights`` belong, and the name by layer.
 
-    Exact names win over patterns.
+    Exact names win over patterns. Warns of patterns without a layer, unless all names are such.
     """
-    found = {name: _found(image, partitions, name) for name in weights}
+    every = {name: _found(image, partitions, name) for name in weights}
+    found = {name: of_name for name, of_name in every.items() if of_name is not None}
+    for name in (name for name in every if name not in found):
+        text = _missing(image, partitions, name)
+        if not found:
+            raise CommandError(text)
+        mi.Log(mi.LogLevel.Warn, f"bdpt: {name!r} changes nothing: {text}")
     chosen = next((prefix for prefix, _ in found.values()), next(iter(partitions)))
     for name, (prefix, _) in found.items():
         if prefix != chosen:
@@ -128,8 +134,11 @@ def _chosen(
     return chosen, own
 
 
-def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, list[str]]:
-    """Return the prefix of the partition and the layers of this ``name``, id or pattern."""
+def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, list[str]] | None:
+    """Return the prefix of the partition and the layers of this ``name``, id or pattern.
+
+    None for a pattern without a layer.
+    """
 
     def fitting(fits: Callable[[str, str], bool]) -> dict[str, list[str]]:
         text = name if isinstance(name, str) else ""
@@ -139,18 +148,49 @@ def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, 
         }
         return {prefix: layers for prefix, layers in found.items() if layers}
 
-    found = fitting(str.__eq__) or fitting(lambda layer, text: matches(layer, layer_name(text, keep="*?")))
+    exact = fitting(str.__eq__)
+    found = exact or fitting(lambda layer, text: matches(layer, layer_name(text, keep="*?")))
     if len(found) > 1:
         either = " or ".join(prefix + name for prefix in found)
+        if is_pattern(name):
+            raise CommandError(f"{name!r} matches light groups and path layers; write {either}")
         raise CommandError(f"{image} has a light group and a path layer {name!r}; write {either}")
-    if not found:
-        there = "; ".join(
-            f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
+    if found and not exact and not is_pattern(name) and GROUP in found:
+        _check_is_one(name, found[GROUP][0], list(partitions[GROUP]))
+    if not found and not (isinstance(name, str) and is_pattern(name)):
+        raise CommandError(_missing(image, partitions, name))
+    return next(iter(found.items()), None)
+
+
+def _check_is_one(name: str, layer: str, layers: list[str]) -> None:
+    """Raise ``CommandError`` if the emitter of the id ``name`` may have another layer than ``layer``.
+
+    ``light_groups=auto`` numbers names that are taken; of many emitters, the last by name are in `REST`.
+    """
+    candidates = [
+        other for other in layers if re.fullmatch(rf"{re.escape(layer)}_([2-9]|[1-9][0-9]+)", other)
+    ]
+    last = max((other for other in layers if other != REST), key=by_numbers)
+    if REST in layers and by_numbers(last) < by_numbers(f"{layer}_2"):
+        candidates.append(REST)
+    if candidates:
+        raise CommandError(
+            f"{name!r} may be the id of the light of {' or '.join([layer, *candidates])}; write the "
+            "name of the layer (an id of letters, digits, _ and - is one; other ids like it have numbers)"
         )
-        names = [layer for layers in partitions.values() for layer in layers]
-        question = did_you_mean(str(name), names, parts=True)
-        raise CommandError(f"{image} has no layer {name!r}; {question}{there}")
-    return next(iter(found.items()))
+
+
+def _missing(image: str, partitions: dict[str, _Layers], name: str) -> str:
+    """Return a message that no layer has this ``name``."""
+    there = "; ".join(
+        f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
+    )
+    names = [layer for layers in partitions.values() for layer in layers]
+    question = did_you_mean(str(name), names, parts=True)
+    rest = (
+        f"; the light of emitters in no other group is in {REST}" if REST in partitions.get(GROUP, ()) else ""
+    )
+    return f"{image} has no layer {name!r}; {question}{there}{rest}"
 
 
 def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
