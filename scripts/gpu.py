@@ -153,7 +153,9 @@ def page(found: dict) -> str:
     lines = []
     for name, methods in sorted(by_scene.items()):
         ours, path, none = methods["bdpt"], methods["path"], methods["bdpt skip=none"]
-        bias = "not judged" if ours["bias"] is None else "none found" if ours["bias"]["passed"] else "found"
+        bias = (
+            "too few renders" if ours["bias"] is None else "none found" if ours["bias"]["passed"] else "found"
+        )
         lines.append(
             [
                 name,

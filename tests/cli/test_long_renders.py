@@ -124,7 +124,8 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
 
 
 @pytest.mark.parametrize(
-    ("after", "text"), [(0, "no checkpoint 'a.checkpoint.npz': no pass was over"), (1, "checkpoint 'a.ch")]
+    ("after", "text"),
+    [(0, "checkpoint 'a.checkpoint.npz' is missing: no later pass was over"), (1, "checkpoint 'a.ch")],
 )
 def test_ctrl_c_within_a_pass_tells_what_the_checkpoint_lacks(monkeypatch, capsys, after, text):
     """Rationale: the image had the pass, the checkpoint did not, and the next run began anew without a word.
@@ -144,7 +145,13 @@ def test_ctrl_c_within_a_pass_tells_what_the_checkpoint_lacks(monkeypatch, capsy
     done = rendered.image("a.exr")[1]["spp"]
     err = capsys.readouterr().err
     assert text in err and Path("a.checkpoint.npz").exists() == bool(after)
-    assert not after or f"{reports[0].spp_done} of the image's {done} samples per pixel" in err
+    assert not after or f"has {reports[0].spp_done} of the image's {done} samples per pixel" in err
+    if after:  # resumed, and interrupted again before a pass is over: what is there stays
+        reports[1:] = []
+        with monkeypatch.context() as patch:
+            patch.setattr(Render, "report", report)
+            assert main(arguments) == 130
+        assert f"has {reports[0].spp_done} of the image's" in capsys.readouterr().err
     assert main(arguments) == 0 and ("resume: " in capsys.readouterr().err) == bool(after)
 
 

@@ -371,7 +371,7 @@ def test_choices_and_the_cost_of_the_pilot():
     assert found[1] == "t<=1" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and len(found) == 4
     assert report.OF_A_SCENE["pilot"](results, "box") == report.Measured("20.0 % at 64 spp", [20.0])
-    with pytest.raises(Refused, match="remembered no pilots"):
+    with pytest.raises(Refused, match="cached no pilots"):
         report.OF_A_SCENE["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
 
@@ -463,6 +463,8 @@ def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
     assert "| over bdpt merging, trimmed |" in text and text.count("over bdpt skip=none, trimmed |") == 1
     assert "efficiency over ptracer" not in report.checks_table(every, MADE, {})
     assert "efficiency over ptracer" in report.checks_table(results, MADE, {})
+    for text in (report.checks_table(every, MADE, {}), report.checks_table(results, MADE, {})):
+        assert "| bdpt skip=none over path |" in text
 
 
 def test_a_report_says_where_times_are_equal(results):
@@ -471,6 +473,8 @@ def test_a_report_says_where_times_are_equal(results):
     rows = [r | {"equal_time_spp": 16 if r["scene"] == "dark" else 64} for r in results.rows]
     said = report._introduction(replace(results, rows=rows))
     assert "Times are equal at the largest budget (for lack of time at 16 spp: `dark`), and nearly" in said
+    rows = [r | {"match": "spp", "equal_time_spp": None} for r in results.rows]
+    assert "Times are equal" not in report._introduction(replace(results, rows=rows))
 
 
 def test_a_sweep_that_was_cut_has_figures():

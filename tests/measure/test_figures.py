@@ -274,6 +274,13 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
             crops.centres(wrong)
     with pytest.raises(CommandError, match="must be 2 places"):
         crops.centres(["0.5,0.5"])
+    words = ALL | {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "columns": 1}
+    for more, text in (
+        ({"plot": "rays", "windows": ["0,0", "1,1"]}, "--windows is for --plot crops, not for rays"),
+        ({"plot": "samples", "spp": 16}, "--spp is not for --plot samples, which has all budgets"),
+    ):
+        with pytest.raises(CommandError, match=text):
+            figures.run(Namespace(**words | more))
     found = saved(monkeypatch, crops)
     crops.draw([block(2, 60, 60)], None, 2, places)
     frames = [patch.get_xy() for patch in found[0].axes[0].patches]

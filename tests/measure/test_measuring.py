@@ -166,7 +166,7 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
     (project / "presets" / "mine.toml").write_text(PRESET)
     words = ["reference", "elsewhere/room.xml", "--resolution", "8", "--spp", "64", "--project", "my project"]
     assert main([*words, "--seconds", "0"]) == 1
-    quoted = capsys.readouterr().out.partition("go on by ")[2]
+    quoted = capsys.readouterr().out.partition("to go on: ")[2]
     program, *again = shlex.split(quoted)
     assert program == "mitsuba-bdpt" and build_parser().parse_args(again).project.name == "my project"
     assert main(again) == 0

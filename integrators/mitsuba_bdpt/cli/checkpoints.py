@@ -95,8 +95,9 @@ def start(options: Namespace, output: Path) -> Snapshot | None:
 class Checkpoints:
     """Checkpoints of one render: `after_pass` at intervals, `write` at once."""
 
-    def __init__(self, options: Namespace, output: Path):
+    def __init__(self, options: Namespace, output: Path, start: Snapshot | None = None):
         self.path, self._seconds, self._scene = path_of(output), 60 * options.checkpoint, digest(options)
+        self._kept = 0 if start is None else start.spp  # samples per pixel in the file
         self._last, self._report = time.monotonic(), None
 
     def after_pass(self, report) -> None:
@@ -120,6 +121,7 @@ class Checkpoints:
                 file.flush()
                 # Before renaming, or a power cut could leave a truncated file.
                 os.fsync(file.fileno())
+            self._kept = whole.spp
         except OSError as error:
             why = f"{error.strerror or error}; the render goes on"
             print(f"warning: no checkpoint {str(self.path)!r}: {why}", file=sys.stderr)
@@ -131,10 +133,15 @@ class Checkpoints:
         Prints where the checkpoint lacks samples of the image.
         """
         self.write()
-        kept = 0 if self._report is None else self._report.spp_done
-        if kept < done:
-            lacks = f"{kept} of the image's {done} samples per pixel" if kept else "no pass was over"
-            print(f"{'checkpoint' if kept else 'no checkpoint'} {str(self.path)!r}: {lacks}", file=sys.stderr)
+        if self._kept < done:
+            holds = (
+                f"has {self._kept} of the image's {done} samples per pixel" if self._kept else "is missing"
+            )
+            print(
+                f"checkpoint {str(self.path)!r} {holds}: no later pass was over; the same command renders "
+                "the others again",
+                file=sys.stderr,
+            )
 
     def remove(self) -> None:
         """Remove the checkpoint, after the finished image has been written."""

@@ -301,7 +301,7 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
         print(f"resume: the checkpoint has {start.spp} of {total} samples per pixel", file=sys.stderr)
         limit = limit and limit + start.progress.work.seconds
     if options.checkpoint is not None:
-        kept = checkpoints.Checkpoints(options, options.output)
+        kept = checkpoints.Checkpoints(options, options.output, start)
         watchers = [kept.after_pass, *watchers]
     with closing(display(options.progress, limit, is_open_ended(options))) as shown:
         integrator.on_pass = all_of([*watchers, shown])

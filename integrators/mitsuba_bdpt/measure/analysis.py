@@ -329,7 +329,7 @@ class Results:
 
     @cached_property
     def deciding(self) -> int:
-        """The budget of comparisons: ``compared``, or the largest that every scene has.
+        """The budget of comparisons: ``compared``, or the largest that every scene has, else the largest.
 
         Where a time limit left single renders at some budgets, only budgets with two renders of each
         integrator count.
@@ -342,7 +342,11 @@ class Results:
         if self.compared is None:
             return max(every)
         if self.compared not in every:
-            raise CommandError(f"spp={self.compared} must be one of {', '.join(map(str, sorted(every)))}")
+            known = ", ".join(map(str, sorted(every)))
+            raise CommandError(
+                f"spp={self.compared} must be one of {known}, of which all scenes have two renders of each "
+                "integrator"
+            )
         return self.compared
 
     def of(self, scene: str, method: str, budget: int | None = None) -> list[Row]:

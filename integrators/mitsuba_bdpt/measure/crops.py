@@ -55,13 +55,18 @@ def judged(name: str, spp: int, seconds: float, image: np.ndarray, target: np.nd
     return Column(image, (name, f"{spp} spp, {seconds:.2g} s", figure), errors)
 
 
+def _side(height: int, width: int) -> int:
+    """Return the side of a window in an image."""
+    return max(4, min(height, width) // WINDOW)
+
+
 def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
     """Return two disjoint windows (left, top, side) of the largest differences of two images of errors.
 
     At least a side apart, where the image has the room. Compares logarithms, so that no single pixel decides.
     """
     height, width = first.shape
-    side = max(4, min(height, width) // WINDOW)
+    side = _side(height, width)
     difference = np.abs(np.log10(first + 1e-4) - np.log10(last + 1e-4))
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     score = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
@@ -70,8 +75,8 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
         for left, top, _ in chosen:
             # Neighbours would show the same: they come after all others, and what overlaps never.
             far = 2 * side
-            score[max(0, top - far) : top + far, max(0, left - far) : left + far] -= score.max() + 1
-            score[max(0, top - side) : top + side, max(0, left - side) : left + side] = -np.inf
+            score[max(0, top - far + 1) : top + far, max(0, left - far + 1) : left + far] -= score.max() + 1
+            score[max(0, top - side + 1) : top + side, max(0, left - side + 1) : left + side] = -np.inf
         top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
         chosen.append((left, top, side))
     return chosen
@@ -132,7 +137,7 @@ def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:
 
 def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> list[tuple[int, int, int]]:
     """Return windows (left, top, side) about these places, within the image."""
-    side = max(4, min(height, width) // WINDOW)
+    side = _side(height, width)
 
     def start(share: float, size: int) -> int:
         return min(max(round(share * size - side / 2), 0), size - side)
@@ -143,7 +148,7 @@ def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> l
 def draw(
     blocks: Sequence[Block], file: Path, columns: int, places: Sequence[tuple[float, float]] | None = None
 ) -> float:
-    """Draw the ``blocks`` under each other, as wide as so many columns; return the height in inches.
+    """Draw the ``blocks`` under each other, ``columns`` (1 or 2) wide; return the height in inches.
 
     In each, a column per image, the reference last: image, windows, errors in false colours. ``places``:
     centres of the windows, see `centres`; None: where errors differ most.
@@ -155,9 +160,11 @@ def draw(
         figure = plt.figure(figsize=(wide, tall))
         top = tall
         for block, layout in zip(blocks, layouts, strict=True):
-            height, width = block.target.shape[:2]
-            chosen = windows(block.columns[0].errors, block.columns[-1].errors)
-            _block(figure, block, layout, top, _around(places, height, width) if places else chosen)
+            if places is None:
+                chosen = windows(block.columns[0].errors, block.columns[-1].errors)
+            else:
+                chosen = _around(places, *block.target.shape[:2])
+            _block(figure, block, layout, top, chosen)
             top -= layout.whole
         save(figure, file)
     return tall

@@ -44,7 +44,7 @@ OWN: dict[Error, Literal["reference_rel_mse", "reference_rel_mse_trimmed"]] = {
 SUBTRACTED = 0.9
 
 # Fewest renders of a test for a differing mean; below `FEWEST_RUNS` the squared bias must be this share of
-# the error too, since the test of so few renders rejects too often.
+# the error too: tiles of few, rare bright values differ too often, others hardly ever.
 FEWEST_TESTED = 3
 MATERIAL = 0.05
 
@@ -141,17 +141,17 @@ def _student(freedom: int, confidence: float) -> float:
 def mean_differs(rows: Sequence[Row], reference: Means) -> bool:
     """Return whether the mean of renders of one budget differs from the reference.
 
-    By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light. Of
-    few renders it hardly ever rejects, so that 95 % intervals of energy and squared bias suffice there.
+    By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light.
+    Elsewhere it hardly ever rejects few renders, for which 95 % intervals of energy and squared bias suffice.
     """
     found, are_few = squared_bias(rows), len(rows) < FEWEST_RUNS
-    if not compared(rows, reference) and not (are_few and _both_above_zero(rows, reference, found)):
+    if not compared(rows, reference) and not (are_few and _intervals_leave_out_zero(rows, reference, found)):
         return False
     share = MATERIAL if are_few else 0.0
     return found is None or found.value > share * float(np.mean([row["rel_mse"] for row in rows]))
 
 
-def _both_above_zero(rows: Sequence[Row], reference: Means, bias: Estimate | None) -> bool:
+def _intervals_leave_out_zero(rows: Sequence[Row], reference: Means, bias: Estimate | None) -> bool:
     """Return whether the intervals of the squared ``bias`` and of the missing energy leave out 0."""
     if bias is None or bias.low <= 0:
         return False

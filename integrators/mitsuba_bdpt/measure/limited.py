@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
+from types import MappingProxyType
 
 from .preset import FIRST_SEED, Cell, Cells
 
@@ -15,17 +16,22 @@ LEAST_SLOPE = 0.5  # of a larger budget's seconds over samples, in those of the 
 class Pending:
     """The ``missing`` renders of a scene, in the order of seeds, all budgets of each.
 
-    Integrators of one budget and seed are rendered together or not at all. ``done``: the number of renders so
-    far.
+    Integrators of one budget and seed are rendered together or not at all. ``known``: seconds of earlier
+    renders by integrator and budget.
     """
 
-    def __init__(self, cells: Cells, missing: Sequence[Cell]):
-        self.cells, self.done = cells, 0
+    def __init__(
+        self,
+        cells: Cells,
+        missing: Sequence[Cell],
+        known: Mapping[str, Mapping[int, float]] = MappingProxyType({}),
+    ):
+        self.cells = cells
         ordered = sorted(missing, key=lambda cell: (cell.seed, cell.budget))
         self._groups = [
             list(group) for _, group in groupby(ordered, key=lambda cell: (cell.seed, cell.budget))
         ]
-        self._seconds = dict[str, dict[int, float]]()
+        self._seconds = {method: dict(seconds) for method, seconds in known.items()}
         self._compiled = set[tuple[str, int]]()
 
     @property
@@ -46,10 +52,11 @@ class Pending:
         at = ", ".join(f"{count} at {budget} spp" for budget, count in sorted(counts.items()))
         return f"{len(late)} of {len(self.cells.planned())} renders: {at}"
 
-    def render(self, rendered: Callable[[Cell], float | None], seconds: float) -> None:
-        """Render what fits into the ``seconds``, by ``rendered``, which returns those of a render.
+    def render(self, rendered: Callable[[Cell], float | None], seconds: float) -> int:
+        """Render what fits into the ``seconds``; returns the number of renders.
 
-        Two seeds of the smallest budget are rendered in any case: with fewer there is no figure.
+        ``rendered`` renders a cell and returns its seconds, None if it failed. Two seeds of the smallest
+        budget are rendered in any case: with fewer there is no figure.
         """
         end = time.monotonic() + seconds
 
@@ -58,6 +65,7 @@ class Pending:
             left = end - time.monotonic()
             return is_least or (left > 0 and self._predicted(group) <= left)
 
+        done = 0
         while group := next(filter(fits, self._groups), None):
             self._groups.remove(group)
             for cell in group:
@@ -65,7 +73,8 @@ class Pending:
                 if taken is not None:
                     self._seconds.setdefault(cell.method, {})[cell.budget] = taken
                 self._compiled.add((cell.method, cell.budget))
-                self.done += 1
+                done += 1
+        return done
 
     def _predicted(self, group: list[Cell]) -> float:
         """Return the predicted seconds of the renders of a ``group``."""

@@ -580,8 +580,8 @@ def said(job: Job, made: Reference, reached: bool) -> str:
     own = job.project, job.project.called(job.scene), job.resolution, job.depth
     is_short = made.provenance.get("spp_per_render", PASS_SPP) < PASS_SPP
     why = f"as many as fit into {job.seconds:.3g} s" if is_short else f"not good enough for {job.spp} spp"
-    how = "more are added" if is_short else "go on"
-    return f"{text}, {why}: {how} by {make_command(*own, '--spp', str(job.spp))}"
+    how = "to add more" if is_short else "to go on"
+    return f"{text}, {why}; {how}: {make_command(*own, '--spp', str(job.spp))}"
 
 
 def run(options: Namespace) -> int:

@@ -154,7 +154,8 @@ class Sweep(Options):
     seconds: float | None = option(
         None,
         SECONDS,
-        "seconds of everything; what does not fit is cut, later seeds first, and said; default: no limit",
+        "seconds of everything; what does not fit is cut, large budgets and later seeds first, and said; "
+        "default: no limit",
         metavar="SECONDS",
     )
 
@@ -186,7 +187,7 @@ class Figure(Options):
     integrators: tuple[str, ...] | None = option(
         None,
         str,
-        "integrators to draw beside the first one, by their names in the preset; default: all",
+        "integrators to draw beside the first one, by their names in the preset; default: all compared ones",
         nargs="+",
         metavar="NAME",
     )

@@ -13,7 +13,7 @@ import re
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -215,8 +215,9 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         "slope": partial(_slope, results, notes),
         "slope, independent points": partial(results.convergence, method=INDEPENDENT),
         "bias check": bias,
-        f"efficiency over {LIGHT_TRACER}": lambda scene: _with_bias(results, scene, LIGHT_TRACER),
     }
+    if LIGHT_TRACER in results.aside:  # else it is in the table of efficiencies
+        columns[f"efficiency over {LIGHT_TRACER}"] = lambda scene: _with_bias(results, scene, LIGHT_TRACER)
     of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT}
     of[f"efficiency over {LIGHT_TRACER}"] = LIGHT_TRACER
     return by_scene(results.scenes, _rendered(results, columns, of))
@@ -229,9 +230,8 @@ def _without_verdict(results: Results, scene: str, method: str, why: Refused) ->
 def _rendered(
     results: Results, columns: dict[str, Callable[[str], object]], of: Mapping[str, str]
 ) -> dict[str, Callable[[str], object]]:
-    """Return the ``columns`` without those ``of`` rivals, or of integrators that were not rendered."""
-    there = {None, *results.methods} - {*results.rivals}
-    return {name: made for name, made in columns.items() if of.get(name) in there}
+    """Return the ``columns`` without those ``of`` integrators that were not rendered."""
+    return {name: made for name, made in columns.items() if of.get(name) in (None, *results.methods)}
 
 
 def _with_bias(results: Results, scene: str, rival: str) -> str:
@@ -300,10 +300,10 @@ def _pilot_percent(rows: Sequence[Row]) -> float:
     shares: list[float] = []
     for row in rows:
         if (first := row.get("seconds_pilot")) is None:
-            raise Refused("rows of a version that remembered no pilots")
+            raise Refused("rows of a version that cached no pilots")
         shares.append(first / (first + row["seconds"]))
     if not shares:
-        raise Refused("–")
+        raise Refused("not rendered")
     return 100 * float(np.median(shares))
 
 
@@ -611,7 +611,8 @@ def _met(goal: Goal, values: Sequence[float]) -> str:
 
 
 def goals_table(results: Results, goals: list[Goal]) -> str:
-    """Table of goals and measurements, and whether they are met."""
+    """Table of goals and measurements, and whether they are met, at the default budget of comparisons."""
+    results = replace(results, compared=None)
 
     def figure(measure: str | None = None, scene: str | None = None, **_) -> Measured:
         if measure is None:
@@ -684,11 +685,13 @@ def _clock(results: Results) -> str:
 
 def _equal_times(results: Results) -> str:
     """Describe the budgets at which times are equal."""
+    if all(name in results.at_equal_samples for name in results.methods[1:]):
+        return ""
     found: dict[int, list[str]] = {}
     for scene in results.scenes:
         rows = [row for row in results.rows if row["scene"] == scene]
         largest, at = max(row["budget"] for row in rows), [row.get("equal_time_spp") for row in rows]
-        for spp in {n for n in at if n is not None and n < largest}:
+        for spp in {n for n in at if n is not None and n != largest}:
             found.setdefault(spp, []).append(f"`{scene}`")
     few = "; ".join(f"at {spp} spp: {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
     few = f" (for lack of time {few})" if few else ""

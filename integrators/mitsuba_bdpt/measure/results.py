@@ -392,6 +392,10 @@ def load(
     given = read_toml(goals) if goals.exists() else {}
     aside = list_of(goals, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
     found = analysis.Results(rows, means, measured, tuple(aside), spp)
+    if unknown := [name for name in aside if name not in found.methods]:
+        raise CommandError(
+            f"{goals}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
+        )
     if spp is not None:
         _ = found.deciding  # raises for a budget that is not there
     return found, made

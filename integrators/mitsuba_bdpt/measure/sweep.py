@@ -148,15 +148,15 @@ class Bench:
             one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
-                budget = self._calibrated(first, cell)
+                budget = self._calibration_budget(first, cell)
                 if budget < largest:
                     name = f"{cell.scene}: times of {cell.method} and {first.method}"
                     self.notes.append(f"{name} are equal at {budget} spp, the largest that time allowed")
-                write_json(kept, {"samples": self._measured(first, cell, budget), "spp": budget})
+                write_json(kept, {"samples": self._time_ratio(first, cell, budget), "spp": budget})
             self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
         return self._spp[cell.method]
 
-    def _measured(self, first: Cell, cell: Cell, budget: int) -> float:
+    def _time_ratio(self, first: Cell, cell: Cell, budget: int) -> float:
         """Return the seconds of the ``first`` integrator over a cell's, at equal samples."""
         for one in (first, cell):
             self.compile_seconds(one, budget)
@@ -165,7 +165,7 @@ class Bench:
         seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
         return float(np.median([ours / theirs for ours, theirs in seconds]))
 
-    def _calibrated(self, first: Cell, cell: Cell) -> int:
+    def _calibration_budget(self, first: Cell, cell: Cell) -> int:
         """Return the budget at which equal time is measured."""
         budgets = sorted(self.cells.subject.spp)
         if self.seconds is None:
@@ -347,21 +347,39 @@ class Sweep:
         lacking = [
             (cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing
         ]
-        pending = [Pending(*one) for one in lacking]
-        benches = [Bench(cells, self.output, seconds / len(lacking)) for cells, _ in lacking]
+        pending = [Pending(cells, missing, self._known_seconds(cells)) for cells, missing in lacking]
+        benches: dict[int, Bench] = {}
         for cells in self.scenes:
             self._first_images(cells)
-        before = -1
+
+        def rendered(i: int) -> int:
+            """Render what fits of a scene into its share of the time left."""
+            if i not in benches:
+                benches[i] = Bench(lacking[i][0], self.output, seconds / len(lacking))
+            sharing = sum(bool(other.late) for other in pending[i:])
+            share = (end - time.monotonic()) / max(sharing, 1)
+            done = pending[i].render(partial(self._cell, benches[i]), max(share, 0.0))
+            if not pending[i].late:
+                self.notes += benches.pop(i).notes
+            return done
+
         # What a scene leaves goes to the others, until nothing more fits.
-        while before < (before := sum(one.done for one in pending)):
-            for i, (one, bench) in enumerate(zip(pending, benches, strict=True)):
-                sharing = sum(bool(other.late) for other in pending[i:])
-                share = (end - time.monotonic()) / max(sharing, 1)
-                one.render(partial(self._cell, bench), max(share, 0.0))
+        while sum([rendered(i) for i, one in enumerate(pending) if one.late]):
+            pass
+        self.notes += [text for bench in benches.values() for text in bench.notes]
         late = [one for one in pending if one.late]
         self.cut = {one.cells.subject.name: one.text for one in late}
-        self.notes = [text for bench in benches for text in bench.notes]
         self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
+
+    def _known_seconds(self, cells: Cells) -> dict[str, dict[int, float]]:
+        """Return the seconds of finished renders of a scene, by integrator and budget."""
+        found: dict[str, dict[int, float]] = {}
+        for cell in cells.planned():
+            file = cell_file(self.output, cell)
+            if file.exists():
+                row = read_json(file, "delete it, to render it anew")
+                found.setdefault(cell.method, {})[cell.budget] = row["seconds"]
+        return found
 
     def _first_images(self, cells: Cells):
         """Render the missing first images of a scene, at its smallest budget."""
@@ -608,7 +626,7 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
     for text in sweep.notes:
-        print(f"{text}; a sweep into another folder (-o) with more --seconds measures it at more")
+        print(f"{text}; to measure it at a larger budget, sweep into another folder (-o) with more --seconds")
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
