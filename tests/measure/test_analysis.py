@@ -127,7 +127,7 @@ def test_scenes_with_the_largest_gap_come_first():
     assert found.by_gap("bdpt") == ["spots", "even", "alone"]
     text = report.gaps_table(found)
     assert [line.split("`")[1] for line in text.splitlines()[2:]] == ["spots", "even", "alone"]
-    assert cells(text, "`spots`") == ["8x (8–8)", "2x (2–2)"]
+    assert cells(text, "`spots`") == ["8x (8–8; n = 2)", "2x (2–2; n = 2)"]
     assert cells(text, "`alone`") == ["fewer than two renders: seeds = 2 or more"] * 2
 
 
@@ -248,7 +248,7 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
     text = report.efficiency_table(both)
     assert text.startswith(report.efficiency_table(results).rstrip("\n"))
     assert "| scene | over volpath, trimmed | over volpath, raw | over volpathmis, trimmed |" in text
-    assert cells(text, "`fog`")[:3:2] == ["5x (5–5)", "3x (3–3)"]
+    assert cells(text, "`fog`")[:3:2] == ["5x (5–5; n = 3)", "3x (3–3; n = 3)"]
     assert both.against_path("fog").median == pytest.approx(3)
     assert both.against_path("box").median == pytest.approx(0.8)
     assert cells(report.gaps_table(both), "`fog`") == ["1x (1–1)", "0.2x (0.2–0.2)"]
@@ -329,7 +329,7 @@ def test_goals_stand_beside_what_is_measured(results):
         "**no**",
     ]
     assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"]
-    assert cells(text, "cold") == ["4 s and 2x at most", "–", "4.00 s, 2x (2–2) `path`'s", "yes"]
+    assert cells(text, "cold") == ["4 s and 2x at most", "–", "4.00 s, 2x (2–2; n = 2) `path`'s", "yes"]
     assert cells(text, "memory") == ["1 GiB at most", "–", "not measured", "–"]
     assert cells(text, "floor") == ["1.35x at most", "–", "1.3x (1.2–1.4) `box`", "yes"]
     assert cells(text, "nothing") == ["1x", "–", "not measured yet", "–"]
@@ -469,12 +469,12 @@ def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
 
 def test_a_report_says_where_times_are_equal(results):
     """Expected: at the largest budget, and where a limit of time allowed a smaller one only, at which."""
-    assert "Times are equal at the largest budget, and nearly" in report._introduction(results)
+    assert "equal time at the largest budget, so that" in report._introduction(results)
     rows = [r | {"equal_time_spp": 16 if r["scene"] == "dark" else 64} for r in results.rows]
     said = report._introduction(replace(results, rows=rows))
-    assert "Times are equal at the largest budget (for lack of time at 16 spp: `dark`), and nearly" in said
+    assert "equal time at the largest budget (for lack of time at 16 spp: `dark`), so that" in said
     rows = [r | {"match": "spp", "equal_time_spp": None} for r in results.rows]
-    assert "Times are equal" not in report._introduction(replace(results, rows=rows))
+    assert "equal time at the" not in report._introduction(replace(results, rows=rows))
 
 
 def test_a_sweep_that_was_cut_has_figures():

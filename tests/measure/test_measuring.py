@@ -16,7 +16,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.measure import making, reference, report, showing, sweep
+from mitsuba_bdpt.measure import equal_time, making, reference, report, showing, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
 
@@ -511,3 +511,20 @@ def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
     assert main(words) == 1
     said = capsys.readouterr().out
     assert "fog.xml': its film has no colours" in said.partition("making one")[0]
+
+
+def test_samples_in_equal_time_are_matched_again(monkeypatch):
+    """Rationale: `path` had 132 samples where 222 take as long as `bdpt`: 64 were timed, much of whose time
+    is fixed. Renders take 1 s and 10 ms per sample. Expected: of 3 s 200 samples, to 5 %; no further renders
+    where the first ones take as long."""
+    asked = []
+
+    def seconds(scene, made, spp):
+        asked.append(spp)
+        return 1 + 0.01 * spp
+
+    monkeypatch.setattr(equal_time, "seconds", seconds)
+    assert equal_time._samples_within(3.0, None, None, 64) == pytest.approx(200, rel=0.08)
+    assert asked[0] == 64 and len(asked) <= 4
+    asked.clear()
+    assert equal_time._samples_within(1.64, None, None, 64) == 64 and asked == [64]

@@ -30,6 +30,7 @@ from .showing import steps
 from .timing import alternating, timed
 
 TIMED = 3  # renders for the median of times
+MATCHED, CLOSE = 3, 0.05  # times that samples are matched at most, and difference of times that is left
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,21 @@ def seconds(scene, made, spp: int) -> float:
     return float(np.median([found.seconds for (found,) in turns]))
 
 
+def _samples_within(limit: float, scene, made, spp: int) -> int:
+    """Return the samples per pixel that an integrator renders in ``limit`` seconds.
+
+    In proportion to those of ``spp``, and twice anew from what these took, since a part of the time is fixed.
+    The last render is of these samples, for which Mitsuba compiles.
+    """
+    count, taken = spp, seconds(scene, made, spp)
+    for _ in range(MATCHED):
+        if abs(taken / limit - 1) <= CLOSE:
+            break
+        count = max(1, round(count * limit / taken))
+        taken = seconds(scene, made, count)
+    return count
+
+
 def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
     """Render with each integrator in the time of the last one.
 
@@ -82,8 +98,7 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
         limit, found = seconds(scene, made[-1], spp), []
         for name, one in zip(ways, made, strict=True):
             step(name)
-            count = spp if one is made[-1] else max(1, round(spp * limit / seconds(scene, one, spp)))
-            seconds(scene, one, count)  # Mitsuba compiles for each number of samples
+            count = spp if one is made[-1] else _samples_within(limit, scene, one, spp)
             image, taken, _ = timed(scene, one, count, seed=7)
             found.append(Shot(name, count, taken, image, rel_mse(image, target, TRIM)))
     return found

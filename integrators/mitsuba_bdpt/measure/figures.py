@@ -53,7 +53,7 @@ STYLES = {
     # Only in scenes with media.
     MEDIA_RIVALS[0]: ("#D55E00", "s"),
     MEDIA_RIVALS[1]: ("#E69F00", "D"),
-    LIGHT_TRACER: ("#CC79A7", "x"),
+    LIGHT_TRACER: ("#CC79A7", "h"),
 }
 PLAIN = (("#000000", "p"), ("#882255", "*"), ("#117733", "<"), ("#332288", ">"))
 """Of other integrators, in turn."""
@@ -304,20 +304,22 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 
 
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
-    """Return the images of a scene's first seed at the deciding budget, rivals first, and the reference.
+    """Return images of a scene at the deciding budget, rivals first, and the reference.
 
-    Captions have median seconds, and say which integrators have equal samples in place of equal time.
+    Each integrator's image is of the seed with the median trimmed error. Captions have median seconds, and
+    say which integrators have equal samples in place of equal time.
     """
     columns: list[crops.Column] = []
     for method in [*results.rivals, results.methods[0]]:
-        rows = results.of(scene, method, results.deciding)
-        file = folder / "images" / scene / f"{rows[0]['key']}.exr" if rows else None
-        if file is None or not file.exists():
+        rows = sorted(results.of(scene, method, results.deciding), key=lambda row: row["rel_mse_trimmed"])
+        shown = rows[(len(rows) - 1) // 2] if rows else None
+        file = folder / "images" / scene / f"{shown['key']}.exr" if shown else None
+        if shown is None or file is None or not file.exists():
             continue
         (image,), _ = read_layers(file, "")
         called = f"{method} (equal spp)" if method in results.at_equal_samples else method
         seconds = float(np.median([row["seconds"] for row in rows]))
-        columns.append(crops.judged(called, rows[0]["spp"], seconds, image, kept.image))
+        columns.append(crops.judged(called, shown["spp"], seconds, image, kept.image))
     if not columns:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
     return crops.Block(scene, tuple(columns), kept.image)
@@ -344,6 +346,8 @@ def run(options: Namespace) -> int:
     check_figure(output)
     if options.windows and options.plot != "crops":
         raise CommandError(f"--windows is for --plot crops, not for {options.plot}; leave it out")
+    if options.integrators and options.plot == "rays":
+        raise CommandError("--integrators is not for --plot rays, which is of the first one; leave it out")
     if options.spp and options.plot in AXES_OF:
         raise CommandError(f"--spp is not for --plot {options.plot}, which has all budgets; leave it out")
     results, made = load(project, folder)

@@ -696,8 +696,8 @@ def _equal_times(results: Results) -> str:
     few = "; ".join(f"at {spp} spp: {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
     few = f" (for lack of time {few})" if few else ""
     return (
-        f"Times are equal at the largest budget{few}, and nearly at others; unequal ones\nare compared as if "
-        "errors fell with 1 / time."
+        f"Samples are matched for equal time at the largest budget{few}, so that times\nat others are nearly "
+        "equal; what is left is in the efficiency, as if errors fell with 1 / time."
     )
 
 
@@ -777,14 +777,16 @@ missing by the bias check.
 {errors_table(results)}
 ## What was skipped
 
-Decided by a pilot in the first render of each scene, at {results.deciding} samples per pixel:
+By `{results.methods[0]}`, decided by a pilot in the first render of each scene, at {results.deciding} samples
+per pixel.
+Rays: closest hits of camera + light subpaths; shadow rays for s = 1 + t = 1 + other connections.
 
 {choices_table(results)}
 ## Cost, convergence, bias
 
-Slope: exponent of raw relMSE over samples, −1 for independent samples, with its 95 % interval ("between
-decisions": budgets differ in what is skipped, since a short render has no pilot). Bias
-check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
+Of `{results.methods[0]}`. Slope: exponent of raw relMSE over samples, −1 for independent samples, with its
+95 % interval ("between decisions": budgets differ in what is skipped, since a short render has no pilot).
+Bias check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
 and what the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both
 have in common is left to the package's own tests.
 

@@ -14,6 +14,8 @@ from .metrics import Estimate
 WIDE = 1e3
 """Ratio of the ends of an interval from which on it says nothing."""
 
+FEW = 5  # values, below which their number stands beside a range
+
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table; escapes bars and line ends."""
@@ -44,7 +46,8 @@ def ratio(x: float) -> str:
 
 def ranged(found: Summary) -> str:
     """Format bound, median (smallest–largest)."""
-    middle = f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]})"
+    few = f"; n = {found.count}" if found.count < FEW else ""
+    middle = f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]}{few})"
     return f"{found.bound} {middle}".lstrip()
 
 
