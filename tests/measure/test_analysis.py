@@ -251,7 +251,7 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
     assert cells(text, "`fog`")[:3:2] == ["5x (5–5; n = 3)", "3x (3–3; n = 3)"]
     assert both.against_path("fog").median == pytest.approx(3)
     assert both.against_path("box").median == pytest.approx(0.8)
-    assert cells(report.gaps_table(both), "`fog`") == ["1x (1–1)", "0.2x (0.2–0.2)"]
+    assert cells(report.gaps_table(both), "`fog`") == ["1x (1–1; n = 3)", "0.2x (0.2–0.2; n = 3)"]
     assert "the stronger of `volpath` and `volpathmis`" in report.stronger(both)
     assert report.stronger(results) == "the stronger `path`"
 
@@ -331,7 +331,7 @@ def test_goals_stand_beside_what_is_measured(results):
     assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"]
     assert cells(text, "cold") == ["4 s and 2x at most", "–", "4.00 s, 2x (2–2; n = 2) `path`'s", "yes"]
     assert cells(text, "memory") == ["1 GiB at most", "–", "not measured", "–"]
-    assert cells(text, "floor") == ["1.35x at most", "–", "1.3x (1.2–1.4) `box`", "yes"]
+    assert cells(text, "floor") == ["1.35x at most", "–", "1.3x (1.2–1.4; n = 3) `box`", "yes"]
     assert cells(text, "nothing") == ["1x", "–", "not measured yet", "–"]
     dark = cells(text, "dark")[2]
     assert dark.startswith("≥ 0.8x (0.8–0.8); `path`: ") and "% of the energy is missing" in dark
