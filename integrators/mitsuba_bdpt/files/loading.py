@@ -67,17 +67,17 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
 def parsed(
     scene: Path, definitions: Mapping[str, object], strict: bool = True
 ) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    """Parse a ``scene`` file by Mitsuba's parser, see `parsed_by`.
+    """Parse a ``scene`` file by Mitsuba's parser, see `parse_upgraded`.
 
     ``definitions``: values of its parameters; if ``strict``, unused and missing ones are errors.
     """
     config = mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
     if strict:
-        return config, parsed_by(config, scene, definitions)
+        return config, parse_upgraded(config, scene, definitions)
     config.unused_parameters = mi.LogLevel.Debug
     while True:
         try:
-            return config, parsed_by(config, scene, definitions)
+            return config, parse_upgraded(config, scene, definitions)
         except RuntimeError as error:
             missing = _MISSING.search(str(error))
             if missing is None:
@@ -85,7 +85,7 @@ def parsed(
             definitions = {**definitions, missing[1]: "1"}
 
 
-def parsed_by(
+def parse_upgraded(
     config: mi.parser.ParserConfig, scene: Path, definitions: Mapping[str, object]
 ) -> mi.parser.ParserState:
     """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6."""

@@ -20,8 +20,8 @@ from ..files.loading import (
     in_proportion,
     named_files,
     parameters,
+    parse_upgraded,
     parsed,
-    parsed_by,
     searching,
     spectra,
 )
@@ -168,7 +168,7 @@ class SceneFile(MeasuredScene):
             return super()._instantiated(definitions, sampler)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        return parsed_by(config, self.file, in_proportion(self.file, definitions))
+        return parse_upgraded(config, self.file, in_proportion(self.file, definitions))
 
 
 class DictionaryScene(MeasuredScene):

@@ -82,12 +82,7 @@ def explain(
     ]
     lines += [f"used: {name}" for name in used]
     if p.merging:
-        merged = (
-            "SDS paths and of paths that connections rarely sample" if prepared.near_specular else "SDS paths"
-        )
-        lines.append(
-            f"used: vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)"
-        )
+        lines.append(f"used: {_merging(prepared)}")
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
@@ -105,6 +100,13 @@ def explain(
             f"invalid samples (NaN or infinite): {invalid} of the pilot, which decided from the rest"
         )
     return "\n".join(lines + _pilot(settings, table, confidence))
+
+
+def _merging(prepared: PreparedScene) -> str:
+    merged = (
+        "SDS paths and of paths that connections rarely sample" if prepared.near_specular else "SDS paths"
+    )
+    return f"vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)"
 
 
 def _guided_emission(p: Plan) -> str:
