@@ -54,7 +54,8 @@ IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt
 
 
 OF_PLUGIN = re.compile(
-    r"\[(?!\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct|Stream|Pool|Thread|Parser)\])[A-Z]\w*(\[\w+\])?\] (?!.*Traceback)",
+    r"\[(?!\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct|Stream|Pool|Thread|Parser)\])"
+    r"[A-Z]\w*(\[\w+\])?\] (?!.*Traceback)",
     re.DOTALL,
 )
 """What an error of a plugin in C++ begins with: its class in brackets.
