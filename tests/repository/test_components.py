@@ -63,7 +63,10 @@ KNOWN = {
     ),
     "merging": Component(
         asked={"merging": True},
-        tests=("images/test_merging.py", "images/test_sds_paths.py"),
+        tests=(
+            *("images/test_hard_paths.py", "images/test_merging.py", "images/test_sds_paths.py"),
+            "planning/test_undersampled.py",
+        ),
     ),
     "media": Component(
         things={"fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}},
@@ -156,6 +159,16 @@ def test_the_rest_renders_as_before(name, tmp_path):
     assert f"{name.replace('_', ' ')} is not part of this installation" in str(found["said"])
     for skip, expected in images(known.never).items():
         np.testing.assert_allclose(found[skip], expected, rtol=2e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", KNOWN)
+def test_tests_that_import_a_component_are_known_here(name):
+    """Rationale: two new ones could not be collected without it, which only the slow test saw. Expected: each
+    module that imports it when it is collected is among its tests."""
+    imports = re.compile(rf"^(from|import) mitsuba_bdpt(\.| import ){name}\b", re.MULTILINE)
+    found = {file for file in TESTS.rglob("test_*.py") if imports.search(file.read_text())}
+    known = [TESTS / path for path in KNOWN[name].tests]
+    assert not {file for file in found if not any(file.is_relative_to(own) for own in known)}
 
 
 @pytest.mark.slow
