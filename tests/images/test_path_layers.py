@@ -247,7 +247,7 @@ def test_roughness_of_near_specular_lobes(kind):
     `NARROW` from both sides from others. Tolerance: the two digits of the manual, and the 4 % of light that
     glass reflects."""
     page = Path(__file__).parents[2] / "docs/user/light_groups.md"
-    manual = float(re.search(rf"`{kind}`[^;)]*?below (0\.\d+)", page.read_text())[1])
+    manual = float(re.search(rf"`{kind}`[^;]*?below (0\.\d+)", page.read_text())[1])
     side = -1 if kind == "roughdielectric" else 1
     for alpha, narrow in ((0.97 * manual, True), (1.03 * manual, False)):
         glass = {"int_ior": 1.5, "ext_ior": 1.0} if side < 0 else {}
