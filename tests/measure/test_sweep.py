@@ -1156,7 +1156,7 @@ def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
     through both; at least half of the proportion, for noise; that of a known budget is the last one."""
     preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
     cells = sweep.Cells(REPOSITORY, preset, preset.subjects[0])
-    made = limited.Pending(cells, cells.planned())
+    made = limited.Pending(cells, cells.planned(), {})
     assert made._seconds_of("ours", 4) == 0
     made._seconds["ours"] = {2: 0.7}
     assert made._seconds_of("ours", 4) == pytest.approx(0.7 + 0.35 * 2)

@@ -166,10 +166,10 @@ def _matched(
 ) -> tuple[dict[int, str], list[str]]:
     """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`."""
     names = _layer_names(emitters)
-    known = [list(dict.fromkeys([*_ids(e), own])) for e, own in zip(emitters, names, strict=True)]
-    real = [set(_ids(e)) for e in emitters]
-    every = sorted({n for names in known for n in names})
-    one_each = sorted({names[0] for names in known})
+    real = [_ids(emitter) for emitter in emitters]
+    known = [list(dict.fromkeys([*ids, made])) for ids, made in zip(real, names, strict=True)]
+    every = sorted({name for of_one in known for name in of_one})
+    one_each = sorted({of_one[0] for of_one in known})
     there = f"Emitters: {', '.join(one_each[:20])}" + (", ..." if len(one_each) > 20 else "")
     there += f"; {_SEPARATORS}" if re.search("[,;]", "".join(every)) else ""
     found: dict[int, str] = {}
@@ -177,7 +177,7 @@ def _matched(
     for name, pattern in ((name, pattern) for name, patterns in groups.items() for pattern in patterns):
         own = [i for i, ids in enumerate(real) if pattern in ids]
         own = own or [i for i, made in enumerate(names) if made == pattern]
-        own = own or [i for i, names in enumerate(known) if any(matches(n, pattern) for n in names)]
+        own = own or [i for i, of_one in enumerate(known) if any(matches(n, pattern) for n in of_one)]
         if not own and is_pattern(pattern):
             unmatched.append((name, pattern))
         elif not own:

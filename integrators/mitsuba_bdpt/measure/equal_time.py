@@ -75,8 +75,8 @@ def seconds(scene, made, spp: int) -> float:
 def _samples_within(limit: float, scene, made, spp: int) -> int:
     """Return the samples per pixel that an integrator renders in ``limit`` seconds.
 
-    In proportion to those of ``spp``, and twice anew from what these took, since a part of the time is fixed.
-    The last render is of these samples, for which Mitsuba compiles.
+    In proportion to those of ``spp``, then anew from what these took, since a part of the time is fixed. The
+    last render is of these samples, for which Mitsuba compiles.
     """
     count, taken = spp, seconds(scene, made, spp)
     for _ in range(MATCHED):

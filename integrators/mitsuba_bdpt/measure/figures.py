@@ -72,7 +72,6 @@ PANELS = {1: 2, 2: 4}
 DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
-AXES_OF = {"seconds": "seconds", "samples": "spp"}  # by plot
 SHORT = 30.0  # ratio of the ends of a logarithmic axis
 PAGE = 29.7  # cm, the height of A4
 BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
@@ -293,8 +292,8 @@ def _rays_per_sample(results: Results, scene: str, kind: str) -> float:
 
 
 PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
-    "samples": lambda *given: convergence(given[0], AXES_OF["samples"], *given[1:]),
-    "seconds": lambda *given: convergence(given[0], AXES_OF["seconds"], *given[1:]),
+    "samples": lambda results, path, columns, scenes: convergence(results, "spp", path, columns, scenes),
+    "seconds": lambda results, path, columns, scenes: convergence(results, "seconds", path, columns, scenes),
     "efficiency": lambda results, path, columns, scenes: efficiencies(
         results, results.rivals, path, columns, scenes
     ),
@@ -348,7 +347,7 @@ def run(options: Namespace) -> int:
         raise CommandError(f"--windows is for --plot crops, not for {options.plot}; leave it out")
     if options.integrators and options.plot == "rays":
         raise CommandError("--integrators is not for --plot rays, which is of the first one; leave it out")
-    if options.spp and options.plot in AXES_OF:
+    if options.spp and options.plot in ("samples", "seconds"):
         raise CommandError(f"--spp is not for --plot {options.plot}, which has all budgets; leave it out")
     results, made = load(project, folder)
     results = replace(_among(results, options.integrators), compared=options.spp)

@@ -6,7 +6,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
-from types import MappingProxyType
 
 from .preset import FIRST_SEED, Cell, Cells
 
@@ -20,12 +19,7 @@ class Pending:
     renders by integrator and budget.
     """
 
-    def __init__(
-        self,
-        cells: Cells,
-        missing: Sequence[Cell],
-        known: Mapping[str, Mapping[int, float]] = MappingProxyType({}),
-    ):
+    def __init__(self, cells: Cells, missing: Sequence[Cell], known: Mapping[str, Mapping[int, float]]):
         self.cells = cells
         ordered = sorted(missing, key=lambda cell: (cell.seed, cell.budget))
         self._groups = [

@@ -40,9 +40,7 @@ class Row(Measured):
     max_depth: int
     sampler: str
     match: str  # "spp" or "seconds": what is equal to the first integrator's
-    equal_time_spp: NotRequired[
-        int | None
-    ]  # where its seconds equal the first one's; missing in older sweeps
+    equal_time_spp: NotRequired[int | None]  # budget of equal seconds; missing in older sweeps
     clock: NotRequired[str]  # "wall" or "processor": the seconds that decide; missing in older sweeps
     budget: int  # samples per pixel of the first integrator
     first: str  # the integrator that the others are compared with

@@ -817,7 +817,8 @@ class Report:
     @staticmethod
     def of(project: Project, folder: Path, spp: int | None = None) -> Report:
         """Read a folder; raises ``CommandError`` like `results.load`, or for invalid goals and notes."""
-        results, made = load(project, folder, spp)
+        results, made = load(project, folder)
+        results = replace(results, compared=spp)
         files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
         kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
         for scene, text in kept["notes"].items():

@@ -354,14 +354,11 @@ def decisive(rows: list[Row]) -> list[Row]:
     return [{**row, "seconds": decided(row)} for row in rows]
 
 
-def load(
-    project: Project, folder: Path, spp: int | None = None
-) -> tuple[analysis.Results, dict[str, Reference]]:
+def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
     """Return the results in a folder, and the references of its scenes by name.
 
-    ``spp``: the budget of comparisons; default: the largest that all have. The integrators that goals.toml
-    lists as ``aside`` are not compared. Raises ``CommandError`` if there are no results, or if errors are
-    against other references than the ``project``'s.
+    The integrators that goals.toml lists as ``aside`` are not compared. Raises ``CommandError`` if there are
+    no results, or if errors are against other references than the ``project``'s.
     """
     try:
         rows = decisive(pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist())
@@ -391,11 +388,9 @@ def load(
     goals = folder / "goals.toml"
     given = read_toml(goals) if goals.exists() else {}
     aside = list_of(goals, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
-    found = analysis.Results(rows, means, measured, tuple(aside), spp)
+    found = analysis.Results(rows, means, measured, tuple(aside))
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
             f"{goals}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
         )
-    if spp is not None:
-        _ = found.deciding  # raises for a budget that is not there
     return found, made

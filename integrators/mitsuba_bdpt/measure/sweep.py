@@ -121,10 +121,9 @@ class Bench:
 
     def spp_of(self, cell: Cell) -> int:
         """Return the samples of a cell: its budget, or those for equal time."""
-        first = self.cells.of(cell.budget, cell.seed)[0]
-        if cell.match == "spp" or cell.method == first.method:
+        if cell.match == "spp":
             return self._possible(cell.sampler, cell.budget)
-        wanted = cell.budget * self._equal(first, cell)["samples"]
+        wanted = cell.budget * self._equal(cell)["samples"]
         if cell.sampler == "independent":
             return max(round(wanted), 1)
         # Mitsuba's stratified samplers are a tenth slower per sample far from a power of two.
@@ -132,13 +131,10 @@ class Bench:
 
     def equal_time_spp(self, cell: Cell) -> int | None:
         """Return the budget at which the seconds of a cell's integrator equal the first one's, if they do."""
-        first = self.cells.of(cell.budget, cell.seed)[0]
-        if cell.match == "spp" or cell.method == first.method:
-            return None
-        return int(self._equal(first, cell)["spp"])
+        return None if cell.match == "spp" else int(self._equal(cell)["spp"])
 
-    def _equal(self, first: Cell, cell: Cell) -> dict[str, float]:
-        """Return the ``samples`` of an integrator in the time of one of the ``first``, and at which ``spp``.
+    def _equal(self, cell: Cell) -> dict[str, float]:
+        """Return the ``samples`` of an integrator in the time of one of the first, and at which ``spp``.
 
         Measured once, at the largest budget, or the largest that the limit of time allows, and kept in a
         file.
@@ -148,6 +144,7 @@ class Bench:
             one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
+                first = self.cells.of(cell.budget, cell.seed)[0]
                 budget = self._calibration_budget(first, cell)
                 if budget < largest:
                     name = f"{cell.scene}: times of {cell.method} and {first.method}"
