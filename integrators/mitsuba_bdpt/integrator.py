@@ -184,8 +184,9 @@ class BDPTIntegrator(metaclass=ABCMeta):
             render.replay()
         planner = render.planner
         confidence = planner.confidence(render.passes) if table else 0.0
-        invalid, loss = planner.lost_by_pilots(), render.explained_loss().removeprefix(UsageError.prefix)
-        text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, loss)
+        invalid = planner.lost_by_pilots()
+        warning = render.explained_warning().removeprefix(UsageError.prefix)
+        text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, warning)
         if spp is None and is_open(render.plan, self.settings):
             return (
                 f"{text}\nno spp given: this is the plan before the pilot; with spp=..., the scene or a "

@@ -50,7 +50,7 @@ def render_of(scene, spp=64, **parameters):
 
 def lost_in(scene, spp=64, **parameters):
     """The light that such a render lacks, None if it is not looked for or there is none."""
-    return render_of(scene, spp, **parameters)._lost()
+    return render_of(scene, spp, **parameters)._unsampled()
 
 
 def share_of(lost):
@@ -60,7 +60,7 @@ def share_of(lost):
 def said(scene, mean=MEAN, spp=64, **parameters):
     """The warning about an image of this ``mean``."""
     render = render_of(scene, spp, **parameters)
-    lost = render._lost()
+    lost = render._unsampled()
     if lost is None:
         return ""
     shares = unsampled_light.shares(lost, mean)
@@ -373,7 +373,7 @@ def test_lenses_seldom_met_are_no_excuse():
 def test_merging_finds_it():
     """Expected: nothing is missing with merging."""
     ball = {"type": "sphere", "bsdf": frosted(0.01)}
-    assert render_of(slab({"type": "dielectric"}, ball=ball), merging=True)._lost() is None
+    assert render_of(slab({"type": "dielectric"}, ball=ball), merging=True)._unsampled() is None
 
 
 def test_a_timeout_bounds_the_samples(monkeypatch):

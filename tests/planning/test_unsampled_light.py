@@ -556,7 +556,7 @@ def test_each_render_of_a_scene_has_its_own_hidden_emitters():
     found = []
     for hidden in (False, True):
         render = Render(scene, scene.sensors()[0], bdpt(hide_emitters=hidden).settings, 0, 16)
-        lost = render._lost()
+        lost = render._unsampled()
         found.append(sum(lost.radiance.values()) if lost else 0.0)
     render = Render(alone, alone.sensors()[0], bdpt().settings, 0, 16)
     expected = unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance

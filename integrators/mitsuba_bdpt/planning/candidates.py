@@ -33,7 +33,7 @@ LEFT_OUT = [
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
     """Those of `CANDIDATES` that sample the light that ``full`` samples."""
 
-    def lost_without_arrival(plan: Plan) -> tuple[UnsampledPaths, ...]:
+    def without_arrival(plan: Plan) -> tuple[UnsampledPaths, ...]:
         """Paths that are not sampled, when neither t = 0 nor merging counts.
 
         A small lens rarely samples such paths, and merging is not unbiased: neither replaces connections.
@@ -43,9 +43,9 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
     def is_possible(candidate: Configuration) -> bool:
         if candidate.connections != "none" and full.connections == "none":
             return False
-        return (candidate.light_paths > 0 or not tied) and lost_without_arrival(candidate.plan(full)) == lost
+        return (candidate.light_paths > 0 or not tied) and without_arrival(candidate.plan(full)) == unsampled
 
-    lost = lost_without_arrival(full)
+    unsampled = without_arrival(full)
     # A sensor with area sees delta emitters only by light subpaths.
     tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
     return [candidate for candidate in CANDIDATES if is_possible(candidate)]

@@ -24,13 +24,13 @@ _RESTS = {
 }
 
 
-def words(lost: UnsampledPaths) -> str:
+def words(unsampled: UnsampledPaths) -> str:
     """Describe paths that no strategy in use can sample, from the emitter to the sensor."""
-    starts = " or ".join(_STARTS[start] for start in lost.starts)
-    where = " (on a surface or in a medium)" if lost.volumes else ""
-    share = "; an estimate of its share leaves out vertices in media" if lost.volumes else ""
-    rest = _RESTS[lost.rest].format(longest=lost.longest, where=where, share=share)
-    return f"{starts} - {rest} (needs {lost.needs})" if lost.needs else f"{starts} - {rest}"
+    starts = " or ".join(_STARTS[start] for start in unsampled.starts)
+    where = " (on a surface or in a medium)" if unsampled.volumes else ""
+    share = "; an estimate of its share leaves out vertices in media" if unsampled.volumes else ""
+    rest = _RESTS[unsampled.rest].format(longest=unsampled.longest, where=where, share=share)
+    return f"{starts} - {rest} (needs {unsampled.needs})" if unsampled.needs else f"{starts} - {rest}"
 
 
 def fraction(light_paths: float) -> str:
@@ -87,7 +87,7 @@ def explain(
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
-    lines += [f"not sampled: {words(lost)}" for lost in unsampled_paths(prepared, p, settings)]
+    lines += [f"not sampled: {words(unsampled)}" for unsampled in unsampled_paths(prepared, p, settings)]
     if not_sampled:
         lines.append(not_sampled)
     if prepared.emitters.evaluated:

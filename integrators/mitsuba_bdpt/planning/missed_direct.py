@@ -37,8 +37,8 @@ HITTING = 1 << 18
 
 def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
     """Warnings about such light, direct and by delta events; empty if all is sampled."""
-    lost = [paths for paths in unsampled_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
-    return [_warning(prepared, plan, settings, findings, paths) for paths in lost]
+    unsampled = [paths for paths in unsampled_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
+    return [_warning(prepared, plan, settings, findings, paths) for paths in unsampled]
 
 
 def _warning(prepared, plan, settings, findings, paths: UnsampledPaths) -> str:

@@ -272,12 +272,12 @@ class Planner:
         for decision in self._settings.decisions or ():
             if decision.first_pass == len(passes):
                 self.adopt(decision, replayed(decision))
-                before = self._lost(self.full)
-                for lost in self._lost(self.plan):
-                    if lost not in before:
-                        mi.Log(mi.LogLevel.Warn, f"bdpt: by decisions, not sampled: {words(lost)}")
+                before = self._unsampled(self.full)
+                for unsampled in self._unsampled(self.plan):
+                    if unsampled not in before:
+                        mi.Log(mi.LogLevel.Warn, f"bdpt: by decisions, not sampled: {words(unsampled)}")
 
-    def _lost(self, p: Plan):
+    def _unsampled(self, p: Plan):
         return unsampled_paths(self._prepared, p, self._settings)
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):

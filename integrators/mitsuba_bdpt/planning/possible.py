@@ -256,27 +256,27 @@ def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tup
     `explain.words` describes them.
     """
     emitters, camera = prepared.emitters, prepared.camera
-    lost: list[UnsampledPaths] = []
+    unsampled: list[UnsampledPaths] = []
     deltas = prepared.delta and emitters.unhittable
     starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
     if not p.arrival:  # t = 0 samples all that follow
         for start in starts:
             if not p.splat:
-                lost.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "t=1"))
+                unsampled.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "t=1"))
             if p.connections == "none":
-                lost.append(UnsampledPaths((start,), Rest.VERTICES, "inner connections"))
+                unsampled.append(UnsampledPaths((start,), Rest.VERTICES, "inner connections"))
         if deltas:
-            lost.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
+            unsampled.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
         if not camera.delta and starts:
-            lost.append(UnsampledPaths(starts, Rest.SENSOR, "t=0"))
-        # With hide_emitters this light is hidden, not lost.
+            unsampled.append(UnsampledPaths(starts, Rest.SENSOR, "t=0"))
+        # With hide_emitters this light is hidden on purpose.
         direct = bool(emitters.unhittable_connectible) and not settings.hide_emitters
         if direct and not camera.delta and not p.endpoints and settings.max_depth:
-            lost.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
+            unsampled.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
-        lost.append(UnsampledPaths(starts, Rest.LONG, longest=longest))
+        unsampled.append(UnsampledPaths(starts, Rest.LONG, longest=longest))
     if p.merging:  # samples all paths with a vertex for merging
-        lost = [paths for paths in lost if paths.rest in (Rest.SENSOR, Rest.LONG)]
+        unsampled = [paths for paths in unsampled if paths.rest in (Rest.SENSOR, Rest.LONG)]
     volumes = prepared.space is not None and prepared.space.media.scatters
-    return tuple(replace(paths, volumes=volumes) for paths in lost)
+    return tuple(replace(paths, volumes=volumes) for paths in unsampled)

@@ -111,8 +111,9 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return True
     if plan.arrival:
         return False
-    lost = unsampled_paths(prepared, plan, settings)  # light without a vertex in between: `missed_direct`
-    return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in lost)
+    # Light without a vertex in between is left to `missed_direct`.
+    unsampled = unsampled_paths(prepared, plan, settings)
+    return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in unsampled)
 
 
 def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
@@ -231,25 +232,25 @@ def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
-def shares(lost: UnsampledLight, mean: float) -> dict[int, float]:
+def shares(unsampled: UnsampledLight, mean: float) -> dict[int, float]:
     """Shares of the image's light by emitter index.
 
     ``mean`` of the image's brightest colour, which includes light that is not absent.
     """
-    size = sum(lost.radiance.values())
-    whole = max(mean + lost.never * size, size)
-    return {i: radiance / whole for i, radiance in lost.radiance.items()}
+    size = sum(unsampled.radiance.values())
+    whole = max(mean + unsampled.never * size, size)
+    return {i: radiance / whole for i, radiance in unsampled.radiance.items()}
 
 
-def predicted_shares(lost: UnsampledLight, mean: float) -> dict[int, float]:
+def predicted_shares(unsampled: UnsampledLight, mean: float) -> dict[int, float]:
     """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light."""
-    share = lost.intensity / (mean + (1 + lost.few) * lost.intensity)
-    whole = sum(lost.radiance.values())
-    return {i: share * radiance / whole for i, radiance in lost.radiance.items()}
+    share = unsampled.intensity / (mean + (1 + unsampled.few) * unsampled.intensity)
+    whole = sum(unsampled.radiance.values())
+    return {i: share * radiance / whole for i, radiance in unsampled.radiance.items()}
 
 
 def in_words(
-    prepared: PreparedScene, plan: Plan, shares: dict[int, float], lost: UnsampledLight, samples: int
+    prepared: PreparedScene, plan: Plan, shares: dict[int, float], unsampled: UnsampledLight, samples: int
 ) -> str:
     """Warning about unsampled light with its remedy; empty where it is not worth a word.
 
@@ -259,28 +260,28 @@ def in_words(
     if all_of_it < WORTH_A_WORD:
         return ""
     share = "nearly all" if all_of_it > 0.99 else f"about {100 * all_of_it:.0f} %"
-    return _in_words(prepared, plan, shares, lost, samples, f"{share} of the image's light")
+    return _in_words(prepared, plan, shares, unsampled, samples, f"{share} of the image's light")
 
 
 def explained(
-    prepared: PreparedScene, plan: Plan, lost: UnsampledLight, samples: int, mean: float | None
+    prepared: PreparedScene, plan: Plan, unsampled: UnsampledLight, samples: int, mean: float | None
 ) -> str:
     """`in_words` of undersampled light of any share; its radiance if the image's ``mean`` is not known."""
-    if not lost.is_undersampled:
+    if not unsampled.is_undersampled:
         return ""
-    shares = lost.radiance if mean is None else predicted_shares(lost, mean)
+    shares = unsampled.radiance if mean is None else predicted_shares(unsampled, mean)
     all_of_it = sum(shares.values())
     share = f"light of mean radiance {all_of_it:.2g}"
     if mean is not None:
         share = f"{max(100 * all_of_it, 0.01):.2g} % of the image's light"
-    return _in_words(prepared, plan, shares, lost, samples, share)
+    return _in_words(prepared, plan, shares, unsampled, samples, share)
 
 
 def _in_words(
     prepared: PreparedScene,
     plan: Plan,
     parts: dict[int, float],
-    lost: UnsampledLight,
+    unsampled: UnsampledLight,
     samples: int,
     share: str,
 ) -> str:
@@ -290,15 +291,15 @@ def _in_words(
     least = WORTH_A_WORD * sum(parts.values())
     lamps = [emitters[i] for i in order if parts[i] >= least][:NAMED]
     what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
-    if lost.is_undersampled:
+    if unsampled.is_undersampled:
         remedy = _remedy(prepared, lamps)
         if not plan.splat and prepared.camera.connectible:
             remedy = f"leave light_paths and decisions to the integrator, {remedy}"
-        return f"bdpt: undersampled, {share}: {_undersampled(what, lost, samples, remedy)}"
+        return f"bdpt: undersampled, {share}: {_undersampled(what, unsampled, samples, remedy)}"
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
-        what += f" on what is seen through {' and '.join(lost.through) or 'them'}"
+        what += f" on what is seen through {' and '.join(unsampled.through) or 'them'}"
     elif not prepared.camera.connectible:
         why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
@@ -307,12 +308,12 @@ def _in_words(
     return f"bdpt: not sampled, {share}: {what} ({why}); {remedy}"
 
 
-def _undersampled(what: str, lost: UnsampledLight, samples: int, remedy: str) -> str:
+def _undersampled(what: str, unsampled: UnsampledLight, samples: int, remedy: str) -> str:
     """The rest of the warning about light of which a few samples are expected."""
-    objects = " and ".join(lost.sharp)
+    objects = " and ".join(unsampled.sharp)
     off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
     why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
-    rougher = f"or make the {'surface' if len(lost.sharp) == 1 else 'surfaces'} rougher"
+    rougher = f"or make the {'surface' if len(unsampled.sharp) == 1 else 'surfaces'} rougher"
     return f"{what} through or {off} connections rarely sample ({why}); {remedy}, {rougher}"
 
 

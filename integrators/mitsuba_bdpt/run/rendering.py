@@ -148,7 +148,7 @@ class Render:
                     break
                 self._decide_again()
                 if not number:
-                    messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_loss())
+                    messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
                     missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
                     for text in filter(None, missed):
                         warn_once(self.prepared.scene, self.sensor, text)
@@ -229,7 +229,7 @@ class Render:
             decisions = self.settings.decisions
             known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
-            wanted = long and not known and (self._plays_roulette() or self._lost() is not None)
+            wanted = long and not known and (self._plays_roulette() or self._unsampled() is not None)
             self._small_first = bool(wanted)
         earlier = sum(self.passes)
         for step in schedule(self.spp, self._longest, self.settings, self._small_first):
@@ -366,15 +366,15 @@ class Render:
 
         Warns of large shares, once per scene and plan.
         """
-        lost = self._lost() if self.passes else None
-        if lost is None:
+        unsampled = self._unsampled() if self.passes else None
+        if unsampled is None:
             return {}
-        shares = unsampled_light.shares(lost, number(self.accumulator.mean()))
-        text = unsampled_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+        shares = unsampled_light.shares(unsampled, number(self.accumulator.mean()))
+        text = unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
         messages.warn_of_unsampled_light(self.prepared, self.plan, text)
         return shares
 
-    def _lost(self) -> UnsampledLight | None:
+    def _unsampled(self) -> UnsampledLight | None:
         """Return the unsampled light transport; None if there is none.
 
         Estimated once per scene and plan, and again after edits.
@@ -385,31 +385,31 @@ class Render:
         samples = self._samples()
         look = partial(unsampled_light.estimate, prepared, plan, settings, samples)
         key = unsampled_light.key(prepared, plan, settings, samples)
-        lost, _ = self.findings.find("unsampled light", key, look)
-        return lost if lost.colours else None
+        unsampled, _ = self.findings.find("unsampled light", key, look)
+        return unsampled if unsampled.colours else None
 
-    def predicted_loss(self) -> str:
+    def predicted_warning(self) -> str:
         """Return the warning about unsampled light before the first pass.
 
         Empty if there is none, or if no decision has estimated the image's mean.
         """
         mean = self._predicted_mean()
-        lost = None if mean is None else self._lost()
-        if lost is None:
+        unsampled = None if mean is None else self._unsampled()
+        if unsampled is None:
             return ""
-        shares = unsampled_light.predicted_shares(lost, mean)
-        return unsampled_light.in_words(self.prepared, self.plan, shares, lost, self._samples())
+        shares = unsampled_light.predicted_shares(unsampled, mean)
+        return unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
 
-    def explained_loss(self) -> str:
-        """Return `predicted_loss`, or what is undersampled though there is no warning."""
-        if text := self.predicted_loss():
+    def explained_warning(self) -> str:
+        """Return `predicted_warning`, or what is undersampled though there is no warning."""
+        if text := self.predicted_warning():
             return text
         undersampled = unsampled_light.is_undersampling_possible(self.prepared, self.settings)
-        lost = self._lost() if undersampled else None
-        if lost is None:
+        unsampled = self._unsampled() if undersampled else None
+        if unsampled is None:
             return ""
         mean = self._predicted_mean()
-        return unsampled_light.explained(self.prepared, self.plan, lost, self._samples(), mean)
+        return unsampled_light.explained(self.prepared, self.plan, unsampled, self._samples(), mean)
 
     def _predicted_mean(self) -> float | None:
         """Return the image's mean as the last decision has estimated it, None if none has."""
