@@ -184,16 +184,21 @@ def test_what_cannot_be_measured_is_named(here, call, words):
         call()
 
 
-def test_a_reference_of_another_dictionary_is_refused_with_the_call_that_makes_it(here):
-    """Expected: under one name, that of an edited scene is none."""
+def test_a_reference_of_another_dictionary_is_made_anew(here, capsys):
+    """Expected: under one name, that of an edited scene is none; the call that makes it better is named, with
+    its limit of time."""
     common = {"project": "project", "resolution": 8, "spp": 4}
     measure.make_reference(measure.SceneDict("mine", room()), seconds=0, **common)
     edited = room()
     edited["walls"]["radius"] = 6
-    with pytest.raises(
-        ValueError, match=r"measure.make_reference\(SceneDict\('mine', ...\), resolution=8, max_d"
-    ):
-        measure.compare_integrators(measure.SceneDict("mine", edited), "bdpt", "path", pairs=1, **common)
+    mine = measure.SceneDict("mine", edited)
+    measure.compare_integrators(mine, "bdpt", "path", pairs=1, reference_seconds=0, **common)
+    said = capsys.readouterr().out
+    assert (
+        "mine: the scene has changed since its reference at 8 and depth 3 was made; making one anew" in said
+    )
+    call = "measure.make_reference(SceneDict('mine', ...), resolution=8, max_depth=3, spp=4, seconds=600)"
+    assert call in said and Path("project/references/mine_8_3_earlier.exr").is_file()
 
 
 @pytest.mark.parametrize("name", ["reference", "compare", "equal-time", "pyramid", "sweep"])

@@ -353,8 +353,9 @@ def test_wide_scenes_stay_wide():
 
 
 def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
-    """Expected: the command that makes the reference is named."""
-    command = f"mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --project {project.root}"
+    """Expected: the command that makes the reference is named, with its limit of time."""
+    command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --seconds 600 "
+    command += f"--project {project.root}"
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
         reference_of(project, 2)
     making.make(job(2, seconds=0))
@@ -508,8 +509,7 @@ def test_ctrl_c_ends_a_sweep(folder, job, swept):
 
 
 def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
-    """Expected: a sweep makes those of its references that are missing before it renders anything; one that
-    cannot judge, since it is of another scene, it names before that too, and leaves it as it is."""
+    """Expected: a sweep makes those of its references that are missing before it renders anything."""
     words, began = (preset_file(folder), "-o", folder / "out"), []
 
     measured = sweep.measure
@@ -520,16 +520,46 @@ def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
 
     monkeypatch.setattr(sweep, "measure", measure)
     assert swept(*words) == 0 and began == [True] * 8
-    for file in (folder / "out" / "cells").iterdir():
-        file.unlink()
-    kept = reference_of(project, 3)
-    path = reference.reference_path(project, "cornell_box", 8, 3)
-    reference.write(path, replace(kept, provenance=kept.provenance | {"scene_sha256": "of another"}))
-    before = path.read_bytes()
-    monkeypatch.setattr(sweep, "measure", None)
-    with pytest.raises(ValueError, match="was made of another cornell_box, mesh or texture; mitsuba"):
-        swept(*words)
-    assert path.read_bytes() == before
+
+
+def test_a_reference_of_a_version_before_is_kept(project, job, monkeypatch, capsys):
+    """Rationale: an edit stopped the sweep, and the command that it named replaced a reference of hours.
+    Expected: the reference of the version before lies beside the new one, one of them at most: that with the
+    smallest error; it is used again, bit by bit, when the scene is reverted, also where the new one is
+    missing, and its place taken by the last."""
+    making.make(job(2))
+    path, sha256 = reference.reference_path(project, "cornell_box", 8, 2), scenes.SceneFile.sha256
+    best, earlier = path.read_bytes(), reference.earlier_path(path)
+    made = []
+    for version in ("second", "third"):
+        monkeypatch.setattr(scenes.SceneFile, "sha256", version)
+        assert making.obtained(job(2, seconds=0)).provenance["scene_sha256"] == version
+        made.append(path.read_bytes())
+        said = capsys.readouterr().out
+        assert (
+            "cornell_box: the scene has changed since its reference at 8 and depth 2 was made; making" in said
+        )
+        assert "_8_2_earlier.exr', and used again if the scene is reverted" in said
+        assert earlier.read_bytes() == best and len(list(project.references.glob("*.exr"))) == 2
+    assert "better than the last, stays" in said
+    monkeypatch.setattr(scenes.SceneFile, "sha256", sha256)
+    for _ in range(2):
+        assert making.obtained(job(2, seconds=0)).error < 1e-3 and path.read_bytes() == best
+        assert earlier.read_bytes() == made[1]
+    assert capsys.readouterr().out == "cornell_box: again the scene of its earlier reference, which is used\n"
+    path.replace(earlier)
+    making.make(job(2, seconds=0))
+    assert not earlier.exists() and reference_of(project, 2).provenance["scene_sha256"] == job(2).scene_sha256
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "references").glob("*.exr")), ids=lambda path: path.stem)
+def test_committed_references_are_of_their_scenes(path):
+    """Rationale: after an edit of a scene `make sweep` makes a reference anew, in ten minutes, not hours,
+    and keeps the other beside it. Expected: neither is committed by accident."""
+    kept = reference.header_of(path)
+    name = path.stem.rsplit("_", 2)[0]
+    assert kept["scene_sha256"] == REPOSITORY.scene(name).sha256
+    assert kept.get("spp_per_render", making.PASS_SPP) == making.PASS_SPP
 
 
 def test_files_are_replaced_at_once(folder, monkeypatch):
@@ -641,11 +671,11 @@ def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
 
 
 def test_a_plugin_that_does_not_exist_is_refused(folder, job, swept):
-    """Expected: before anything is rendered, by the name of the integrator."""
+    """Expected: before anything is rendered, by the name of the integrator, and no folder is left."""
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "no_such_plugin"\nname = "bad"'))
     with pytest.raises(CommandError, match="integrator 'bad': .*no_such_plugin"):
         swept(path, "-o", folder / "out")
-    assert not (folder / "out" / "cells").exists()
+    assert not (folder / "out").exists()
 
 
 KILLED = """
@@ -1170,7 +1200,8 @@ def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
 def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
     """Rationale: at the largest budget it took longer than the whole limit. Expected: of budgets to 400
     samples, 1.25 ms each of both integrators and four renders, a quarter of the limit allows 4 (16 ms
-    of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit); a note says so."""
+    of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit); a message says so,
+    from the rows, so that it comes after each run."""
     text = PRESET.replace("[2, 4]", "[4, 40, 400]")
     preset = read_preset(preset_file(folder, text), REPOSITORY)
     cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
@@ -1178,12 +1209,17 @@ def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch
     monkeypatch.setattr(Clock, "compile_seconds", lambda self, cell, spp: None)
     for seconds, budget in ((0.016, 4), (1.6, 40), (None, 400)):
         bench = Clock(cells, folder / f"{budget}", seconds)
-        assert bench.spp_of(cells.of(4, 1)[1]) == 16
-        assert [f"equal at {budget} spp, the largest" in text for text in bench.notes] == [True] * (
-            budget < 400
-        )
-        assert bench.spp_of(cells.of(400, 1)[1]) == 1600 and len(bench.notes) == (budget < 400)
+        assert bench.spp_of(cells.of(4, 1)[1]) == 16 and bench.spp_of(cells.of(400, 1)[1]) == 1600
         assert [bench.equal_time_spp(cell) for cell in cells.of(4, 1)] == [None, budget]
+        rows = [
+            {"scene": cell.scene, "method": cell.method, "equal_time_spp": bench.equal_time_spp(cell)}
+            for cell in cells.planned()
+        ]
+        told = [
+            f"equal at {budget} spp, the largest that time allowed; to meas" in text
+            for text in sweep.equal_elsewhere(cells, rows)
+        ]
+        assert told == [True] * (budget < 400)
 
 
 PER = {"ours": 1e-3, "path": 0.25e-3}

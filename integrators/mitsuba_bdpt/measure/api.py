@@ -45,12 +45,13 @@ def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Ref
 
     ``options``: those of `options.MakeReference`. Returns the reference with its ``image`` and own ``error``.
     """
-    from .making import Job, make
+    from .making import Job, fitted, make
 
     asked = _options(available.MakeReference, options)
-    limits = asked.resolution, asked.max_depth, asked.spp, asked.seconds, asked.by
+    limits = asked.max_depth, asked.spp, asked.seconds, asked.by
     with _measured([scene], project) as (found, (name,)):
-        return make(Job(found, found.scene(name), *limits))[0]
+        measured = found.scene(name)
+        return make(Job(found, measured, fitted(measured, asked.resolution), *limits))[0]
 
 
 def compare_integrators(

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from .making import Job, obtained
+from .making import Job, fitted, obtained
 from .options import VARIANT, Compare
 from .project import Project
 from .record import Measured
@@ -110,7 +110,8 @@ def lines(
             )
     rows: list[list[str]] = []
     for scene in scenes:
-        job = Job(project, scene, options.resolution, None, max(options.spp), options.reference_seconds)
+        width = fitted(scene, options.resolution)
+        job = Job(project, scene, width, None, max(options.spp), options.reference_seconds)
         for way in ways:
             own = dict(way)
             sampler = own.pop("sampler", None)

@@ -20,7 +20,7 @@ from ..errors import CommandError
 from ..files.images import read_layers
 from ..files.loading import choose_sensor
 from . import crops
-from .making import Job, obtained
+from .making import Job, fitted, obtained
 from .metrics import TRIM, rel_mse
 from .options import RESOLUTION, VARIANT, EqualTime
 from .paper import check_figure
@@ -52,7 +52,8 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
     """Return scene, reference image and ``max_depth`` of the ``options``."""
     if options.reference is None:
         seconds = options.reference_seconds
-        job = Job(project, file, options.resolution or RESOLUTION, None, options.spp, seconds)
+        width = fitted(file, options.resolution or RESOLUTION)
+        job = Job(project, file, width, None, options.spp, seconds)
         target = obtained(job).image
         return file.load(job.resolution, options.sampler), target, job.depth
     (target,), _ = read_layers(options.reference, "")

@@ -43,12 +43,15 @@ from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
 from .reference import (
     Reference,
+    is_outdated,
     kept_of,
     load_reference,
     make_command,
     means_of,
+    put_aside,
     reference_path,
     source_digest,
+    take_again,
     write,
 )
 from .scenes import MeasuredScene, integrator_of, path_tracers
@@ -182,6 +185,15 @@ class Job:
         return self.max_depth or self.project.depth(self.scene)
 
     @property
+    def path(self) -> Path:
+        return reference_path(self.project, self.scene.name, self.resolution, self.depth)
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether there is no reference of this version of the scene."""
+        return not self.path.is_file() or is_outdated(self.path, self.scene_sha256)
+
+    @property
     def stored(self) -> Reference | None:
         """The stored reference; None if it is of another scene."""
         try:
@@ -191,49 +203,69 @@ class Job:
 
 
 def obtained(job: Job) -> Reference:
-    """Return the stored reference, or make it.
+    """Return the stored reference, or make it if it is missing or of another version of the scene.
 
     A new one has enough renders for a bias check, with as many samples as the time allows, and is reported
-    on standard output. Raises ``CommandError``
-    if the stored one is of another scene.
+    on standard output.
     """
-    if not reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
-        print(
-            f"{job.scene.name}: no reference at {job.resolution} and depth {job.depth} yet; making one, "
-            f"for at most about {job.seconds:g} s",
-            flush=True,
-        )
+    check(job)
+    if job.is_missing:
         made = replace(job, max_depth=job.depth, rounds=FEWEST_RUNS // 2)
         print(said(job, *make(made)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
 def check(job: Job) -> None:
-    """Raise ``CommandError``, before rendering, if a reference cannot be made or used."""
+    """Raise ``CommandError``, before rendering, if a reference cannot be made.
+
+    Takes the kept one again if the scene has become what it was, see `take_again`.
+    """
     Recipe.of(job.project, job.scene.name)
     check_size(job)
-    if reference_path(job.project, job.scene.name, job.resolution, job.depth).is_file():
-        load_reference(job.project, job.scene, job.resolution, job.depth)
+    try:
+        if take_again(job.path, job.scene_sha256):
+            print(f"{job.scene.name}: again the scene of its earlier reference, which is used", flush=True)
+        if job.is_missing:
+            job.path.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(job.path)
+    except OSError as error:
+        raise CommandError(
+            f"project={str(job.project.root)!r}: the reference of {job.scene.name} cannot be written into "
+            f"{str(job.path.parent)!r} ({error.strerror}); name another folder, for references, by --project"
+        ) from error
 
 
 def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
     Returns it, and whether it is good enough. A reference cut short by time does not replace a better one of
-    the same light.
+    the same light. One of another version of the scene is kept, see `put_aside`.
     """
+    check(job)
     recipe = Recipe.of(job.project, job.scene.name)
-    check_size(job)
-    path = reference_path(job.project, job.scene.name, job.resolution, job.depth)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(path)
+    check_writable(job.path)
+    outdated = is_outdated(job.path, job.scene_sha256)
+    if recipe.radiance is None and job.is_missing:
+        print(_announced(job, outdated), flush=True)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
     if stored is not None and stored.merged == reference.merged and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
-    write(path, reference)
+    if outdated:
+        print(f"{job.scene.name}: {put_aside(job.path)}, and used again if the scene is reverted", flush=True)
+    write(job.path, reference)
     return reference, reached
+
+
+def _announced(job: Job, outdated: bool) -> str:
+    """Return the message before a new reference is rendered."""
+    where = f"{job.resolution} and depth {job.depth}"
+    if outdated:
+        why = f"the scene has changed since its reference at {where} was made; making one anew"
+    else:
+        why = f"no reference at {where} yet; making one"
+    return f"{job.scene.name}: {why}, for at most about {job.seconds:g} s"
 
 
 def check_size(job: Job) -> None:
@@ -249,14 +281,36 @@ def check_size(job: Job) -> None:
     )
 
 
-def check_film(scene: MeasuredScene, wanted: int) -> None:
-    """Load a scene; raises ``CommandError`` if it cannot be measured at about this width."""
-    if nearest_width(scene, wanted) is None:
+def fitting_width(scene: MeasuredScene, wanted: int) -> int:
+    """Load a scene, and return the nearest width at which it can be measured, see `resized`.
+
+    Raises ``CommandError`` if there is none near.
+    """
+    found = nearest_width(scene, wanted)
+    if found is None:
         width, height = scene.size()
         raise CommandError(
             f"scene={scene.name!r} has a film of {width} x {height} pixels, which divides into {TILES} x "
             f"{TILES} tiles at no width near {wanted}; take another resolution"
         )
+    return found
+
+
+def resized(scene: MeasuredScene, wanted: int, width: int) -> list[str]:
+    """Return a message if a scene is not rendered at the width that is asked for."""
+    if width == wanted:
+        return []
+    size = " x ".join(map(str, scene.size(width)))
+    text = f"rendered with {size} pixels: resolution={wanted} does not divide it into {TILES} x {TILES} tiles"
+    return [f"{scene.name}: {text}"]
+
+
+def fitted(scene: MeasuredScene, wanted: int) -> int:
+    """Return `fitting_width`; prints a message if that is another width."""
+    width = fitting_width(scene, wanted)
+    for told in resized(scene, wanted, width):
+        print(told, flush=True)
+    return width
 
 
 def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
@@ -609,7 +663,7 @@ def run(options: Namespace) -> int:
             job = Job(
                 project,
                 scene,
-                options.resolution,
+                fitted(scene, options.resolution),
                 options.max_depth,
                 options.spp,
                 options.seconds,

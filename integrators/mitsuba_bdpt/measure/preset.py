@@ -65,7 +65,7 @@ from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from . import probes
 from .agreement import FEWEST_RUNS, TILES
-from .making import check_film, nearest_width
+from .making import fitting_width, resized
 from .options import RESOLUTION
 from .project import Project, depth_in
 from .reference import source_digest
@@ -151,12 +151,7 @@ class Preset:
 
     def resized(self) -> list[str]:
         """Return a message about each scene that is not rendered at the width that is asked for."""
-        return [
-            f"{one.name}: rendered with {' x '.join(map(str, one.scene.size(one.resolution)))} pixels: "
-            f"resolution={self.resolution} does not divide it into {TILES} x {TILES} tiles"
-            for one in self.subjects
-            if one.resolution != self.resolution
-        ]
+        return [told for one in self.subjects for told in resized(one.scene, self.resolution, one.resolution)]
 
 
 DEFAULTS: dict[str, Any] = {
@@ -240,12 +235,12 @@ def _subjects(path, data, scenes) -> tuple[tuple, tuple]:
     found, left_out = [], []
     for scene in scenes:
         try:
-            check_film(scene, data["resolution"])
+            width = fitting_width(scene, data["resolution"])
         except Exception as error:  # one scene must not cost the others
             raise_interrupt(error)
             left_out.append(f"{scene.name}: left out: {' '.join(message(error).split())}")
         else:
-            found.append(_subject(path, data, scene))
+            found.append(_subject(path, data, scene, width))
     if not found:
         raise CommandError(f"{path}: no scene can be measured: {'; '.join(left_out)}")
     return tuple(found), tuple(left_out)
@@ -298,7 +293,7 @@ def _row(path, key, value) -> tuple:
     return tuple(value)
 
 
-def _subject(path, data, scene) -> Subject:
+def _subject(path, data, scene, width: int) -> Subject:
     name = scene.name
     own = table_of(path, f"scene.{name}", data.get("scene", {}).get(name, {}))
     _check_keys(path, own, set(), {"max_depth", "spp", "seeds"}, f"[scene.{name}]")
@@ -312,7 +307,6 @@ def _subject(path, data, scene) -> Subject:
             raise CommandError(f"{path}: seeds={list(seeds)} of {name} must be as many as spp={list(spp)}")
     else:
         seeds = (whole_of(path, "seeds", seeds),) * len(spp)
-    width = nearest_width(scene, data["resolution"])
     return Subject(scene, width, depth_in(path, data, scene), spp, seeds)
 
 
@@ -466,6 +460,12 @@ class Cells:
         known = {cell.key for cell in found}
         first = [cell for seed in range(self.fewest()) for cell in self.further(seed)]
         return found + [cell for cell in first if cell.key not in known]
+
+    def possible(self) -> list[Cell]:
+        """Return these and all that [more] may add."""
+        more = range(0 if self.more is None else self.more.at_most)
+        found = {c.key: c for c in (*self.planned(), *(c for seed in more for c in self.further(seed)))}
+        return list(found.values())
 
     def where(self) -> tuple:
         """Key of the reference: project, scene, resolution, ``max_depth``."""

@@ -2,12 +2,15 @@
 
 Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
 two halves of its samples (difference.R ...), a sample of its own error, and the provenance as JSON in the
-header, with the data of bias checks. `making` makes them.
+header, with the data of bias checks. `making` makes them. Beside one may lie that of an earlier version of
+the scene, see `put_aside` and `take_again`.
 """
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError
-from ..files.images import read_layers, write_layers
+from ..files.images import attribute, read_layers, write_layers
 from .agreement import Means, Sample
 from .metrics import reference_rel_mse, rel_mse
+from .options import REFERENCE_SECONDS
 from .project import Project
 from .scenes import MeasuredScene, digest
 
@@ -61,11 +65,12 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
 
 
 def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """Return the command line that makes or refines the reference of a scene.
+    """Return the command line that makes or refines the reference of a scene, with its limit of time.
 
     ``called``: the scene's name; for a dictionary, returns the call in Python. ``more``: further options and
     their values.
     """
+    more = *more, "--seconds", f"{REFERENCE_SECONDS:g}"
     if called in project.given:
         options = {"resolution": resolution, "max_depth": max_depth} | dict(
             zip((name.strip("-") for name in more[::2]), more[1::2], strict=True)
@@ -96,6 +101,58 @@ def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_
             f"the reference {path.name} was made of another {scene.name}, mesh or texture; {make}"
         )
     return found
+
+
+def earlier_path(path: Path) -> Path:
+    """Return where the reference of an earlier version of a scene is kept."""
+    return path.with_name(f"{path.stem}_earlier{path.suffix}")
+
+
+def header_of(path: Path) -> dict[str, Any]:
+    """Return the provenance in the header of a reference; empty if the file is missing or no reference."""
+    try:
+        return json.loads(attribute(path, "provenance") or "{}")
+    except ValueError:
+        return {}
+
+
+def is_outdated(path: Path, scene_sha256: str) -> bool:
+    """Return whether the reference is of another version of the scene."""
+    return header_of(path).get("scene_sha256", scene_sha256) != scene_sha256
+
+
+def take_again(path: Path, scene_sha256: str) -> bool:
+    """Exchange a missing or outdated reference with the kept one if that is of this version of the scene.
+
+    Returns whether it is.
+    """
+    earlier = earlier_path(path)
+    if header_of(earlier).get("scene_sha256") != scene_sha256:
+        return False
+    if not path.exists():
+        os.replace(earlier, path)
+    elif is_outdated(path, scene_sha256):
+        between = path.with_name(f".{path.name}.tmp")
+        os.replace(path, between)
+        os.replace(earlier, path)
+        os.replace(between, earlier)
+    else:
+        return False
+    return True
+
+
+def put_aside(path: Path) -> str:
+    """Move an outdated reference to `earlier_path`, and describe that.
+
+    Of two the one with the smaller error stays, which took longer.
+    """
+    earlier = earlier_path(path)
+    kept, last = (header_of(file).get("rel_mse", math.inf) for file in (earlier, path))
+    if kept < last:
+        path.unlink()
+        return f"the reference of a version before, better than the last, stays in {str(earlier)!r}"
+    os.replace(path, earlier)
+    return f"the reference before is kept in {str(earlier)!r}"
 
 
 def too_few(name: str, make: str) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.texts import list_of, read_toml, text_of, write_text
-from ..files.whole import check_own
+from ..files.whole import check_own, check_writable
 from . import figures
 from .agreement import BiasCheck
 from .analysis import (
@@ -845,6 +845,13 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
     found = Report.of(project, folder, options.spp)
+    try:
+        check_writable(folder / "README.md")
+    except OSError as error:
+        raise CommandError(
+            f"folder={str(folder)!r} cannot be written ({error.strerror}), which has the report; copy it to "
+            "where it can, or change its rights"
+        ) from error
     write_text(folder / "README.md", found.text())
     found.draw(folder)
     if options.readme:

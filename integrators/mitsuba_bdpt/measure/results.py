@@ -46,6 +46,53 @@ def image_file(output: Path, cell: Cell) -> Path:
     return output / "images" / cell.scene / f"{cell.key}.exr"
 
 
+def earlier_folder(output: Path) -> Path:
+    """Return the folder of the renders of earlier versions of scenes, see `set_apart`."""
+    return output / "earlier"
+
+
+def _move(scene: str, key: str, source: Path, target: Path) -> None:
+    """Move a cell's files from a folder to another, the cell last, by which an interrupted move goes on."""
+    for file in (f"images/{scene}/{key}.exr", f"first/{key}.json", f"cells/{key}.json"):
+        if (source / file).exists():
+            (target / file).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source / file, target / file)
+
+
+def set_apart(cells: Cells, table: Sequence[Row], output: Path) -> None:
+    """Move the renders of other versions of a scene that has rows in the ``table`` to `earlier_folder`.
+
+    With their images' names; prints how many.
+    """
+    name, now, count = cells.subject.name, cells.common["scene_sha256"], 0
+    if not any(row["scene"] == name for row in table):
+        return
+    for file in sorted((output / "cells").glob("*.json")):
+        try:
+            row = read_json(file, "")
+        except CommandError:  # damaged: `rows` says so
+            continue
+        if row["scene"] == name and row["scene_sha256"] != now:
+            _move(name, file.stem, output, earlier_folder(output))
+            (output / "images" / named_image(row)).unlink(missing_ok=True)
+            count += 1
+    if count:
+        print(
+            f"{name}: the scene has changed: {count} renders of it before are no longer in the tables; they "
+            f"are in {earlier_folder(output)}, and used again if it is reverted"
+        )
+
+
+def take_back(cells: Cells, output: Path) -> None:
+    """Move the renders of a scene that are in `earlier_folder` back; prints how many."""
+    earlier = earlier_folder(output)
+    found = [cell for cell in cells.possible() if cell_file(earlier, cell).exists()]
+    for cell in found:
+        _move(cell.scene, cell.key, earlier, output)
+    if found:
+        print(f"{cells.subject.name}: again the scene of {len(found)} renders in {earlier}, which are used")
+
+
 def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
     """Return a reference, and the SHA-256 of its file, computed before reading.
 
@@ -128,11 +175,9 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
 
     Cells are those that were rendered: a source edited meanwhile changes their names.
     """
-    wanted = {c.key: c for c in cells.planned()}
-    if cells.more is not None:
-        wanted |= {c.key: c for s in range(cells.more.at_most) for c in cells.further(s)}
-    found = read_rows(output, cells, wanted.values())
-    spreads = _spreads(output, cells, list(wanted.values()), found) if found else {}
+    wanted = cells.possible()
+    found = read_rows(output, cells, wanted)
+    spreads = _spreads(output, cells, wanted, found) if found else {}
     first = {c.method: _first_image(output, c) for c in cells.of(min(cells.subject.spp), FIRST_SEED)}
     for row in found:
         row |= {"spread": spreads[row["key"]], "first": preset.methods[0].name}
@@ -198,16 +243,21 @@ def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[
 
 
 def lost(table: list[Row], output: Path) -> list[str]:
-    """Return messages about stored rows whose render is not among those of the ``table``."""
+    """Return messages about stored rows whose render is not among those of the ``table``.
+
+    Except for those of other versions of its scenes, see `set_apart`.
+    """
     file = output / "rows.parquet"
     if not table or not file.exists():
         return []
     keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
     try:
-        before = pyarrow.parquet.read_table(file, columns=keys).to_pylist()
+        before = pyarrow.parquet.read_table(file, columns=[*keys, "scene_sha256"]).to_pylist()
     except pyarrow.ArrowInvalid:  # damaged: it is written anew
         return []
     kept = {tuple(row[key] for key in keys) for row in table}
+    versions = {row["scene"]: row["scene_sha256"] for row in table}
+    before = [row for row in before if versions.get(row["scene"], row["scene_sha256"]) == row["scene_sha256"]]
     gone = [row for row in before if tuple(row[key] for key in keys) not in kept]
     if not gone:
         return []

@@ -21,6 +21,7 @@ import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, lru_cache, partial
 from itertools import groupby
@@ -57,7 +58,9 @@ from .results import (
     lost,
     read_rows,
     rows,
+    set_apart,
     store,
+    take_back,
     write_tables,
 )
 from .scenes import check_plugins, integrator_of
@@ -72,11 +75,11 @@ ROOM = 1.25  # times the predicted seconds of what was cut, in the advice of how
 class Bench:
     """Loaded scenes and integrators of one scene's cells, with compiled kernels.
 
-    ``seconds``: limit of the time for all its renders. ``notes``: of what that limits, besides renders.
+    ``seconds``: limit of the time for all its renders.
     """
 
     def __init__(self, cells: Cells, output: Path, seconds: float | None = None):
-        self.cells, self.output, self.seconds, self.notes = cells, output, seconds, list[str]()
+        self.cells, self.output, self.seconds = cells, output, seconds
         _, self._file, self._resolution, self._depth = cells.where()
         self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
 
@@ -140,15 +143,11 @@ class Bench:
         file.
         """
         if cell.method not in self._spp:
-            largest = max(self.cells.subject.spp)
-            one = next(c for c in self.cells.of(largest, 0) if c.method == cell.method)
+            one = next(c for c in self.cells.of(max(self.cells.subject.spp), 0) if c.method == cell.method)
             kept = self.output / "ratios" / f"{one.key}.json"
             if not kept.exists():
                 first = self.cells.of(cell.budget, cell.seed)[0]
                 budget = self._calibration_budget(first, cell)
-                if budget < largest:
-                    name = f"{cell.scene}: times of {cell.method} and {first.method}"
-                    self.notes.append(f"{name} are equal at {budget} spp, the largest that time allowed")
                 write_json(kept, {"samples": self._time_ratio(first, cell, budget), "spp": budget})
             self._spp[cell.method] = read_json(kept, "delete it, to measure it anew")
         return self._spp[cell.method]
@@ -260,39 +259,48 @@ class Sweep:
     """A preset being rendered into a folder.
 
     ``failed``: messages of failures; ``cut``: what was left out for lack of time, by scene; ``wanted``: the
-    seconds that it needs; ``notes``: what else time did not allow.
+    seconds that it needs.
     """
 
     def __init__(self, project: Project, preset: Preset, output: Path):
         self.project, self.preset, self.output = project, preset, output
-        self.cut, self.wanted, self.notes = dict[str, str](), 0, list[str]()
+        self.cut, self.wanted = dict[str, str](), 0
         self.failed = list(preset.left_out)
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
+        for cells in self.scenes:
+            take_back(cells, output)
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
         self._progress = Renders()  # placeholder until `run`
 
+    def check(self):
+        """Raise ``CommandError`` for plugins and references that cannot be made."""
+        for cells, job in self._jobs():
+            found = {cell.method: cell for cell in cells.planned()}
+            for name, cell in found.items():
+                check_plugins(name, dict(cell.parameters), cell.sampler, cells.subject.max_depth)
+            check(job)
+
+    def _jobs(self) -> list[tuple[Cells, Job]]:
+        """Return the scenes that lack renders or their reference, with these."""
+        jobs = [Job(*cells.where(), spp=max(cells.subject.spp)) for cells in self.scenes]
+        every = zip(self.scenes, jobs, self._todo, strict=True)
+        return [(cells, job) for cells, job, missing in every if missing or job.is_missing]
+
     def prepare(self, seconds: float | None = None, limit: float | None = None):
-        """Check all cells, and make missing references, before rendering.
+        """Make the references that are missing, or of another version of their scene, before rendering.
 
         Each reference takes at most about ``seconds``, by default `REFERENCE_SECONDS`, or equal shares of
         half the ``limit``. A scene without one is skipped, and recorded in ``failed``.
         """
-        wanted = [(cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing]
-        for cells, missing in wanted:
-            for method in {cell.method: cell for cell in missing}.values():
-                check_plugins(method.method, dict(method.parameters), method.sampler, cells.subject.max_depth)
-        jobs = [Job(*cells.where(), spp=max(cells.subject.spp)) for cells, _ in wanted]
-        for job in jobs:
-            check(job)
+        wanted = self._jobs()
         if seconds is None:
-            lacking = sum(job.stored is None for job in jobs)
+            lacking = sum(job.is_missing for _, job in wanted)
             seconds = REFERENCE_SECONDS if limit is None else limit / 2 / max(lacking, 1)
-        jobs = [replace(job, seconds=seconds) for job in jobs]
         lost = []
-        for (cells, _), job in zip(wanted, jobs, strict=True):
+        for cells, job in wanted:
             try:
-                obtained(job)
+                obtained(replace(job, seconds=seconds))
             except Exception as error:
                 self._note(f"{job.scene.name}: left out", error)
                 lost.append(cells)
@@ -357,13 +365,12 @@ class Sweep:
             share = (end - time.monotonic()) / max(sharing, 1)
             done = pending[i].render(partial(self._cell, benches[i]), max(share, 0.0))
             if not pending[i].late:
-                self.notes += benches.pop(i).notes
+                del benches[i]
             return done
 
         # What a scene leaves goes to the others, until nothing more fits.
         while sum([rendered(i) for i, one in enumerate(pending) if one.late]):
             pass
-        self.notes += [text for bench in benches.values() for text in bench.notes]
         late = [one for one in pending if one.late]
         self.cut = {one.cells.subject.name: one.text for one in late}
         self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
@@ -521,6 +528,18 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     return found
 
 
+def equal_elsewhere(cells: Cells, table: list[Row]) -> list[str]:
+    """Return messages about integrators whose equal time was measured below the largest budget."""
+    name, first = cells.subject.name, cells.methods[0].name
+    at = {row["method"]: row.get("equal_time_spp") for row in analysis.select(table, scene=name)}
+    return [
+        f"{name}: times of {method} and {first} are equal at {spp} spp, the largest that time allowed; to "
+        "measure it at a larger budget, sweep into another folder (-o) with more --seconds"
+        for method, spp in at.items()
+        if spp is not None and spp < max(cells.subject.spp)
+    ]
+
+
 def short_of_target(table: list[Row]) -> list[str]:
     """Return messages about integrators that ended before the preset's target error."""
     renders = {}
@@ -549,10 +568,13 @@ def swept(
     began = time.monotonic()
     whole, output, text = _read(project, preset, options)
     _check_cluster(project, preset, whole, options)
-    check_output(output / "rows.csv", ".csv")  # fail before rendering
     for told in (*whole.left_out, *whole.resized()):
         print(told, flush=True)
     sweep = Sweep(project, whole, output)
+    sweep.check()
+    check_output(output / "rows.csv", ".csv")  # fail before rendering
+    if options.output is None:
+        print(f"rows and images go to {output}", flush=True)
     sweep.prepare(options.reference_seconds, options.seconds)
     left = None
     if options.seconds is not None:
@@ -568,11 +590,15 @@ def swept(
         table = beside(table, whole.scenes, output)
     for told in lost(table, output):
         print(f"warning: {told}")
+    for cells in sweep.scenes:
+        set_apart(cells, table, output)
     if table:
         write_tables(table, output)
     command = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
     scenes = [subject.name for subject in whole.subjects]
     keep_missing(output, scenes, sweep.cut, f"{command} --seconds {sweep.wanted}" if command else "")
+    with suppress(OSError):  # not empty
+        output.rmdir()
     _tell(sweep, table)
     late = time.monotonic() - began - (options.seconds or math.inf)
     if late > 1:
@@ -622,8 +648,8 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
-    for text in sweep.notes:
-        print(f"{text}; to measure it at a larger budget, sweep into another folder (-o) with more --seconds")
+    for text in [text for cells in sweep.scenes for text in equal_elsewhere(cells, table)]:
+        print(text)
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")
