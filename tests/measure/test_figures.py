@@ -93,15 +93,18 @@ def saved(monkeypatch, module):
     return found
 
 
-@pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (2, 5)])
+@pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (1, 4), (2, 5)])
 def test_images_stand_side_by_side(monkeypatch, columns, count):
     """Expected: of two scenes, one of them wide, a column per image and one of the reference: image, two
-    windows where the errors differ most, errors; all text readable, inside, none over another."""
+    windows where the errors differ most, errors; all text readable, inside, none over another, and no unit in
+    a line of its own."""
     found = saved(monkeypatch, crops)
     crops.draw([block(count), block(count, 16, 64, "b")], None, columns)
     (figure,) = found
     assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
     check_texts(figure)
+    texts = [text.get_text() for text in figure.texts]
+    assert not [text for text in texts if re.search(r"\n(s|spp)\b", text)]
     images = [axis for axis in figure.axes if axis.images]
     assert len(images) == 2 * (3 * (count + 1) + count)
     boxes = [axis.get_position() for axis in figure.axes]
@@ -164,12 +167,39 @@ def test_pyramids_can_be_read(monkeypatch, columns, longest):
     assert sum(bool(axis.get_title()) for axis in figure.axes) == len(keys)
 
 
-def test_a_single_panel_is_one_column_wide(monkeypatch):
-    """Rationale: one scene drew its curves into the left quarter of a white page, and the legend of two
-    columns was cut at the edge of one. Expected: 8.5 cm, all text inside."""
+def test_rows_of_a_pyramid_without_light_are_not_brightened(monkeypatch):
+    """Expected: the factor below k where a strategy of that row brings light, and k alone elsewhere."""
+    found = saved(monkeypatch, pyramid)
+    images = {(2, 0, 3): None, (2, 1, 2): None, (3, 1, 3): np.ones((9, 16, 3)), (3, 2, 2): None}
+    pyramid.draw(images, None, 0.0, 2)
+    assert [text.get_text() for text in found[0].texts] == ["$k=2$", "$k=3$\n4x"]
+
+
+def test_a_single_panel_fills_its_columns(monkeypatch):
+    """Rationale: one scene drew its curves into the left quarter of a white page, then in two columns at the
+    width of one. Expected: 17.8 cm, the panel on more than half of it, twice as wide as high, the legend
+    beside it, all text inside."""
     figure = drawn(monkeypatch, "seconds", 2, ("b",))
-    assert figure.get_size_inches()[0] * 2.54 == pytest.approx(8.5)
+    (axis,), (legend,) = figure.axes, figure.legends
+    assert figure.get_size_inches()[0] * 2.54 == pytest.approx(17.8)
+    panel, beside = axis.get_window_extent(), legend.get_window_extent()
+    assert panel.width > figure.bbox.width / 2 and 1.5 < panel.width / panel.height < 3
+    assert beside.x0 > panel.x1 and beside.y1 < panel.y1
     check_texts(figure)
+
+
+def test_a_single_budget_has_dashes_and_no_slope(monkeypatch):
+    """Rationale: a trimmed error looked like a short solid line, and the legend had a slope that was not
+    drawn. Expected: two dashes, and no slope there; both lines with two budgets."""
+    kept = results(("b",))
+    for budgets, slopes in (({64}, 0), ({16, 64}, 1)):
+        rows = [row for row in kept.rows if row["budget"] in budgets]
+        monkeypatch.setitem(globals(), "results", lambda scenes, rows=rows: replace(kept, rows=rows))
+        figure = drawn(monkeypatch, "samples", 1, ("b",))
+        assert sum("slope" in text.get_text() for text in figure.legends[0].get_texts()) == slopes
+        dashed = [line for line in figure.axes[0].lines if line.get_marker() is figures.TWO_DASHES]
+        assert len(dashed) == (0 if slopes else len(METHODS))
+    assert len(figures.TWO_DASHES.to_polygons(closed_only=False)) == 2
 
 
 def check_texts(figure):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ ERRORS = {"norm": LogNorm(1e-5, 10), "cmap": "viridis"}
 GAP, LINE = 0.03, 0.105  # inches between images, and per line of text
 SCALE = 0.48  # inches of the scale of errors, with its labels in two lines
 CHARACTER = 0.052  # inches
+NARROW = 0.75  # inches of an image below which the scale of errors has two labels
 SMALL = 6  # points
 
 
@@ -97,7 +99,9 @@ class _Layout:
         width = (wide - (count + 1) * GAP) / count
         most = max(int(width / CHARACTER), 8)
         captions = [*(column.caption for column in block.columns), ("reference",)]
-        wrapped = ["\n".join(textwrap.fill(line, most) for line in caption) for caption in captions]
+        # A number and its unit stay in one line.
+        captions = [[re.sub(r"(\d) (s|spp)\b", "\\1\u00a0\\2", line) for line in one] for one in captions]
+        wrapped = ["\n".join(textwrap.fill(line, most) for line in one) for one in captions]
         lines = max(text.count("\n") for text in wrapped) + 1
         return _Layout(width, width * block.target.shape[0] / block.target.shape[1], tuple(wrapped), lines)
 
@@ -220,6 +224,6 @@ def _bar(figure: Figure, left: float, top: float, layout: _Layout) -> None:
     bar = figure.colorbar(ScalarMappable(**ERRORS), cax=axis, orientation="horizontal")
     between = " " if layout.width > 1 else "\n"
     bar.set_label(f"squared{between}relative error", fontsize=SMALL, labelpad=0)
-    bar.set_ticks([1e-4, 1e-2, 1])
+    bar.set_ticks([1e-4, 1e-2, 1] if layout.width > NARROW else [1e-4, 1])
     bar.ax.tick_params(labelsize=SMALL, pad=1, length=2)
     bar.ax.minorticks_off()

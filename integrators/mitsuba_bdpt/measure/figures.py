@@ -16,6 +16,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
+from matplotlib.path import Path as MarkerPath
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..errors import CommandError
@@ -70,6 +71,8 @@ PANELS = {1: 2, 2: 4}
 """Scenes side by side, at most."""
 
 DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
+TWO_DASHES = MarkerPath([(-1, 0), (-0.25, 0), (0.25, 0), (1, 0)], [1, 2, 1, 2])
+SLOPE = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 0.8}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
 SHORT = 30.0  # ratio of the ends of a logarithmic axis
@@ -89,19 +92,21 @@ def convergence(
 ) -> None:
     """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene, raw and trimmed.
 
-    Medians over seeds, with the quartiles of the raw error; the dotted line has slope -1.
+    Medians over seeds, with the quartiles of the raw error; the dotted line has slope -1. A single panel in
+    two columns has the legend beside it.
     """
     scenes = scenes or results.scenes
     across = min(PANELS[columns], len(scenes)) if len(scenes) > PANELS[1] or columns == 2 else 1
-    rows = math.ceil(len(scenes) / across)
-    width = WIDTHS[columns] if across > 1 or columns == 1 else WIDTHS[1]
-    high = max(0.82 * width / across, 1.5)
+    rows, width = math.ceil(len(scenes) / across), WIDTHS[columns]
+    is_beside = columns == 2 and len(scenes) == 1
+    high = max(0.82 * (WIDTHS[1] if is_beside else width / across), 1.5)
     with plt.rc_context(PAPER):
         figure, axes = plt.subplots(
             rows, across, figsize=(width, high * rows), squeeze=False, layout="constrained"
         )
-        for scene, axis in zip(scenes, axes.flat, strict=False):
-            _curves(axis, results, scene, against)
+        sloped = [
+            _curves(axis, results, scene, against) for scene, axis in zip(scenes, axes.flat, strict=False)
+        ]
         for axis in axes.flat[len(scenes) :]:
             axis.set_axis_off()
         for i, axis in enumerate(axes.flat[: len(scenes)]):
@@ -114,13 +119,17 @@ def convergence(
         handles += [
             Line2D([], [], color="black", linestyle=DASHES[kind], label=text) for kind, text in KINDS.items()
         ]
-        handles.append(Line2D([], [], color="black", linestyle=(0, (1, 2)), linewidth=0.8, label="slope −1"))
-        _legend(figure, handles)
+        if any(sloped):
+            handles.append(Line2D([], [], label="slope −1", **SLOPE))
+        _legend(figure, handles, is_beside)
         save(figure, path)
 
 
-def _legend(figure, handles: Sequence) -> None:
-    """Put a legend under the axes, and make the figure higher by it."""
+def _legend(figure, handles: Sequence, is_beside: bool = False) -> None:
+    """Put a legend under the axes, and make the figure higher by it, or beside them."""
+    if is_beside:
+        figure.legend(handles=handles, loc="outside right center")
+        return
     longest = max(len(handle.get_label()) for handle in handles)
     width, height = figure.get_size_inches()
     across = max(1, min(len(handles), int(width / (0.4 + 0.055 * longest))))
@@ -128,8 +137,8 @@ def _legend(figure, handles: Sequence) -> None:
     figure.legend(handles=handles, loc="outside lower center", ncols=across)
 
 
-def _curves(axis, results: Results, scene: str, against: str) -> None:
-    """Plot all integrators in a scene."""
+def _curves(axis, results: Results, scene: str, against: str) -> bool:
+    """Plot all integrators in a scene; return whether there is a line of slope -1."""
     first = None
     for method in results.methods:
         for error in KINDS:
@@ -138,8 +147,8 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
                 continue
             look = style(results.methods, method) | {"linestyle": DASHES[error]}
             x, low, middle, high = points.T
-            # A single point has no line: a dash stands for a dashed one.
-            dash = {"marker": "_", "markersize": 8} if len(points) == 1 else {"marker": ""}
+            # A single point has no line: two dashes stand for a dashed one.
+            dash = {"marker": TWO_DASHES, "markersize": 9} if len(points) == 1 else {"marker": ""}
             axis.plot(x, middle, **look | (dash if error != "rel_mse" else {}))
             if error == "rel_mse":
                 axis.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
@@ -147,11 +156,13 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
                 axis.plot(x[hollow], middle[hollow], **look | {"linestyle": "", "markerfacecolor": "white"})
             first = points if first is None else first
     axis.set(xscale="log", yscale="log", title=scene)
-    if first is not None and len(first) > 1:
+    is_sloped = first is not None and len(first) > 1
+    if is_sloped:
         (x0, _, y0, _), (x1, _, _, _) = first[0], first[-1]
-        axis.plot([x0, x1], [y0, y0 * x0 / x1], color="black", linestyle=(0, (1, 2)), linewidth=0.8, zorder=1)
+        axis.plot([x0, x1], [y0, y0 * x0 / x1], zorder=1, **SLOPE)
     for side in (axis.xaxis, axis.yaxis):
         _ticks(side)
+    return is_sloped
 
 
 def _ticks(side) -> None:

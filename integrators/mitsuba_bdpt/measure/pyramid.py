@@ -83,7 +83,8 @@ def draw(found: dict, path: Path, exposure: float, columns: int = 2):
     """Draw the pyramid: a row per path length k, the strategies s = 0 ... k + 1 from left to right.
 
     Rows are centred. Strategies that are impossible or bring no light are empty frames. Rows below the last
-    with light are left out. As wide as so many ``columns`` of a page.
+    with light are left out; those without any are not labelled as brightened. As wide as so many ``columns``
+    of a page.
     """
     shape = next(image.shape for image in found.values() if image is not None)
     longest = max(k for (k, _, _), image in found.items() if image is not None)
@@ -111,7 +112,8 @@ def draw(found: dict, path: Path, exposure: float, columns: int = 2):
                 else:
                     axis.imshow(tone_map(image, exposure + k - 1), interpolation="nearest", aspect="auto")
                     axis.set_axis_off()
-            text = f"$k={k}$\n{2 ** (k - 1)}x"
+            is_lit = any(found.get((k, s, k + 1 - s)) is not None for s in range(k + 2))
+            text = f"$k={k}$\n{2 ** (k - 1)}x" if is_lit else f"$k={k}$"
             figure.text(0.02 / wide, (bottom + (high - TITLE) / 2) / tall, text, va="center")
         save(figure, path)
 
