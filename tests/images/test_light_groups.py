@@ -11,6 +11,7 @@ from media_parts import fog
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.light_groups import LightGroups
+from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
@@ -168,7 +169,7 @@ def test_each_emitter_has_its_own_group():
     target = scene()
     made = LightGroups.of(target, "auto")
     assert sorted(made.names) == sorted(LAMPS)
-    for emitter, group in zip(target.emitters(), made.of_emitters, strict=True):
+    for emitter, group in zip(in_order(target), made.of_emitters, strict=True):
         shape = emitter.get_shape()
         assert made.names[group] == (emitter if shape is None else shape).id()
     lamps = {f"lamp{i}": {"type": "point", "position": [i, 0, 0]} for i in range(12)}

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.host.introspection import matrix_of, world_matrix
 
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION
@@ -161,9 +162,10 @@ def disks_of(found) -> Disks | None:
 
 
 def lamps_of(scene) -> list[Lamp]:
-    """The scene's emitters, in Mitsuba's order."""
-    weights = np.array([float(np.array(e.sampling_weight()).ravel()[0]) for e in scene.emitters()])
-    return [_lamp(e, p) for e, p in zip(scene.emitters(), (weights / weights.sum()).tolist(), strict=True)]
+    """The scene's emitters, in the package's order."""
+    lamps = in_order(scene)
+    weights = np.array([float(np.array(e.sampling_weight()).ravel()[0]) for e in lamps])
+    return [_lamp(e, p) for e, p in zip(lamps, (weights / weights.sum()).tolist(), strict=True)]
 
 
 def _lamp(emitter, probability) -> Lamp:

@@ -14,6 +14,7 @@ import numpy as np
 from mitsuba_bdpt.emitters.area import PLAIN
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.infinite import SKY_BINS
+from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.geometry.smooth_meshes import is_flat
@@ -106,7 +107,7 @@ class Tables:
     def __init__(self, scene, tables):
         self.tables, self.side = tables.densities(), tables.side
         world = Emitters(scene)
-        self.emitters, self.counts, self.disks = scene.emitters(), world.tables, world.disks
+        self.emitters, self.counts, self.disks = world.objects, world.tables, world.disks
 
     def second(self, number, own, x1, d):
         """That of x_1 from the emitter ``number``, whose ``own`` density it is without tables."""
@@ -339,9 +340,10 @@ class Capture(Observer):
         if s >= 2 or (s, t) == (1, 1):
             found = np.array(self.emission.index)
         elif s == 1:
-            found = np.array(self.scene.sample_emitter(self.endpoint[s, t].x)[0])
+            chosen, _ = Emitters(self.scene)._select(self.endpoint[s, t].x, mi.Bool(True))
+            found = np.array(chosen.index)
         else:
-            pointers = np.array(dr.reinterpret_array(mi.UInt32, self.scene.emitters_dr()))
+            pointers = np.array(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(in_order(self.scene))))
             hit = self.walked["camera"].vertices[t - 2].si.emitter(self.scene)
             ids = np.array(dr.reinterpret_array(mi.UInt32, hit))
             found = np.argmax(ids[:, None] == pointers, axis=1)

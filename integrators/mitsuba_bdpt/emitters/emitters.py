@@ -22,6 +22,7 @@ from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party
+from .order import in_order
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .tables import Mask, inverse_table
 
@@ -32,7 +33,7 @@ class Emitters:
     Built for each render, so that edits of the scene count. Raises ``UsageError`` and ``UnsupportedError``
     for emitters for which Mitsuba's own sampling and evaluation disagree.
 
-    Properties of the scene's ``count`` emitters:
+    Properties of the scene's ``count`` emitters, ``objects`` by index (see `order.in_order`):
 
     * ``hittable``, ``unhittable``: camera subpaths can hit one; cannot hit one.
     * ``direct``, ``traced``: next-event estimation, light subpaths can choose one.
@@ -52,7 +53,7 @@ class Emitters:
         self.scene = scene
         facts = facts or ShapeFacts(scene)
         self.shape_errors = facts.errors
-        emitters = scene.emitters()
+        self.objects = emitters = in_order(scene)
         types = [group_of(emitter) for emitter in emitters]
         weights = [_sampling_weight(emitter) for emitter in emitters]
         registered = registered_emitters()
@@ -63,9 +64,10 @@ class Emitters:
         if not emitters:
             return
         _make_opaque(emitters, facts)
-        self._pointers = scene.emitters_dr()
+        self._pointers = mi.EmitterPtr(emitters)
         sampling_weight = mi.Float(weights)
         self._pmf, self._inverse = sampling_weight / dr.sum(sampling_weight), inverse_table(self._pointers)
+        self._choice = mi.DiscreteDistribution(sampling_weight) if len(set(weights)) > 1 else None
         dr.schedule(self._pmf)  # one kernel with the groups' tables
         context = Context(scene, facts, self._lacks_sample_position(registered))
         present = [group for group in GROUPS if group in types]
@@ -120,7 +122,7 @@ class Emitters:
     @cached_property
     def contrast(self) -> float:
         """Largest `infinite.contrast`; infinite unless all light comes from environments."""
-        return max((contrast(emitter) for emitter in self.scene.emitters()), default=math.inf)
+        return max((contrast(emitter) for emitter in self.objects), default=math.inf)
 
     # -- hooks of guided emission -------------------------------------------------------------
 
@@ -146,10 +148,14 @@ class Emitters:
 
     def _select(self, u, active: mi.Bool):
         """Choose an emitter; also returns the reused part of ``u``."""
-        index = mi.UInt32(0)
-        if self.count > 1:
-            index, _, u = self.scene.sample_emitter(u, active)
-        return self._chosen(index, active), u
+        if self.count == 1:
+            return self._chosen(mi.UInt32(0), active), u
+        if self._choice is not None:
+            index, u = self._choice.sample_reuse(u, active)
+            return self._chosen(index, active), u
+        scaled = u * self.count
+        index = dr.minimum(mi.UInt32(scaled), self.count - 1)
+        return self._chosen(index, active), scaled - mi.Float(index)
 
     def _chosen(self, index, active) -> Chosen:
         emitter = dr.gather(mi.EmitterPtr, self._pointers, index, active)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError, did_you_mean
+from .order import in_order
 
 # Names of the plugins of Mitsuba's emitters, by class.
 PLUGINS = {
@@ -145,7 +146,7 @@ class LightGroups:
         """
         if not text.strip():
             return None
-        emitters = scene.emitters()
+        emitters = in_order(scene)
         if not emitters:
             raise _error(text, "the scene has no emitters; leave light_groups out")
         groups = parsed(text)

@@ -61,12 +61,8 @@ class MeasuredScene(ABC):
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
         """Return the parser's state."""
 
-    def _plain(self, definitions: dict) -> mi.Scene:
-        """Return the scene with its own film and sampler."""
-        return self._instantiated(definitions, None)
-
     def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
-        """Return the scene with another type of sampler, of equal sample count."""
+        """Return the scene; with another type of ``sampler``, of equal sample count, unless None."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel = False
         state = self._parsed(config, definitions)
@@ -89,10 +85,7 @@ class MeasuredScene(ABC):
         """
         asked, known = {"resolution": resolution, "sampler": sampler}, self._parameters
         definitions |= {key: value for key, value in asked.items() if value is not None and key in known}
-        if sampler is None or "sampler" in known:
-            scene = self._plain(definitions)
-        else:
-            scene = self._instantiated(definitions, sampler)
+        scene = self._instantiated(definitions, None if "sampler" in known else sampler)
         if resolution is not None and "resolution" not in known:
             _resize(scene, resolution)
         return scene
@@ -159,9 +152,6 @@ class SceneFile(MeasuredScene):
     @property
     def _parameters(self) -> Mapping[str, str]:
         return parameters(self.file, {})
-
-    def _plain(self, definitions: dict) -> mi.Scene:
-        return mi.load_file(str(self.file), parallel=False, **in_proportion(self.file, definitions))
 
     def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
         with searching(self.file):

@@ -119,7 +119,7 @@ class LightMedia:
         order = np.argsort(index, kind="stable")
         parts = np.split(order, np.searchsorted(index[order], np.arange(1, count)))
         probed = []
-        for emitter, part in zip(self._emitters.scene.emitters(), parts, strict=True):
+        for emitter, part in zip(self._emitters.objects, parts, strict=True):
             of_this = number[part[known[part]]]
             most = int(np.bincount(of_this).argmax()) if len(of_this) else self.outside
             # Emitters with few samples are determined per ray.
@@ -150,7 +150,7 @@ class _Probed:
 def _declared(space: Space, emitters: Emitters) -> tuple[list, list]:
     """By emitter: media in front of and behind a shape that bounds media, else None."""
     front, back = [], []
-    for emitter in emitters.scene.emitters():
+    for emitter in emitters.objects:
         shape = emitter.get_shape()
         bounds = shape is not None and shape.is_medium_transition()
         front.append(space.media.number_of(shape.exterior_medium()) if bounds else None)

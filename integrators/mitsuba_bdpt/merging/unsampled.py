@@ -106,7 +106,7 @@ def _merged(
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
     side = replace(side, connect=None, only_delta=delta, only_specular=0 if delta else NARROW, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
-    sums = dr.zeros(mi.Float64, len(kernel.scene.emitters()) * channels)
+    sums = dr.zeros(mi.Float64, kernel.emitters.count * channels)
 
     def merge(z, only_delta, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)

@@ -49,7 +49,7 @@ def _warning(prepared, plan, settings, findings, paths: UnsampledPaths) -> str:
     found, _ = findings.find("missed direct light", key, look)
     if not found:
         return ""
-    emitters = [prepared.scene.emitters()[i] for i in found[:NAMED]]
+    emitters = [prepared.emitters.objects[i] for i in found[:NAMED]]
     lamps = " and ".join(map(called, emitters)) + (" and others" if len(found) > NAMED else "")
     shine = "shines" if len(found) == 1 else "shine"
     how = "directly" if direct or not prepared.delta else "through glass or mirrors"
@@ -78,7 +78,7 @@ def _arriving(prepared: PreparedScene, plan: Plan, settings: Settings, direct: b
 
     Directly if ``direct``, else by delta events.
     """
-    kernel, emitters = delta_kernel(prepared, plan, settings), prepared.scene.emitters()
+    kernel, emitters = delta_kernel(prepared, plan, settings), prepared.emitters.objects
     found: set[int] = set()
     for view in _with_area(prepared):
         kernel.camera = view

@@ -150,7 +150,7 @@ def estimate(
         of = max(samples, PREVIEW) if undersampled else None
         found = components.merging.estimate(kernel, batch, SUBPATHS, *drawn, aim, of)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
-    total = np.array(found.by_emitter).reshape(len(prepared.scene.emitters()), -1) / batch.size
+    total = np.array(found.by_emitter).reshape(prepared.emitters.count, -1) / batch.size
     if mi.is_spectral:
         total = np.repeat(total.mean(axis=1, keepdims=True), total.shape[1], axis=1)
     if np.array(found.seen).any():
@@ -223,7 +223,7 @@ def _called_shape(shape: mi.Shape) -> str:
 
 def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
     """Warn of emitters whose unsampled light cannot be estimated."""
-    emitters = prepared.scene.emitters()
+    emitters = prepared.emitters.objects
     lamps = " and ".join(called(emitters[i]) for i in indices[:NAMED])
     text = (
         f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or infinite; "
@@ -286,7 +286,7 @@ def _in_words(
     share: str,
 ) -> str:
     """`in_words` of this ``share``; ``parts`` of it by emitter index."""
-    emitters = prepared.scene.emitters()
+    emitters = prepared.emitters.objects
     order = sorted(parts, key=parts.__getitem__, reverse=True)
     least = WORTH_A_WORD * sum(parts.values())
     lamps = [emitters[i] for i in order if parts[i] >= least][:NAMED]

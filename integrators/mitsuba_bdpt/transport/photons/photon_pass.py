@@ -150,7 +150,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     counts = counters.summed()
     broken = mi.Bool(False)
     if kept.estimates:
-        broken = dr.zeros(mi.Bool, len(kernel.scene.emitters()))
+        broken = dr.zeros(mi.Bool, kernel.emitters.count)
         traced = e.delta | undersampled
         astray = walk.broken | (traced & ~dr.isfinite(dr.sum(e.d)))
         dr.scatter(broken, mi.Bool(True), e.index, astray)

@@ -32,7 +32,7 @@ def arriving(kernel: Kernel, points: Points, count: int) -> mi.Bool:
         return arrived | (hit & ((walk.edges > 1) | e.beam))
 
     arrived, _ = random_walk(kernel, side, walk, stream, visit, mi.Bool(False))
-    found = dr.zeros(mi.Bool, len(kernel.scene.emitters()))
+    found = dr.zeros(mi.Bool, kernel.emitters.count)
     dr.scatter(found, mi.Bool(True), e.index, arrived)
     dr.eval(found)
     return found
