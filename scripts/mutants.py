@@ -261,6 +261,13 @@ MUTANTS = (
         ("tests/planning/test_unsampled_light.py::test_lamps_of_several_colours_are_lost_together",),
     ),
     Mutant(
+        "emitters: lamps on meshes are in Mitsuba's order",
+        "emitters/order.py",
+        "sorted(on_meshes, key=key)",
+        "on_meshes",
+        ("tests/emitters/test_order.py::test_a_seed_has_one_image_in_every_load",),
+    ),
+    Mutant(
         "unsampled light: said after the last pass",
         "run/rendering.py",
         "messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())",

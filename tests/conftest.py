@@ -5,7 +5,6 @@ import mitsuba as mi
 import leftovers
 import pytest
 import short_pilots  # noqa: F401
-import unshuffled  # noqa: F401
 import variants
 from costs import (  # noqa: F401  (hooks of pytest)
     pytest_addoption,

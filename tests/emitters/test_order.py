@@ -4,13 +4,16 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.emitters.order import in_order
+from mitsuba_bdpt.planning.unsampled_light import UnsampledLight
+from mitsuba_bdpt.run.rendering import Render
 
 
-def room(ids):
+def room(ids, optimize=True):
     """A room with rectangles that shine, and meshes that share a BSDF, as a file."""
     lamps = "".join(
         f"""<shape type="rectangle"{f' id="{name}"' if name else ""}>
-            <transform name="to_world"><scale value=".2"/><translate x="{i % 2}" y="{i // 2}" z="-1"/></transform>
+            <transform name="to_world"><rotate y="1" angle="180"/><scale value=".2"/>
+            <translate x="{i % 2}" y="{i // 2}" z="-1"/></transform>
             <emitter type="area"><rgb name="radiance" value="{i + 1}, 1, 2"/></emitter></shape>"""
         for i, name in enumerate(ids)
     )
@@ -19,10 +22,11 @@ def room(ids):
             </transform><ref id="grey"/></shape>"""
         for i in range(6)
     )
+    turned = '<transform name="to_world"><rotate y="1" angle="180"/></transform>'
     size = "".join(f'<integer name="{name}" value="16"/>' for name in ("width", "height"))
-    sensor = f'<sensor type="perspective"><film type="hdrfilm">{size}</film></sensor>'
+    sensor = f'<sensor type="perspective">{turned}<film type="hdrfilm">{size}</film></sensor>'
     text = f'<scene version="3.0.0"><bsdf type="diffuse" id="grey"/>{lamps}{floors}{sensor}</scene>'
-    return mi.load_string(text, optimize=True)
+    return mi.load_string(text, optimize=optimize)
 
 
 def places(scene):
@@ -44,6 +48,7 @@ def test_a_seed_has_one_image_in_every_load():
     """Expected: the images of four loads of a file with one seed are equal but for the rounding of sums."""
     bdpt = mi.load_dict({"type": "bdpt"})
     images = [np.array(bdpt.render(room(["b", "c", "a", "d"]), seed=3, spp=4)) for _ in range(4)]
+    assert images[0].mean() > 0.01
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-5)
 
@@ -53,3 +58,13 @@ def test_other_emitters_keep_their_places():
     lamps = {name: {"type": "point", "position": [i, 0, 0]} for i, name in enumerate("cab")}
     scene = mi.load_dict({"type": "scene"} | lamps)
     assert [emitter.id() for emitter in in_order(scene)] == [emitter.id() for emitter in scene.emitters()]
+
+
+def test_statistics_have_the_scenes_numbers(monkeypatch):
+    """Expected: the share of the lamp that is first in the tables is under its number in the scene."""
+    unsampled = UnsampledLight({0: np.ones(3)})
+    monkeypatch.setattr(Render, "_unsampled", lambda self: unsampled)
+    scene, bdpt = room(["b", "a"], optimize=False), mi.load_dict({"type": "bdpt"})
+    bdpt.render(scene, spp=1)
+    (number,) = bdpt.statistics["unsampled_light"]
+    assert scene.emitters()[number].get_shape().id() == "a"

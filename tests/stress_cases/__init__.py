@@ -3,7 +3,6 @@
 from importlib import import_module
 
 import short_pilots  # noqa: F401
-import unshuffled  # noqa: F401
 
 from .case import Case
 

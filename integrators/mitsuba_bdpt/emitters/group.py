@@ -34,7 +34,8 @@ class Context:
 class Group:
     """The emitters of a scene that share formulas; made for each render.
 
-    Constructed from ``emitters``, in the scene's order with None for those of other groups, and a `Context`.
+    Constructed from ``emitters``, in the order of `order.in_order` with None for those of other groups, and a
+    `Context`.
     Methods without support are never called; results of lanes that are not ``active`` are undefined.
 
     * ``hittable``: camera subpaths can hit its emitters (`is_hittable`: each one).

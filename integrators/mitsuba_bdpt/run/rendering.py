@@ -362,7 +362,7 @@ class Render:
         self._small_first = progress.small_first
 
     def unsampled_light(self) -> dict[int, float]:
-        """Return shares of the image's light that are not sampled, by emitter index.
+        """Return shares of the image's light that are not sampled, by index in ``scene.emitters()``.
 
         Warns of large shares, once per scene and plan.
         """
@@ -372,7 +372,8 @@ class Render:
         shares = unsampled_light.shares(unsampled, number(self.accumulator.mean()))
         text = unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
         messages.warn_of_unsampled_light(self.prepared, self.plan, text)
-        return shares
+        emitters, of_scene = self.prepared.emitters.objects, self.prepared.scene.emitters()
+        return {of_scene.index(emitters[i]): share for i, share in shares.items()}
 
     def _unsampled(self) -> UnsampledLight | None:
         """Return the unsampled light transport; None if there is none.

@@ -148,7 +148,7 @@ class Statistics(TypedDict):
     non_finite_in_pilot: int
     """The same in the pilots."""
     unsampled_light: NotRequired[dict[int, float]]
-    """Estimated share of the image's light that no strategy samples, by index of the emitter."""
+    """Estimated share of the image's light that no strategy samples, by index in ``scene.emitters()``."""
     error: NotRequired[float | None]
     """Estimated relMSE, with ``variance``."""
     kernels: dict[str, int]
