@@ -184,6 +184,19 @@ def test_what_cannot_be_measured_is_named(here, call, words):
         call()
 
 
+def test_a_sweep_of_a_dictionary_says_where_its_results_go(here, capsys):
+    """Expected: the folder, before the reference is made; a preset that fails leaves none."""
+    mine, given = measure.SceneDict("mine", room()), {"resolution": 8, "spp": [2], "seeds": 2}
+    failing = given | {"integrator": [{"type": "bdp"}]}
+    with pytest.raises(ValueError, match="bdp"):
+        measure.run_sweep(failing, [mine], project="project", reference_seconds=0)
+    assert not Path("project/results").exists()
+    measure.run_sweep(given, [mine], project="project", reference_seconds=0)
+    assert capsys.readouterr().out.startswith(
+        "rows and images go to project/results/sweep\nmine: no reference"
+    )
+
+
 def test_a_reference_of_another_dictionary_is_made_anew(here, capsys):
     """Expected: under one name, that of an edited scene is none; the call that makes it better is named, with
     its limit of time."""

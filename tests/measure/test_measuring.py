@@ -514,11 +514,14 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
 
     def found():
         files = [file.relative_to(out) for file in sorted(out.rglob("*"))]
-        kept = [file for file in files if file.suffix == ".exr" or file.parent.name == "cells"]
+        kept = [file for file in files if file.suffix == ".exr" or file.parent.name in ("cells", "first")]
         rows = pyarrow.parquet.read_table(out / "rows.parquet").to_pylist()
         return {file: (out / file).read_bytes() for file in kept}, {row["key"]: row["mean"] for row in rows}
 
     assert main(words) == 0
+    for cell in (out / "cells").iterdir():  # as if all had a first image
+        (out / "first").mkdir(exist_ok=True)
+        (out / "first" / cell.name).write_text("[1.0]")
     (before, first), _ = found(), capsys.readouterr()
     (here / "elsewhere" / "room.xml").write_text(text.replace("3, 2, 1", "6, 4, 2"))
     assert main(words) == 0
@@ -537,7 +540,7 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
     assert {name.stem for name in now if name.parent != images} == set(second)
     assert {name.stem for name in after if name.parent == Path("cells")} == set(second)
     apart = {Path("earlier") / name for name in before if name.stem in set(first) - kept}
-    assert apart == {name for name in after if name.parts[0] == "earlier"} and len(apart) == 8
+    assert apart == {name for name in after if name.parts[0] == "earlier"} and len(apart) == 12
     (here / "elsewhere" / "room.xml").write_text(text)
     assert main(words) == 0
     said, (again, third) = capsys.readouterr().out, found()

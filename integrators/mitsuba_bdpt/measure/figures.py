@@ -156,8 +156,9 @@ def _curves(axis, results: Results, scene: str, against: str) -> bool:
                 axis.plot(x[hollow], middle[hollow], **look | {"linestyle": "", "markerfacecolor": "white"})
             first = points if first is None else first
     axis.set(xscale="log", yscale="log", title=scene)
-    is_sloped = first is not None and len(first) > 1
-    if is_sloped:
+    is_sloped = False
+    if first is not None and len(first) > 1:
+        is_sloped = True
         (x0, _, y0, _), (x1, _, _, _) = first[0], first[-1]
         axis.plot([x0, x1], [y0, y0 * x0 / x1], zorder=1, **SLOPE)
     for side in (axis.xaxis, axis.yaxis):
