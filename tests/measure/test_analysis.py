@@ -497,19 +497,25 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % / sqrt(3);
     a squared bias within its noise; no verdict of so few, or by a reference of few renders; a single one is
     called so."""
-    rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), spread=0.02) for i in (1, 2, 3)]
+    rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), variance=0.02) for i in (1, 2, 3)]
     found = Results(rows, {"box": KNOWN}, {})
     energy = found.surplus("box", "bdpt")
     assert (energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
     line = report.errors_table(found).splitlines()[2]
-    assert "| 2.00e-02 |" in line and line.endswith("| +2 % ± 2.5 |") and "–" not in line.split("|")[9]
+    assert (
+        line.count("| 2.00e-02 (2.00e-02–2.00e-02) |") == 2
+        and line.endswith("| +2 % ± 2.5 |")
+        and "–" not in line.split("|")[9]
+    )
     checks = report.checks_table(found, MADE, {})
     assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
     few = Results(rows, {}, {})
     assert "| the reference has fewer than 8 renders, by `path` |" in report.checks_table(few, MADE, {})
     assert "| the reference has fewer than 8 renders |" in report.errors_table(few)
     alone = report.errors_table(Results(rows[:1], {"box": KNOWN}, {})).splitlines()[2]
-    assert alone.endswith("| fewer than three renders | fewer than two renders: seeds = 2 or more |")
+    assert alone.endswith("| one render | one render | fewer than two renders: seeds = 2 or more |")
+    lost = Results([one | {"variance": None} for one in rows], {"box": KNOWN}, {})
+    assert report.errors_table(lost).count("images are missing, or samples differ") == 2
 
 
 def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
@@ -527,9 +533,38 @@ def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
         found.bias("box", "bdpt")
 
 
-def test_a_report_has_the_name_of_its_scene_or_preset(results, tmp_path):
-    """Expected: of a single scene its name, of several that of the folder, which is the preset's."""
-    assert report.title(Results(runs("bdpt", 2), {}, {}), tmp_path) == "Box"
+@pytest.mark.parametrize(
+    ("wall", "processor", "is_busy"),
+    [
+        ((1.6, 4.6, 4.4, 4.0), (3.2, 3.4, 3.3, 3.2), True),
+        ((1.6, 4.6, 4.4, 4.0), (1.6, 4.6, 4.4, 4.0), False),  # the work itself differs
+        ((1.0, 1.2, 1.1, 1.3), (2.0, 2.01, 2.0, 2.0), False),  # by less than a fifth
+        ((1.0, 3.0), (2.0, 2.0), False),  # too few
+        ((1.0, 3.0, 2.0), (None,) * 3, False),  # an older sweep
+    ],
+)
+def test_other_programs_are_noticed(wall, processor, is_busy):
+    """Rationale: wall seconds of 1.6 to 4.6 s, of the same work, were reported without a word. Expected: the
+    report names what to set, before its figures; not where the work differs, or by little; nor for the
+    integrators that are not compared."""
+    rows = [
+        row("path", i, seconds=w, cpu_seconds=c) for i, (w, c) in enumerate(zip(wall, processor, strict=True))
+    ]
+    rows = runs("bdpt", len(wall), cpu_seconds=1.0) + rows
+    found = Results(rows, {"box": KNOWN}, {})
+    text = report.busy_text(found)
+    assert bool(text) == is_busy
+    if is_busy:
+        assert "`box`: path 1.6–4.6 s (processor 3.2–3.4 s). " in text
+        assert 'clock = "processor"' in text and "bdpt" not in text
+        assert not report.busy_text(replace(found, aside=("path",)))
+        page = report.page(found, {"box": image_of_two()}, [], {}, "Box")
+        assert page.index(text) < page.index("Efficiency is")
+
+
+def test_a_report_has_the_name_of_its_preset(results, tmp_path):
+    """Expected: that of the folder, which is the preset's, and of a single scene its name too."""
+    assert report.title(Results(runs("bdpt", 2), {}, {}), tmp_path / "rooms") == "Rooms: box"
     assert report.title(results, tmp_path / "rooms") == "Rooms"
 
 

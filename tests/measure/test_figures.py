@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.images import write_layers
-from mitsuba_bdpt.measure import crops, figures, paper, pyramid
+from mitsuba_bdpt.measure import crops, figures, paper, pyramid, report
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results
+from mitsuba_bdpt.measure.estimates import RelativeError
+from mitsuba_bdpt.measure.metrics import Estimate
 
 METHODS = ("bdpt", "path", "path multijitter", "bdpt skip=none", "an integrator with a long name of its own")
 KNOWN = Means.known(np.full((4, 4, 3), 2.0))
@@ -81,7 +83,8 @@ def block(count, height=48, width=32, title="a_caustic_with_a_long_name"):
     for i in range(count):
         image = target + 0.01 * rng.standard_normal(target.shape)
         image[-12:, -12:] += (count - i) * rng.exponential(0.5, (12, 12, 3))
-        columns.append(crops.judged(METHODS[i], 64, 1.234, image, target))
+        error = RelativeError(Estimate(0.01234, 0.01, 0.02), "≤", 8)
+        columns.append(crops.judged(METHODS[i], 64, 1.234, error, image, target))
     return crops.Block(title, tuple(columns), target)
 
 
@@ -131,11 +134,18 @@ def test_windows_lie_where_errors_differ():
 
 
 def test_crops_are_of_the_sweep(tmp_path):
-    """Expected: the images of the median seed at the deciding budget, rivals first, with their samples and
-    seconds; integrators without images are left out, and a scene without any is an error."""
-    rows = [row | {"key": f"{row['method']}{row['seed']}"} for row in results(("b",)).rows]
+    """Rationale: captions had the measured error of the image, with the reference's, up to 1.7 times that of
+    the tables. Expected: the images of the median seed at the deciding budget, rivals first, with their
+    samples, seconds and the trimmed relMSE of the tables, less the reference's own; integrators without
+    images are left out, and a scene without any is an error."""
+    own = {"reference_rel_mse_trimmed": 0.004}
+    rows = [row | own | {"key": f"{row['method']}{row['seed']}"} for row in results(("b",)).rows]
     found = Results(rows, {"b": KNOWN}, {}, compared=64)
     kept = Namespace(image=np.ones((8, 8, 3)))
+
+    def mean(method):
+        return np.mean([row["rel_mse_trimmed"] for row in found.of("b", method, 64)])
+
     with pytest.raises(CommandError, match="no image of b is there; run the sweep again"):
         figures.cropped(tmp_path, found, kept, "b")
     for method, value in (("bdpt", 1.5), ("path", 2.0)):
@@ -145,13 +155,37 @@ def test_crops_are_of_the_sweep(tmp_path):
         write_layers(tmp_path / "images" / "b" / f"{method}{middle}.exr", {"": np.full((8, 8, 3), value)}, {})
     made = figures.cropped(tmp_path, found, kept, "b")
     assert [one.caption for one in made.columns] == [
-        ("path", "64 spp, 0.64 s", "relMSE 0.99 (trimmed)"),
-        ("bdpt", "64 spp, 0.64 s", "relMSE 0.25 (trimmed)"),
+        ("path", "64 spp, 0.64 s", f"relMSE ≥ {mean('path') - 0.004:.2g} (trimmed)"),
+        ("bdpt", "64 spp, 0.64 s", f"relMSE {mean('bdpt') - 0.004:.2g} (trimmed)"),
     ]
+    table = report.errors_table(found)
+    assert f"| b | {mean('bdpt') - 0.004:.2e} (" in table.replace(
+        "`b` | bdpt | 64 | 0.64 (0.64–0.64) | 8", "b"
+    )
     np.testing.assert_allclose(made.columns[1].errors, 0.25 / 1.01, rtol=1e-3)
     rows = [row | ({"match": "spp"} if row["method"] == "path" else {}) for row in found.rows]
     made = figures.cropped(tmp_path, replace(found, rows=rows), kept, "b")
     assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
+
+
+@pytest.mark.parametrize(
+    ("seeds", "label"),
+    [
+        ((8, 8), "95 % interval"),
+        ((5, 5), "95 % interval"),
+        ((2, 2), "range of 2 seeds"),
+        ((2, 4), "range of 2 to 4 seeds"),
+        ((2, 8), "95 % interval; range if n < 5"),
+    ],
+)
+def test_the_range_of_few_seeds_is_no_interval(monkeypatch, seeds, label):
+    """Rationale: the range of two seeds, which holds the median in half of cases, was called a 95 % interval.
+    Expected: it is called what it is, and by the number of seeds."""
+    found, most = results(), dict(zip(("a_caustic_with_a_long_name", "b"), seeds, strict=True))
+    kept = replace(found, rows=[row for row in found.rows if row["seed"] < most[row["scene"]]])
+    drawn = saved(monkeypatch, figures)
+    figures.efficiencies(kept, kept.rivals, None)
+    assert label in [text.get_text() for text in drawn[0].legends[0].get_texts()]
 
 
 @pytest.mark.parametrize("columns", [1, 2])

@@ -10,8 +10,9 @@ import pytest
 from mitsuba_bdpt import measure
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import FailureError
-from mitsuba_bdpt.measure import options, sweep
+from mitsuba_bdpt.measure import estimates, options, sweep, tables
 from mitsuba_bdpt.measure.project import Project
+from mitsuba_bdpt.measure.results import relative_errors
 from mitsuba_bdpt.measure.scenes import DictionaryScene, SceneFile
 
 PRESET = """
@@ -135,6 +136,9 @@ def test_measurements_take_dictionaries(here):
     assert "| `mine` | 4 |" in table and "| `scene_" in table
     path, bdpt = measure.compare_at_equal_time(named, spp=4, **common)
     assert (path.name, bdpt.name, bdpt.spp) == ("path", "bdpt", 4) and bdpt.image.shape == (4, 8, 3)
+    kept = measure.make_reference(named, seconds=0, **common)
+    error = estimates.relative_error([relative_errors(bdpt.image, kept)], "rel_mse_trimmed", False)
+    assert bdpt.error == error and f"relMSE {tables.brief(error)} (trimmed)" in bdpt.caption
     images = measure.render_pyramid(named, spp=1, max_depth=2, **common)
     assert images["weighted"].keys() == images["unweighted"].keys() >= {(2, 1, 2)}
     assert {"equal_time_mine.png", "pyramid_mine.exr"} <= {p.name for p in Path("project/renders").iterdir()}

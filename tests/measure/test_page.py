@@ -58,7 +58,11 @@ const lines = [...document.querySelectorAll("#rows tbody tr")];
 const seconds = lines.map(row => Number(row.children[5].textContent));
 seen.sorted = seconds.every((x, i) => i === 0 || seconds[i - 1] <= x);
 seen.sort = document.querySelectorAll("#rows th")[5].getAttribute("aria-sort");
+document.querySelectorAll("#rows th button")[6].click();
+const errors = () => [...document.querySelectorAll("#rows tbody tr")].map(row => row.children[6].textContent);
+seen.byBound = errors();
 set(document.getElementById("filter"), "cornell_box");
+seen.trimmed = errors();
 seen.filtered = [...new Set(cells())];
 seen.unlabelled = [...document.querySelectorAll("input, select")].filter(
   e => !e.closest("label") && !e.getAttribute("aria-label")).length;
@@ -112,14 +116,14 @@ def opened(file) -> dict:
 def test_the_page_in_a_browser(tmp_path):
     """Expected: no script error and no request; the divider shows one image or the other, exposure darkens
     (by 4 stops: a linear 0.25 from 137 to 34 of 255 in sRGB), the error map is dark where an image is the
-    reference; headings sort, the filter filters; every input has a label.
+    reference; headings sort, bounds as numbers, the filter filters; every input has a label.
     """
     grey, half, noise = (np.full((8, 16, 3), x) for x in (0.25, 0.0, 0.0))
     noise[::2] = 1.0
     scenes = [fake_scene("cornell_box", bdpt=grey, path=half, reference=grey + noise)]
     rows = [
         ["cornell_box", "bdpt", 64, 5, 64, 0.5, 1e-3, 1e-3, 0.1, None, 0.2],
-        ["cornell_box", "path", 64, 5, 90, 0.25, 1e-2, 1e-2, 0.1, 0.3, 0.2],
+        ["cornell_box", "path", 64, 5, 90, 0.25, [1e-2, "≥"], 1e-2, 0.1, 0.3, 0.2],
         ["open_sky </script>", "bdpt", 64, 5, 64, 0.125, 1e-3, 1e-3, 0.1, None, 0.2],
     ]
     seen = opened(written(tmp_path, rows, scenes))
@@ -136,6 +140,11 @@ def test_the_page_in_a_browser(tmp_path):
     assert seen["noError"] == [68, 1, 84, 255] and "reference right of it" in seen["label"]
     assert seen["rows"] == 3 and seen["sorted"] and seen["sort"] == "ascending"
     assert seen["filtered"] == ["cornell_box"]
+    assert seen["trimmed"] == ["0.00100", "≥ 0.0100"] and seen["byBound"] == [
+        "0.00100",
+        "0.00100",
+        "≥ 0.0100",
+    ]
 
 
 def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):

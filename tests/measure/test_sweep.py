@@ -1056,7 +1056,7 @@ def test_the_table_is_tidy(tmp_path):
         "key": "abc",
         "budget": 8,
         "seconds": 1.5,
-        "spread": 0.25,
+        "variance": 0.25,
         "rel_mse": 0.5,
         "energy": 0.9,
         "flip": None,

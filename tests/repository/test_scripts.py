@@ -187,6 +187,29 @@ def test_a_comparison_with_what_has_no_error_is_refused():
     assert "exactly that of the reference" in line[2]
 
 
+@pytest.mark.parametrize(("second", "ratio", "bounds"), [(0.1, 4.0, ("", "")), (0.02, None, ("≥", "≤"))])
+def test_a_comparison_is_of_the_errors_of_reports(second, ratio, bounds):
+    """Renders of 20 % noise and of 10 % or 2 % against a reference of 10 %, half of the second's measured
+    error or most of it. Rationale: measured ratios, with the reference's error in both, were 2.5 for a ratio
+    of variances of 4.
+    Expected: 4 within 10 % (12,288 values), and the efficiency its reciprocal; of a second side with less
+    noise than the reference, bounds."""
+    rng, truth = np.random.default_rng(1), np.ones((64, 64, 3))
+
+    def noisy(sigma):
+        return truth + sigma * rng.standard_normal(truth.shape)
+
+    a, b = noisy(0.1 * 2**0.5), noisy(0.1 * 2**0.5)
+    kept = Reference((a + b) / 2, (a - b) / 2, None, {})
+    sides = [lambda spp, seed, sigma=sigma: Timed(noisy(sigma), 1.0, 1.0) for sigma in (0.2, second)]
+    cells = dict(zip(compare.HEADS, compare.line("box", sides, kept, 4, 3), strict=True))
+    for kind, bound in (("error", bounds[0]), ("raw error", bounds[0])):
+        *mark, value = cells[kind].split()
+        assert "".join(mark) == bound and (ratio is None or float(value) == pytest.approx(ratio, rel=0.1))
+    assert cells["raw efficiency"].split()[:-1] == [bounds[1]] * bool(bounds[1])
+    assert ratio is None or float(cells["raw efficiency"]) == pytest.approx(1 / ratio, rel=0.1)
+
+
 def test_the_floor_is_recorded_in_a_variant(monkeypatch):
     """Rationale: the versions in the record name the LLVM of the variant, and without one the last command of
     `make benchmark` failed after an hour. Expected: the variant is set first."""
@@ -282,7 +305,7 @@ def test_bugs_are_not_taken_for_mistakes():
 
 def test_equal_time_of_a_scene_file(here, capsys):
     """Rationale: only names in scenes/ were taken. Expected: a file with a reference of its own gives the
-    picture; one of another size is refused."""
+    picture, and errors that are upper bounds, since its own is not known; one of another size is refused."""
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file("room.xml")
     path = mi.load_dict({"type": "path", "max_depth": 3})
@@ -293,7 +316,8 @@ def test_equal_time_of_a_scene_file(here, capsys):
     arguments = ["equal-time", "room.xml", "--spp", "2", "-o", "a/b.png", "--reference"]
     assert main([*arguments, "right.exr"]) == 0
     assert matplotlib.image.imread("a/b.png").ndim == 3
-    assert "bdpt, 2 spp" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "bdpt, 2 spp" in out and out.count("relMSE ≤ ") == 2
     with pytest.raises(ValueError, match="has 4 x 4 pixels, the film of 'room.xml' 8 x 8"):
         equal_time.run(build_parser().parse_args([*arguments, "wrong.exr"]))
 

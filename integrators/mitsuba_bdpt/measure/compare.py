@@ -1,8 +1,9 @@
 """Compares two integrators in alternating renders: seconds, errors, efficiency.
 
 Medians over pairs of renders with different seeds, after a warm-up that compiles; for efficiency also
-quartiles. Errors are relMSE, trimmed of the worst 0.1 % and raw. The last column is the share of the
-reference's own error in the trimmed one (the larger of both sides), which bounds the bias of the ratios.
+quartiles. Errors are relMSE, trimmed of the worst 0.1 % and raw, less the reference's own
+(`estimates.seed_errors`); ≥, ≤ and ~ mark ratios that are bounds, where the reference is too noisy. The last
+column is the share of the reference's own error in the trimmed measured one (the larger of both sides).
 Without any error there are no ratios. Equality of means is not tested here: see `agreement`.
 """
 
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,10 +19,11 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
+from .estimates import Bound, bound_of_ratio, seed_errors
 from .making import Job, fitted, obtained
 from .options import VARIANT, Compare
 from .project import Project
-from .record import Measured
+from .record import Error, Measured
 from .reference import Reference
 from .results import relative_errors
 from .scenes import check_plugins, integrator_of
@@ -86,15 +89,33 @@ def line(
 
 def _figures(pairs: Sequence[Sequence[Measured]]) -> list[str]:
     """Return the cells of `HEADS` after the samples."""
-    seconds, errors, raw_errors, own = (
-        np.array([[row[name] for row in pair] for pair in pairs]).T
-        for name in ("seconds", "rel_mse_trimmed", "rel_mse", "reference_rel_mse_trimmed")
-    )
-    time, error, raw = (first / second for first, second in (seconds, errors, raw_errors))
-    low, middle, high = np.quantile(1 / (time * error), (0.25, 0.5, 0.75))
-    *first, raw_efficiency = (f"{np.median(x):.3g}" for x in (time, error, raw, 1 / (time * raw)))
-    share = np.median(own / errors, axis=1).max()
-    return [*first, f"{middle:.3g} ({low:.3g}–{high:.3g})", raw_efficiency, f"{100 * share:.1f} %"]
+    time = np.array([first["seconds"] / second["seconds"] for first, second in pairs])
+    error, raw = (_ratio(pairs, name) for name in ("rel_mse_trimmed", "rel_mse"))
+    low, middle, high = np.quantile(1 / (time * error.values), (0.25, 0.5, 0.75))
+    own = [[row["reference_rel_mse_trimmed"] / row["rel_mse_trimmed"] for row in pair] for pair in pairs]
+    return [
+        f"{np.median(time):.3g}",
+        f"{error.bound} {np.median(error.values):.3g}".lstrip(),
+        f"{raw.bound} {np.median(raw.values):.3g}".lstrip(),
+        f"{error.turned} {middle:.3g} ({low:.3g}–{high:.3g})".lstrip(),
+        f"{raw.turned} {np.median(1 / (time * raw.values)):.3g}".lstrip(),
+        f"{100 * np.median(own, axis=0).max():.1f} %",
+    ]
+
+
+@dataclass(frozen=True)
+class _Ratio:
+    """Ratios of errors, first over second, of each pair; their bound, and that of their reciprocals."""
+
+    values: np.ndarray
+    bound: Bound
+    turned: Bound
+
+
+def _ratio(pairs: Sequence[Sequence[Measured]], error: Error) -> _Ratio:
+    sides = [[pair[side] for pair in pairs] for side in (0, 1)]
+    (first, over), (second, under) = (seed_errors(rows, error, differs=False) for rows in sides)
+    return _Ratio(np.divide(first, second), bound_of_ratio(over, under), bound_of_ratio(under, over))
 
 
 def lines(

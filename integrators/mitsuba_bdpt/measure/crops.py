@@ -18,8 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from ..errors import CommandError
-from .metrics import TRIM, rel_mse, rel_mse_epsilon, tone_map
+from .estimates import RelativeError
+from .metrics import rel_mse_epsilon, tone_map
 from .paper import PAPER, WIDTHS, save
+from .tables import brief
 
 WINDOW = 6  # side of a window: this fraction of the image's
 COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
@@ -50,10 +52,15 @@ class Block:
     target: np.ndarray
 
 
-def judged(name: str, spp: int, seconds: float, image: np.ndarray, target: np.ndarray) -> Column:
-    """Return the column of a render, with its errors against ``target``."""
+def judged(
+    name: str, spp: int, seconds: float, error: RelativeError, image: np.ndarray, target: np.ndarray
+) -> Column:
+    """Return the column of a render, with its errors against ``target``.
+
+    ``error``: the trimmed relMSE that its caption has, that of the tables of reports.
+    """
     errors = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
-    figure = f"relMSE {rel_mse(image, target, TRIM):.2g} (trimmed)"
+    figure = f"relMSE {brief(error)} (trimmed)"
     return Column(image, (name, f"{spp} spp, {seconds:.2g} s", figure), errors)
 
 

@@ -8,10 +8,11 @@ the scene file's size and depth. Windows lie where the errors differ most.
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -20,13 +21,17 @@ from ..errors import CommandError
 from ..files.images import read_layers
 from ..files.loading import choose_sensor
 from . import crops
+from .estimates import RelativeError, mean_of, relative_error
 from .making import Job, fitted, obtained
 from .metrics import TRIM, rel_mse
 from .options import RESOLUTION, VARIANT, EqualTime
 from .paper import check_figure
 from .project import Project
+from .reference import Reference
+from .results import relative_errors
 from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers
 from .showing import steps
+from .tables import brief
 from .timing import alternating, timed
 
 TIMED = 3  # renders for the median of times
@@ -35,27 +40,52 @@ MATCHED, CLOSE = 3, 0.05  # times that samples are matched at most, and differen
 
 @dataclass(frozen=True)
 class Shot:
-    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE."""
+    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE with its bound."""
 
     name: str
     spp: int
     seconds: float
     image: np.ndarray
-    rel_mse: float
+    error: RelativeError
+
+    @property
+    def rel_mse(self) -> float:
+        """The trimmed relMSE, less the reference's own where that is known."""
+        return self.error.total.value
 
     @property
     def caption(self) -> str:
-        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.rel_mse:.2g} (trimmed)"
+        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {brief(self.error)} (trimmed)"
 
 
-def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace):
-    """Return scene, reference image and ``max_depth`` of the ``options``."""
+def _against(kept: Reference, image: np.ndarray) -> RelativeError:
+    return relative_error([relative_errors(image, kept)], "rel_mse_trimmed", differs=False)
+
+
+def _against_image(target: np.ndarray, image: np.ndarray) -> RelativeError:
+    """Return the error against an image, whose own error is unknown: an upper bound."""
+    return RelativeError(mean_of([rel_mse(image, target, TRIM)]), "≤", 1)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Scene, reference image, ``max_depth``, and the error of an image against the reference."""
+
+    scene: Any
+    target: np.ndarray
+    depth: int
+    error: Callable[[np.ndarray], RelativeError]
+
+
+def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace) -> Subject:
+    """Return what the ``options`` ask for."""
     if options.reference is None:
         seconds = options.reference_seconds
         width = fitted(file, options.resolution or RESOLUTION)
         job = Job(project, file, width, None, options.spp, seconds)
-        target = obtained(job).image
-        return file.load(job.resolution, options.sampler), target, job.depth
+        kept = obtained(job)
+        scene = file.load(job.resolution, options.sampler)
+        return Subject(scene, kept.image, job.depth, partial(_against, kept))
     (target,), _ = read_layers(options.reference, "")
     scene = file.load(options.resolution, options.sampler)
     width, height = (int(n) for n in choose_sensor(scene, 0).film().crop_size())
@@ -64,7 +94,7 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
             f"reference={str(options.reference)!r} has {target.shape[1]} x {target.shape[0]} pixels, the "
             f"film of {file.called} {width} x {height}; render it from this scene"
         )
-    return scene, target, depth_of(scene.integrator())
+    return Subject(scene, target, depth_of(scene.integrator()), partial(_against_image, target))
 
 
 def seconds(scene, made, spp: int) -> float:
@@ -88,12 +118,12 @@ def _samples_within(limit: float, scene, made, spp: int) -> int:
     return count
 
 
-def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int) -> list[Shot]:
+def shots(given: Subject, ways: dict[str, dict], spp: int) -> list[Shot]:
     """Render with each integrator in the time of the last one.
 
     ``ways``: parameters of plugins by caption. The last has ``spp`` samples per pixel, others as many as fit.
     """
-    made = [integrator_of(parameters, depth) for parameters in ways.values()]
+    scene, made = given.scene, [integrator_of(parameters, given.depth) for parameters in ways.values()]
     with steps(1 + len(made)) as step:
         step(list(ways)[-1])
         limit, found = seconds(scene, made[-1], spp), []
@@ -101,7 +131,7 @@ def shots(scene, target: np.ndarray, ways: dict[str, dict], depth: int, spp: int
             step(name)
             count = spp if one is made[-1] else _samples_within(limit, scene, one, spp)
             image, taken, _ = timed(scene, one, count, seed=7)
-            found.append(Shot(name, count, taken, image, rel_mse(image, target, TRIM)))
+            found.append(Shot(name, count, taken, image, given.error(image)))
     return found
 
 
@@ -113,11 +143,14 @@ def pictured(
     output = options.output or project.renders / f"equal_time_{file.name}.png"
     check_figure(output)
     places = crops.centres(options.windows)
-    loaded, target, depth = subject(project, file, options)
+    given = subject(project, file, options)
     ways = dict(integrators) or {kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")}
-    found = shots(loaded, target, ways, depth, options.spp)
-    columns = [crops.judged(shot.name, shot.spp, shot.seconds, shot.image, target) for shot in found]
-    crops.draw([crops.Block(file.name, tuple(columns), target)], output, options.columns, places)
+    found = shots(given, ways, options.spp)
+    columns = [
+        crops.judged(shot.name, shot.spp, shot.seconds, shot.error, shot.image, given.target)
+        for shot in found
+    ]
+    crops.draw([crops.Block(file.name, tuple(columns), given.target)], output, options.columns, places)
     return output, found
 
 

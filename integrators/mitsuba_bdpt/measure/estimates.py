@@ -12,8 +12,10 @@ renders that are judged: these divide their own fireflies by themselves.
 
 The raw relMSE is the variance where the mean of the renders agrees with the reference. Where it differs, it
 is variance + squared bias and a lower bound: the integrator is biased, or has not met rare light, whose
-variance the renders do not show. The trimmed relMSE is of the products, of the values that the trimmed
-measured error keeps. Intervals are Student's over seeds; the noise of the reference is not in them.
+variance the renders do not show. Of fewer than `FEWEST_TESTED` renders the mean cannot be tested: the raw
+relMSE is variance + squared bias, or, where the reference is too noisy, the variance as a lower bound. The
+trimmed relMSE is of the products, of the values that the trimmed measured error keeps. Intervals are
+Student's over seeds; the noise of the reference's image in the weights is not in them.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from scipy import stats
 
 from .agreement import FEWEST_RUNS, SIGNIFICANCE, Means, missing_energy, sidak, welch
 from .metrics import CONFIDENCE, Estimate, values_of
-from .record import Error, Row
+from .record import Error, Errors, Row
 
 Bound = Literal["", "≥", "≤", "~"]
 """Exact, at least, at most, or neither bound."""
@@ -54,17 +56,18 @@ class RelativeError:
     """relMSE of an integrator at one budget: the mean over ``count`` seeds with a 95 % interval.
 
     ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where the reference is too
-    noisy. ``variance`` and ``squared_bias`` add up to the raw error; None where too few renders are there.
+    noisy. ``variance`` and ``squared_bias`` are parts of the raw error; None of a single render, or without
+    the renders' variance. Of two renders their intervals are infinite.
     """
 
     total: Estimate
     bound: Bound
     count: int
-    variance: float | None = None
+    variance: Estimate | None = None
     squared_bias: Estimate | None = None
 
 
-def seed_errors(rows: Sequence[Row], error: Error, differs: bool) -> tuple[list[float], Bound]:
+def seed_errors(rows: Sequence[Errors], error: Error, differs: bool) -> tuple[list[float], Bound]:
     """Return an estimate of the relMSE from each row, whose mean is unbiased, and its bound.
 
     ``differs``: whether the mean of the renders differs from the reference. If not, raw errors are scaled to
@@ -73,24 +76,47 @@ def seed_errors(rows: Sequence[Row], error: Error, differs: bool) -> tuple[list[
     """
     measured, own = (np.array([row[key] for row in rows], dtype=np.float64) for key in (error, OWN[error]))
     found = measured - own
-    is_noisy = bool(own.any()) and (own.sum() > SUBTRACTED * measured.sum() or found.min() <= 0)
-    if error == "rel_mse" and not differs and all(row.get("spread") is not None for row in rows):
-        spread = np.array([row["spread"] for row in rows], dtype=np.float64)
-        scaled = not is_noisy and found.min() > 0
-        return (found * (spread.mean() / found.mean()) if scaled else spread).tolist(), ""
+    is_noisy = _is_noisy(rows, error)
+    if error == "rel_mse" and _has_variance(rows):
+        spread = _column(rows, "variance")
+        if _is_variance(rows, differs):
+            scaled = not is_noisy and found.min() > 0
+            return (found * (spread.mean() / found.mean()) if scaled else spread).tolist(), ""
+        if is_noisy and len(rows) < FEWEST_TESTED:
+            return spread.tolist(), "≥"
     if is_noisy:
         return measured.tolist(), "~" if differs else "≤"
     return found.tolist(), "≥" if differs else ""
 
 
-def relative_error(rows: Sequence[Row], error: Error, differs: bool) -> RelativeError:
+def _column(rows: Sequence[Errors], name: str) -> np.ndarray:
+    return np.array([row[name] for row in rows], dtype=np.float64)
+
+
+def _has_variance(rows: Sequence[Errors]) -> bool:
+    return all(row.get("variance") is not None for row in rows)
+
+
+def _is_variance(rows: Sequence[Errors], differs: bool) -> bool:
+    """Return whether the raw relMSE is the variance alone: the mean was tested, and agrees."""
+    return not differs and len(rows) >= FEWEST_TESTED and _has_variance(rows)
+
+
+def _is_noisy(rows: Sequence[Errors], error: Error) -> bool:
+    """Return whether the reference is too noisy to subtract its own error."""
+    measured, own = _column(rows, error), _column(rows, OWN[error])
+    return bool(own.any()) and bool(own.sum() > SUBTRACTED * measured.sum() or (measured - own).min() <= 0)
+
+
+def relative_error(rows: Sequence[Errors], error: Error, differs: bool) -> RelativeError:
     """Return the relMSE of the ``rows`` of an integrator at one budget."""
     values, bound = seed_errors(rows, error, differs)
-    found = RelativeError(mean_of(values), bound, len(rows))
-    if error != "rel_mse" or any(row.get("spread") is None for row in rows):
-        return found
-    variance = float(np.mean([row["spread"] for row in rows]))
-    return RelativeError(found.total, bound, len(rows), variance, squared_bias(rows))
+    total = mean_of(values)
+    if error != "rel_mse" or not _has_variance(rows):
+        return RelativeError(total, bound, len(rows))
+    spread = variance(rows)
+    is_variance = _is_variance(rows, differs) or (_is_noisy(rows, error) and len(rows) < FEWEST_TESTED)
+    return RelativeError(spread if is_variance else total, bound, len(rows), spread, squared_bias(rows))
 
 
 def mean_of(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate:
@@ -103,28 +129,57 @@ def mean_of(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate
     value, n = float(given.mean()), len(given)
     if n == 1:
         return Estimate(value, 0.0, math.inf)
-    without = (given.sum() - given) / (n - 1)
+    return _of_logarithm(value, (given.sum() - given) / (n - 1), confidence)
+
+
+def _of_logarithm(value: float, without: np.ndarray, confidence: float) -> Estimate:
+    """Return Student's interval of the logarithm of ``value``, of the estimates ``without`` each of n."""
+    student = _student(len(without) - 1, confidence)
     if without.min() <= 0:
-        half = _student(n - 1, confidence) * _jackknife(without)
+        half = student * _jackknife(without)
         return Estimate(value, max(value - half, 0.0), value + half)
-    factor = math.exp(min(_student(n - 1, confidence) * _jackknife(np.log(without)), 700.0))
+    factor = math.exp(min(student * _jackknife(np.log(without)), 700.0))
     return Estimate(value, value / factor, value * factor)
 
 
-def squared_bias(rows: Sequence[Row], confidence: float = CONFIDENCE) -> Estimate | None:
+def variance(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate:
+    """Return the variance relative to the reference, with a 95 % interval over seeds.
+
+    Student's interval of the logarithm, whose standard error is the jackknife's; from 0 to infinity for two
+    renders, whose only difference shows no spread. Too narrow where the renders missed rare bright values.
+    """
+    without = _variance_without(rows)
+    value = float(_column(rows, "variance").mean())
+    if without is None:
+        return Estimate(value, 0.0, math.inf)
+    return _of_logarithm(value, without, confidence)
+
+
+def _variance_without(rows: Sequence[Errors]) -> np.ndarray | None:
+    """Return the variances without each of the ``rows``; None for fewer than 3."""
+    n = len(rows)
+    if n < 3:
+        return None
+    # The sum of squares about the mean falls by that row's `metrics.spread`.
+    spread = _column(rows, "variance")
+    return ((n - 1) / n * spread.sum() - spread) / (n - 2)
+
+
+def squared_bias(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate | None:
     """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
 
-    None for fewer than 3 renders. Without bias, its expectation is 0 and it may be negative.
+    None for a single render; infinite interval for two. Without bias, its expectation is 0 and it may be
+    negative.
     """
     n = len(rows)
-    if n < 3 or any(row.get("spread") is None for row in rows):
+    if n < 2 or not _has_variance(rows):
         return None
-    spread = np.array([row["spread"] for row in rows], dtype=np.float64)
-    total = np.array([row["rel_mse"] - row["reference_rel_mse"] for row in rows], dtype=np.float64)
-    # Both without one seed: the sum of squares about the mean falls by that row's `metrics.spread`.
-    variance = ((n - 1) / n * spread.sum() - spread) / (n - 2)
-    without = (total.sum() - total) / (n - 1) - variance
-    value, half = float(total.mean() - spread.mean()), _student(n - 1, confidence) * _jackknife(without)
+    total = _column(rows, "rel_mse") - _column(rows, "reference_rel_mse")
+    value, variances = float(total.mean() - _column(rows, "variance").mean()), _variance_without(rows)
+    if variances is None:
+        return Estimate(value, -math.inf, math.inf)
+    without = (total.sum() - total) / (n - 1) - variances
+    half = _student(n - 1, confidence) * _jackknife(without)
     return Estimate(value, value - half, value + half)
 
 

@@ -40,6 +40,7 @@ from .project import Project
 from .record import Error
 from .reference import Reference
 from .results import load
+from .tables import FEW
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
@@ -211,7 +212,8 @@ def efficiencies(
 ) -> None:
     """Plot efficiencies per scene, the first integrator's over each of the ``rivals``.
 
-    Median with its 95 % interval; trimmed filled, raw hollow; arrows where a ratio is a bound.
+    Median with its 95 % interval, of fewer than `FEW` seeds their range; trimmed filled, raw hollow; arrows
+    where a ratio is a bound.
     """
     scenes = scenes or results.scenes
     with plt.rc_context(PAPER):
@@ -220,6 +222,7 @@ def efficiencies(
         figure, axis = plt.subplots(
             figsize=(WIDTHS[columns], pitch * len(scenes) + 0.4), layout="constrained"
         )
+        counts: set[int] = set()
         for place, scene in enumerate(scenes):
             if place % 2:
                 axis.axhspan(place - 0.5, place + 0.5, color="#f3f3f3", zorder=0, linewidth=0)
@@ -227,7 +230,7 @@ def efficiencies(
             for i, rival in enumerate(here):
                 for j, error in enumerate(("rel_mse_trimmed", "rel_mse")):
                     y = place + 0.8 * ((2 * i + j + 0.5) / (2 * len(here)) - 0.5)
-                    _dot(axis, results, scene, rival, error, y, style(results.methods, rival))
+                    counts |= _dot(axis, results, scene, rival, error, y, style(results.methods, rival))
         axis.axvline(1, color="black", linewidth=0.6)
         axis.set(xscale="log", xlabel=f"efficiency of {results.methods[0]}, {results.deciding} spp")
         _ticks(axis.xaxis)
@@ -247,7 +250,7 @@ def efficiencies(
         handles += [
             Line2D([], [], label="trimmed", **plain),
             Line2D([], [], label="raw", markerfacecolor="white", **plain),
-            Line2D([], [], label="95 % interval", color="#666666", linewidth=0.8),
+            Line2D([], [], label=_interval(counts), color="#666666", linewidth=0.8),
         ]
         if axis.texts:
             arrows = plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
@@ -261,12 +264,22 @@ def _present(results: Results, scene: str, rivals: Sequence[str]) -> list[str]:
     return [rival for rival in rivals if results.of(scene, rival)]
 
 
-def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float, look: dict) -> None:
-    """Plot one efficiency with its interval at the height ``y``; nothing where there is none."""
+def _interval(counts: set[int]) -> str:
+    """Name what lines of medians of these ``counts`` of seeds show: that of few is their range."""
+    few = sorted(count for count in counts if count < FEW)
+    if not few:
+        return "95 % interval"
+    if len(few) < len(counts):
+        return f"95 % interval; range if n < {FEW}"
+    return f"range of {few[0]} seeds" if len(few) == 1 else f"range of {few[0]} to {few[-1]} seeds"
+
+
+def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float, look: dict) -> set[int]:
+    """Plot one efficiency with its interval at the height ``y``; return its number of seeds, if any."""
     try:
         ratio = results.efficiency(scene, rival, error)
     except Refused:
-        return
+        return set()
     face = look["color"] if error == "rel_mse_trimmed" else "white"
     axis.plot([ratio.low, ratio.high], [y, y], color=look["color"], linewidth=0.8)
     axis.plot(ratio.median, y, **look | {"markerfacecolor": face, "linestyle": "", "markeredgewidth": 0.6})
@@ -274,6 +287,7 @@ def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float,
     for bounds, end, away in (("≥~", ratio.high, 5), ("≤~", ratio.low, -5)):
         if ratio.bound and ratio.bound in bounds:
             axis.annotate("", (end, y), xytext=(away, 0), textcoords="offset points", arrowprops=arrow)
+    return {ratio.count}
 
 
 def rays(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None) -> None:
@@ -317,8 +331,9 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
     """Return images of a scene at the deciding budget, rivals first, and the reference.
 
-    Each integrator's image is of the seed with the median trimmed error. Captions have median seconds, and
-    say which integrators have equal samples in place of equal time.
+    Each integrator's image is of the seed with the median trimmed error. Captions have the median seconds and
+    the trimmed relMSE of all seeds, those of the tables, and say which integrators have equal samples in
+    place of equal time.
     """
     columns: list[crops.Column] = []
     for method in [*results.rivals, results.methods[0]]:
@@ -330,7 +345,8 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
         (image,), _ = read_layers(file, "")
         called = f"{method} (equal spp)" if method in results.at_equal_samples else method
         seconds = float(np.median([row["seconds"] for row in rows]))
-        columns.append(crops.judged(called, shown["spp"], seconds, image, kept.image))
+        error = results.error(scene, method)
+        columns.append(crops.judged(called, shown["spp"], seconds, error, image, kept.image))
     if not columns:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
     return crops.Block(scene, tuple(columns), kept.image)

@@ -25,8 +25,8 @@ from ..files.whole import check_own
 from .analysis import NOTHING, Refused, Results
 from .project import Project
 from .reference import HALF_MAX
-from .report import Report
-from .tables import ratio
+from .report import KINDS, Report
+from .tables import brief, ratio
 
 TITLE = "mitsuba-bdpt: sweep"
 """How the title of every page begins."""
@@ -49,7 +49,7 @@ COLUMNS = {
     "samples per pixel": "spp",
     "seconds": "seconds",
     "relMSE, trimmed": "rel_mse_trimmed",
-    "relMSE": "rel_mse",
+    "relMSE, raw": "rel_mse",
     "MAPE": "mape",
     "HDR-FLIP": "flip",
     "ΔE ITP": "delta_e_itp",
@@ -106,9 +106,10 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
             continue
         (image,), _ = read_layers(file, "")
         images[method] = encoded(image)
-        row = rows[0]
+        seconds = float(np.median([row["seconds"] for row in rows]))
         captions[method] = (
-            f"{method}: {row['spp']} samples per pixel, {row['seconds']:.3g} s, relMSE {row['rel_mse']:.2g}"
+            f"{method}: {rows[0]['spp']} samples per pixel, {seconds:.3g} s, "
+            f"relMSE {brief(results.error(scene, method))} (trimmed)"
         )
     bright = float(np.quantile(target.max(axis=-1), 0.95))
     return {
@@ -124,7 +125,7 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
 
 
 def lines(results: Results) -> list[list]:
-    """Return the table's lines: medians over seeds."""
+    """Return the table's lines: medians over seeds, relMSE as in reports, [number, bound] where it is one."""
     found = []
     for scene in results.scenes:
         for method in results.methods:
@@ -132,6 +133,10 @@ def lines(results: Results) -> list[list]:
                 rows = results.of(scene, method, budget)
                 line = [scene, method, budget, len(rows)]
                 for column in list(COLUMNS.values())[len(line) :]:
+                    if column in KINDS:
+                        error = results.error(scene, method, column, budget)
+                        line.append([error.total.value, error.bound] if error.bound else error.total.value)
+                        continue
                     values = [row[column] for row in rows if row[column] is not None]
                     middle = float(np.median(values)) if values else math.nan
                     line.append(middle if math.isfinite(middle) else None)

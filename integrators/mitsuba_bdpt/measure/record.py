@@ -15,6 +15,7 @@ class Errors(TypedDict):
     rel_mse_trimmed: float
     reference_rel_mse: float  # what the reference's own error adds to them
     reference_rel_mse_trimmed: float
+    variance: NotRequired[float | None]  # relMSE to the mean over seeds, without bias, `metrics.spread`
 
 
 class Measured(Errors):
@@ -64,4 +65,3 @@ class Row(Measured):
     mape: float
     flip: float | None  # of the first seed
     delta_e_itp: float
-    spread: float | None  # variance: relMSE to the mean over seeds, without bias, `metrics.spread`

@@ -44,12 +44,25 @@ from .analysis import (
     geometric_mean,
     summary,
 )
-from .metrics import Estimate, rel_mse_epsilon
+from .estimates import RelativeError
+from .metrics import rel_mse_epsilon
 from .project import Project
 from .record import Error, Row
 from .reference import Reference
 from .results import load, missing_of
-from .tables import by_scene, met_text, ranged, ratio, relative, replace_part, said, table
+from .tables import (
+    by_scene,
+    met_text,
+    positive,
+    ranged,
+    ratio,
+    relative,
+    replace_part,
+    said,
+    signed,
+    spanned,
+    table,
+)
 
 # -- tables -----------------------------------------------------------------------------------
 
@@ -99,19 +112,20 @@ def errors_table(results: Results) -> str:
                 lines.append(
                     [
                         *(f"`{scene}`", method, f"{np.median([row['spp'] for row in rows]):.0f}"),
-                        *(f"{np.median([row['seconds'] for row in rows]):.3g}", str(len(rows))),
-                        *(relative(trimmed), relative(raw)),
-                        "one render" if raw.variance is None else f"{raw.variance:.2e}",
-                        _squared(raw.squared_bias),
+                        *(spanned([row["seconds"] for row in rows]), str(len(rows))),
+                        *(relative(trimmed), relative(raw), *_parts(raw)),
                         results.lacks(scene, method) or said(_energy, results, scene, method),
                     ]
                 )
     return table(head, lines)
 
 
-def _squared(found: Estimate | None) -> str:
-    few = "fewer than three renders"
-    return few if found is None else f"{found.value:.2e} ({found.low:.2e} to {found.high:.2e})"
+def _parts(raw: RelativeError) -> tuple[str, str]:
+    """Format variance and squared bias, or why there are none."""
+    if raw.variance is None or raw.squared_bias is None:
+        why = "one render" if raw.count == 1 else "images are missing, or samples differ"
+        return why, why
+    return positive(raw.variance, raw.count), signed(raw.squared_bias, raw.count)
 
 
 def _energy(results: Results, scene: str, method: str) -> str:
@@ -672,9 +686,9 @@ MARK = "Made by `mitsuba-bdpt report`"
 
 
 def title(results: Results, folder: Path) -> str:
-    """Return the title: of the only scene, else of the folder, which has the preset's name."""
-    name = results.scenes[0] if len(results.scenes) == 1 else folder.resolve().name
-    return name[:1].upper() + name[1:]
+    """Return the title: the folder, which has the preset's name, and the scene if there is one only."""
+    name = folder.resolve().name
+    return ": ".join([name[:1].upper() + name[1:], *(results.scenes if len(results.scenes) == 1 else ())])
 
 
 def _clock(results: Results) -> str:
@@ -718,18 +732,63 @@ def missing_text(folder: Path) -> str:
     return f"**Renders are missing**, cut for lack of time: {cut}.{how}\n\n"
 
 
+# Standard deviations of the logarithm of seconds over seeds. Other programs ran where that of wall seconds is
+# `DISTURBED`, a fifth of the seconds, and `BUSY` times that of processor seconds, which the work alone sets.
+DISTURBED = 0.2
+BUSY = 3.0
+FEWEST_TIMED = 3
+
+
+def _is_disturbed(rows: Sequence[Row]) -> bool:
+    """Return whether wall seconds of equal work differ much more than its processor seconds."""
+    if len(rows) < FEWEST_TIMED or any(not row.get("cpu_seconds") for row in rows):
+        return False
+    wall, processor = (
+        float(np.std(np.log([row.get(name, 0.0) for row in rows]), ddof=1))
+        for name in ("seconds", "cpu_seconds")
+    )
+    return wall > max(DISTURBED, BUSY * processor)
+
+
+def busy_text(results: Results) -> str:
+    """Return the paragraph about scenes whose wall seconds other programs disturbed; or nothing."""
+    found: list[str] = []
+    for scene in results.scenes:
+        sides = {
+            name: results.of(scene, name, results.deciding) for name in (results.methods[0], *results.rivals)
+        }
+        disturbed = [f"{name} {_ranges(rows)}" for name, rows in sides.items() if _is_disturbed(rows)]
+        if disturbed:
+            found.append(f"`{scene}`: {', '.join(disturbed)}")
+    if not found:
+        return ""
+    why = "wall seconds differ over seeds where processor seconds do not, and so may efficiencies"
+    how = '`clock = "processor"` in the preset compares processor seconds; the sweep then renders anew'
+    return f"**Other programs ran meanwhile**: {why}. {'; '.join(found)}. {how}.\n\n"
+
+
+def _ranges(rows: Sequence[Row]) -> str:
+    wall, processor = (
+        "–".join(f"{end(row.get(name, 0.0) for row in rows):.3g}" for end in (min, max))
+        for name in ("seconds", "cpu_seconds")
+    )
+    return f"{wall} s (processor {processor} s)"
+
+
 def _introduction(results: Results) -> str:
     """Introduce the figures, with machine and software."""
     return f"""{MARK} from the data beside it. Machine and versions: {machine(results)}.
 
 Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
-median (smallest–largest) over seeds; the figure has the 95 % interval of the median, which is the same range
-for up to five seeds. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
+median (smallest–largest) over seeds; the figure has the 95 % interval of the median, for up to five seeds
+the same range. The range of five seeds holds the median in 94 % of cases, of four, three and two in 87, 75
+and 50 %. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
 without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. Its expectation is free
-of the reference's noise: raw, it is the variance over seeds; trimmed, the error against the reference less
-the reference's own. Where the mean of the renders differs from the reference, the squared bias is added, and
-the figure is a bound, since rare light that was not met is in no variance: ≥ where the other integrator's
-error is at least the one measured, ≤ where the first integrator's is, ~ where both are.
+of the reference's noise: raw, it is the variance over seeds; trimmed, and raw of one or two seeds, the
+error against the reference less its own. Where the mean of the renders differs from the reference, the
+squared bias is added, and the figure is a bound, since rare light that was not met is in no variance: ≥ where
+the other integrator's error is at least the one measured, ≤ where the first integrator's is, ~ where both
+are.
 {_equal_times(results)}
 {_equal_samples(results)}Where seeds were added until an interval was narrow enough, it is slightly too
 narrow (it holds the median in 90 % of cases, not 95 %).
@@ -756,7 +815,7 @@ def page(
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
     return f"""# {name}
 
-{missing}{_introduction(results)}
+{missing}{busy_text(results)}{_introduction(results)}
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
@@ -769,8 +828,9 @@ raw over trimmed relMSE at {results.deciding} samples per pixel:
 ## Errors
 
 At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds; of few
-seeds with rare bright values it is too narrow). Variance and squared bias add up to the raw error where the
-mean of the renders differs from the reference; elsewhere the squared bias is 0 within its noise, and may be
+seeds with rare bright values it is too narrow); of seconds the median (smallest–largest). Variance and
+squared bias add up to the raw error where the mean of the renders differs from the reference, and of two
+renders, which show no interval of them; elsewhere the squared bias is 0 within its noise, and may be
 negative. Energy: that of the image over the reference's, as a difference with its 95 % interval, or what is
 missing by the bias check.
 

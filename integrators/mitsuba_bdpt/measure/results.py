@@ -180,7 +180,7 @@ def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
     spreads = _spreads(output, cells, wanted, found) if found else {}
     first = {c.method: _first_image(output, c) for c in cells.of(min(cells.subject.spp), FIRST_SEED)}
     for row in found:
-        row |= {"spread": spreads[row["key"]], "first": preset.methods[0].name}
+        row |= {"variance": spreads[row["key"]], "first": preset.methods[0].name}
         row["seconds_first_image"] = first[row["method"]]
     return found
 
@@ -228,11 +228,18 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]
     return metrics.spread([_image(output, cell) for cell in group], load_reference(*cells.where()).image)
 
 
+def _stored(file: Path) -> list[Row]:
+    """Return the rows of a file; older sweeps have the variance as ``spread``."""
+    table = pyarrow.parquet.read_table(file)
+    names = ["variance" if name == "spread" else name for name in table.column_names]
+    return table.rename_columns(names).to_pylist()
+
+
 def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[Row]:
     """Return ``table`` and stored rows of other scenes, in ``order``; None: as stored, new ones last."""
     file, done = output / "rows.parquet", {row["scene"] for row in table}
     try:
-        others = pyarrow.parquet.read_table(file).to_pylist() if file.exists() else []
+        others = _stored(file) if file.exists() else []
     except pyarrow.ArrowInvalid as error:
         raise CommandError(
             f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
@@ -306,30 +313,30 @@ COLUMNS: dict[str, Callable[[Row], object]] = {
 }
 """First columns of rows.csv."""
 
-NUMBERS = {
-    "budget": "budget",
-    "equal_time_spp": "equal_time_spp",
-    "seconds": "seconds",
-    "cpu_seconds": "cpu_seconds",
-    "seconds_compile": "seconds_compile",
-    "seconds_pilot": "seconds_pilot",
-    "seconds_first_image": "seconds_first_image",
-    "rel_mse": "rel_mse",
-    "rel_mse_trimmed": "rel_mse_trimmed",
-    "reference_rel_mse": "reference_rel_mse",
-    "reference_rel_mse_trimmed": "reference_rel_mse_trimmed",
-    "variance": "spread",
-    "mse": "mse",
-    "mape": "mape",
-    "flip": "flip",
-    "delta_e_itp": "delta_e_itp",
-    "mean": "mean",
-    "energy": "energy",
-    "width": "width",
-    "height": "height",
-    "max_depth": "max_depth",
-}
-"""Further columns of rows.csv, and those of rows."""
+NUMBERS = (
+    "budget",
+    "equal_time_spp",
+    "seconds",
+    "cpu_seconds",
+    "seconds_compile",
+    "seconds_pilot",
+    "seconds_first_image",
+    "rel_mse",
+    "rel_mse_trimmed",
+    "reference_rel_mse",
+    "reference_rel_mse_trimmed",
+    "variance",
+    "mse",
+    "mape",
+    "flip",
+    "delta_e_itp",
+    "mean",
+    "energy",
+    "width",
+    "height",
+    "max_depth",
+)
+"""Further columns of rows.csv, named as in rows."""
 
 
 def _plain(parameters: str) -> str:
@@ -370,7 +377,7 @@ def write_tables(table: list[Row], output: Path) -> None:
     rays = [key for key in columns if key.startswith("rays_")]
     tidy = [
         {name: made(row) for name, made in COLUMNS.items()}
-        | {name: row.get(key) for name, key in (NUMBERS | dict(zip(rays, rays, strict=True))).items()}
+        | {name: row.get(name) for name in (*NUMBERS, *rays)}
         | {"image": image}
         for row, image in zip(table, _name_images(table, output), strict=True)
     ]
@@ -411,7 +418,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     no results, or if errors are against other references than the ``project``'s.
     """
     try:
-        rows = decisive(pyarrow.parquet.read_table(folder / "rows.parquet").to_pylist())
+        rows = decisive(_stored(folder / "rows.parquet"))
     except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
         raise CommandError(
             f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"

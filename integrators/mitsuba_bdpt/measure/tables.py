@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from ..errors import CommandError
 from .analysis import Refused, Summary
@@ -14,7 +15,8 @@ from .metrics import Estimate
 WIDE = 1e3
 """Ratio of the ends of an interval from which on it says nothing."""
 
-FEW = 5  # values, below which their number stands beside a range
+FEW = 5
+"""Values below which their number stands beside a range, since it holds the median too rarely."""
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -52,13 +54,39 @@ def ranged(found: Summary) -> str:
 
 
 def relative(found: RelativeError) -> str:
-    """Format bound, relMSE (its interval); without the interval of a single render."""
-    text = f"{found.bound} {found.total.value:.2e}".lstrip()
-    if math.isinf(found.total.high):
-        return f"{text} (one render)"
-    if found.total.high > WIDE * found.total.low:
-        return f"{text} (too few renders for an interval)"
-    return f"{text} ({found.total.low:.2e}–{found.total.high:.2e})"
+    """Format bound, relMSE (its interval), or why there is no interval."""
+    return f"{found.bound} {positive(found.total, found.count)}".lstrip()
+
+
+def positive(found: Estimate, count: int) -> str:
+    """Format a positive error of ``count`` renders (its interval), or why there is none."""
+    if math.isinf(found.high):
+        return f"{found.value:.2e} ({_no_interval(count)})"
+    if found.high > WIDE * found.low:
+        return f"{found.value:.2e} (too few renders for an interval)"
+    return f"{found.value:.2e} ({found.low:.2e}–{found.high:.2e})"
+
+
+def signed(found: Estimate, count: int) -> str:
+    """Format an error of ``count`` renders that may be negative (its interval), or why there is none."""
+    if math.isinf(found.high):
+        return f"{found.value:.2e} ({_no_interval(count)})"
+    return f"{found.value:.2e} ({found.low:.2e} to {found.high:.2e})"
+
+
+def _no_interval(count: int) -> str:
+    return "one render" if count == 1 else "two renders: no interval"
+
+
+def spanned(values: Sequence[float]) -> str:
+    """Format the median of positive values (smallest–largest)."""
+    middle, low, high = (f"{x:.3g}" for x in (statistics.median(values), min(values), max(values)))
+    return middle if len(values) == 1 else f"{middle} ({low}–{high})"
+
+
+def brief(found: RelativeError) -> str:
+    """Format bound and relMSE with two digits, for captions."""
+    return f"{found.bound} {found.total.value:.2g}".lstrip()
 
 
 def said(figure: Callable[..., object], *given: object) -> str:

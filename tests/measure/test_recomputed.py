@@ -1,0 +1,134 @@
+"""Figures of a report, computed again from rows.csv as docs/development/measuring.md says."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mitsuba_bdpt.measure import estimates, metrics, page, report, tables
+from mitsuba_bdpt.measure.agreement import Means, tile_columns
+from mitsuba_bdpt.measure.analysis import Results
+from mitsuba_bdpt.measure.reference import Reference
+from mitsuba_bdpt.measure.results import NUMBERS, relative_errors, write_tables
+from scipy import stats
+
+SHAPE = (32, 32, 3)
+TRUTH = np.random.default_rng(1).uniform(0.5, 2, SHAPE)
+PLAIN = {
+    "scene": "box",
+    "first": "bdpt",
+    "parameters": '{"type": "any"}',
+    "sampler": "independent",
+    "decisions": "[]",
+    "statistics": "{}",
+    "versions": "{}",
+    "machine": "a",
+    "started": "now",
+    "budget": 64,
+    "spp": 64,
+}
+
+
+def rendered(own):
+    """Rows of integrators of known noise: few, biased, with fireflies; and the reference's means.
+
+    ``own``: the reference's relative standard error.
+    """
+    rng = np.random.default_rng(4)
+
+    def noisy(level, sigma):
+        return TRUTH * (level + sigma * rng.standard_normal(SHAPE))
+
+    a, b = noisy(1, own * math.sqrt(2)), noisy(1, own * math.sqrt(2))
+    kept = Reference((a + b) / 2, (a - b) / 2, Means.of([tile_columns(noisy(1, own)) for _ in range(8)]), {})
+    sides = {
+        "bdpt": [noisy(1, 0.05) for _ in range(6)],
+        "path": [noisy(1, 0.2) + 9 * (rng.random(SHAPE) < 1e-3) for _ in range(6)],
+        "dark": [noisy(0.9, 0.1) for _ in range(6)],
+        "few": [noisy(0.9, 0.1) for _ in range(2)],
+    }
+    rows = []
+    for method, images in sides.items():
+        variances = metrics.spread(images, kept.image)
+        for seed, (image, variance) in enumerate(zip(images, variances, strict=True), 1):
+            seconds = {"seconds": float(rng.uniform(1, 2)), "cpu_seconds": 2.0}
+            names = {"method": method, "key": f"{method}{seed}", "seed": seed, "variance": variance}
+            measured = relative_errors(image, kept) | {"tile_means": tile_columns(image).tolist()}
+            rows.append(PLAIN | names | seconds | measured)
+    return rows, kept.means
+
+
+def errors(rows, kind, is_marked):
+    """The errors of an integrator's seeds, by the formulas of the page alone."""
+    measured = np.array([float(row[kind]) for row in rows])
+    own = np.array([float(row[f"reference_{kind}"]) for row in rows])
+    variance = np.array([float(row["variance"]) for row in rows])
+    is_noisy = own.sum() > 0.9 * measured.sum() or (measured - own).min() <= 0
+    is_variance = kind == "rel_mse" and (is_noisy if len(rows) < 3 else not is_marked)
+    if is_variance:
+        return variance if is_noisy else (measured - own) * variance.mean() / (measured - own).mean()
+    return measured if is_noisy else measured - own
+
+
+@pytest.mark.parametrize("own", [0.01, 0.2])
+def test_efficiencies_follow_from_the_table_of_renders(tmp_path, own):
+    """Rationale: readers of rows.csv came close to the raw efficiencies, not to them. Expected: by the
+    formulas of the page the table of efficiencies, to each digit, from the columns of rows.csv and the marks
+    of the table of errors; with a reference noisier than the renders too."""
+    rows, means = rendered(own)
+    write_tables(rows, tmp_path)
+    found = Results(rows, {"box": means}, {})
+    renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
+    marked = {name: found.error("box", name, "rel_mse").bound == "≥" for name in found.methods}
+    assert own > 0.1 or [name for name in marked if marked[name]] == ["dark"]
+    cells = []
+    for rival in ("path", "dark", "few"):
+        for kind in ("rel_mse_trimmed", "rel_mse"):
+            sides = []
+            for name in ("bdpt", rival):
+                here = [row for row in renders if row["integrator"] == name]
+                seconds = np.array([float(row["seconds"]) for row in here])
+                sides.append(seconds * errors(here, kind, marked[name]))
+            ratios = sides[1] / sides[0][: len(sides[1])]
+            cells.append(f"{tables.ratio(np.median(ratios))} ({ratios.min():.3g}–{ratios.max():.3g}")
+    line = report.efficiency_table(found).splitlines()[2]
+    for cell, text in zip(cells, line.split(" | ")[1:], strict=False):
+        assert text.lstrip("≥≤~ ").startswith(cell)
+
+
+def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
+    """Expected: variance, raw relMSE and squared bias with their intervals by the formulas of the page."""
+    rows, means = rendered(0.01)
+    write_tables(rows, tmp_path)
+    renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
+    variance = np.array([float(row["variance"]) for row in renders if row["integrator"] == "path"])
+    n = len(variance)
+    without = np.log((variance.sum() * (n - 1) / n - variance) / (n - 2))
+    error = math.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2))
+    factor = math.exp(stats.t.ppf(0.975, n - 1) * error)
+    found = Results(rows, {"box": means}, {}).error("box", "path", "rel_mse")
+    expected = estimates.Estimate(variance.mean(), variance.mean() / factor, variance.mean() * factor)
+    for end in ("value", "low", "high"):
+        assert getattr(found.total, end) == pytest.approx(getattr(expected, end))
+        assert getattr(found.variance, end) == pytest.approx(getattr(expected, end))
+
+
+def test_pages_have_the_errors_of_the_table():
+    """Rationale: the page had the measured error of the first seed, with the reference's in it. Expected: in
+    its table of renders the errors of the report, with their bounds."""
+    rows, means = rendered(0.1)
+    others = dict.fromkeys(("mape", "flip", "delta_e_itp"))
+    found = Results([row | others for row in rows], {"box": means}, {})
+    for line in page.lines(found):
+        cells = dict(zip(page.COLUMNS, line, strict=True))
+        for head, kind in (("relMSE, trimmed", "rel_mse_trimmed"), ("relMSE, raw", "rel_mse")):
+            error = found.error("box", cells["integrator"], kind)
+            assert cells[head] == ([error.total.value, error.bound] if error.bound else error.total.value)
+
+
+def test_the_columns_of_the_table_are_described():
+    """Expected: each column of rows.csv has a line on the page about measuring."""
+    text = (Path(__file__).resolve().parents[2] / "docs" / "user" / "measuring_scenes.md").read_text()
+    for name in ("scene", "integrator", "parameters", "sampler", "spp", "seed", "clock", *NUMBERS, "image"):
+        assert f"`{name}`" in text.partition("## Columns of rows.csv")[2].partition("\n## ")[0]
