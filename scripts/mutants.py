@@ -128,16 +128,16 @@ MUTANTS = (
     Mutant(
         "light groups: names of layers go to ids that become them",
         "emitters/light_groups.py",
-        "if ids[i] and layer_name(ids[i][0]) == ids[i][0] != REST:",
-        "if ids[i] and layer_name(ids[i][0]) != REST:",
+        "if ids[i] and _layer_name(ids[i][0]) == ids[i][0] != REST:",
+        "if ids[i] and _layer_name(ids[i][0]) != REST:",
         ("tests/images/test_light_groups.py::test_an_id_wins_over_a_made_name",),
     ),
     Mutant(
-        "light groups: an id in a mix is the first lamp like it",
+        "light groups: the id of a lamp dims all of its group",
         "files/mixing.py",
-        "    if candidates:\n",
-        "    if False:\n",
-        ("tests/cli/test_mix.py::test_an_id_does_not_switch_another_lamp",),
+        "if 0 < len(own) < len(lamps):",
+        "if False:",
+        ("tests/cli/test_mix.py::test_ids_are_names_of_groups_of_one",),
     ),
     Mutant(
         "light groups: splats have none",

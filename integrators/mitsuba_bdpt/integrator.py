@@ -187,6 +187,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         invalid = planner.lost_by_pilots()
         warning = render.explained_warning().removeprefix(UsageError.prefix)
         text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, warning)
+        if render.light_groups is not None:
+            text = "\n".join([text, *render.light_groups.explained()])
         if spp is None and is_open(render.plan, self.settings):
             return (
                 f"{text}\nno spp given: this is the plan before the pilot; with spp=..., the scene or a "

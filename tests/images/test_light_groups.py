@@ -1,5 +1,7 @@
 """Light groups: layers of the image by emitter."""
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -126,6 +128,8 @@ def test_a_resumed_and_a_joined_render_keep_the_layers():
     start = stopped(method, target, 1, spp=8, seed=3)
     names, resumed = method.aov_names(), np.array(method.render(target, spp=8, seed=3, start=start))
     assert names[-1] == "groups.rest.B"
+    known = method.statistics["light_groups"]
+    assert list(known) == list(groups) and sorted(itertools.chain(*known.values())) == sorted(LAMPS)
     np.testing.assert_allclose(resumed[..., -9:], np.concatenate(list(groups.values()), -1), **ROUNDING)
     parts = [stopped(method, target, None, spp=8, seed=seed) for seed in (3, 4)]
     joined = np.array(method.assemble(parts[0].joined(parts[1]), target), dtype=np.float64)
@@ -184,6 +188,7 @@ def test_emitters_without_id_go_by_their_plugin():
     target = mi.load_string(f'<scene version="3.0.0">{shape}{shape}<emitter type="constant"/></scene>')
     made = LightGroups.of(target, "auto")
     assert made.names == ("area", "area_2", "constant")
+    assert made.explained()[0] == "light group area: area at (0, 0, 0)"
     assert LightGroups.of(target, "sky: constant").names == ("sky", "rest")
     same = LightGroups.of(target, "area: area; area_2: area_2; constant: constant")
     assert (same.names, same.of_emitters) == (made.names, made.of_emitters)

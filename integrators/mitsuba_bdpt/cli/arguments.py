@@ -122,9 +122,10 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add("image", type=Path, help="EXR file that was rendered with light_groups or path_layers")
     text = (
         "factor of the light of a group or path layer (of one kind at a time), or three for red, green and "
-        "blue; 1 for layers that are left out; * and ? in a name stand for any characters"
+        "blue; 1 for layers that are left out; * and ? in a name stand for any characters; without any, the "
+        "layers are listed"
     )
-    add("weights", type=weight, nargs="+", metavar="LAYER=X[,Y,Z]", help=text)
+    add("weights", type=weight, nargs="*", metavar="LAYER=X[,Y,Z]", help=text)
     text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
     add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import check_output, developed, grey, has_channels, write_whole
-from ..files.mixing import mix
+from ..files.mixing import described, mix
 from ..image.layers import DENOISED
 from .mistakes import answered
 
@@ -36,6 +36,9 @@ def _check_not_replaced(image: Path, output: Path) -> None:
 
 def _run(options: Namespace) -> int:
     mi.set_variant(options.variant)
+    if not options.weights:
+        print(described(options.image))
+        return 0
     output: Path = options.output or options.image.with_suffix(".mixed.png")
     is_exr = output.suffix.lower() == ".exr"
     if not is_exr and output.suffix.lower() != ".png":

@@ -18,7 +18,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError, behind
-from ..files.images import check_channels, check_output, check_png, write_images, write_png
+from ..files.images import (
+    STATISTICS,
+    check_channels,
+    check_output,
+    check_png,
+    write_images,
+    write_png,
+)
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
@@ -140,7 +147,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
             print("interrupted before the first pass was over; no image written", file=sys.stderr)
             return False
         found = report(outcome)
-        attributes = {"bdptSettings": json.dumps(settings(job, spp)), "bdptStatistics": json.dumps(found)}
+        attributes = {"bdptSettings": json.dumps(settings(job, spp)), STATISTICS: json.dumps(found)}
         if job.checkpoint is not None and not outcome.interrupted:
             attributes[checkpoints.IDENTITY] = checkpoints.identity(job, spp)
         write(sensor.film(), job, attributes)

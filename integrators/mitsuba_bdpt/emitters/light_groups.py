@@ -71,6 +71,12 @@ def _error(text: str, what: str) -> UsageError:
     return UsageError(f"light_groups={' '.join(text.split())!r}: {what}")
 
 
+def listed(names: Sequence[str], most: int) -> str:
+    """Join the first ``most`` names, and say how many there are beside them."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
 def is_pattern(name: str) -> bool:
     """Return whether ``name`` has ``*`` or ``?``, which stand for any characters, or for any one."""
     return "*" in name or "?" in name
@@ -81,17 +87,20 @@ def matches(name: str, pattern: str) -> bool:
     return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
 
 
-def layer_name(emitter_id: str, keep: str = "") -> str:
-    """Return the name of a layer for an id: other characters than letters, digits, _, - become _.
-
-    ``keep``: characters that stay too.
-    """
-    return re.sub(f"[^A-Za-z0-9_{re.escape(keep)}-]", "_", emitter_id)
+def _layer_name(emitter_id: str) -> str:
+    """Return the name of a layer for an id: other characters than letters, digits, _, - become _."""
+    return re.sub("[^A-Za-z0-9_-]", "_", emitter_id)
 
 
 def _ids(emitter: mi.Emitter) -> list[str]:
     """Return an emitter's ids: its shape's and its own, if they have one."""
     return [owner.id() for owner in (emitter.get_shape(), emitter) if owner is not None and owner.id()]
+
+
+def _place(emitter: mi.Emitter) -> str:
+    """Say where an emitter is, if it is on a shape."""
+    shape = emitter.get_shape()
+    return "" if shape is None else " at ({:.3g}, {:.3g}, {:.3g})".format(*shape.bbox().center())
 
 
 def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
@@ -109,13 +118,13 @@ def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
     in_order = sorted(range(len(emitters)), key=order)
     own: dict[str, int] = {}
     for i in in_order:
-        if ids[i] and layer_name(ids[i][0]) == ids[i][0] != REST:
+        if ids[i] and _layer_name(ids[i][0]) == ids[i][0] != REST:
             own.setdefault(ids[i][0], i)
     found = {i: name for name, i in own.items()}
     last = Counter({REST: 1} | {emitter_id: 1 for of_one in ids for emitter_id in of_one})
     for i in (i for i in in_order if i not in found):
         plugin = emitters[i].class_name()
-        base = layer_name((ids[i] or [PLUGINS.get(plugin, plugin)])[0])
+        base = _layer_name((ids[i] or [PLUGINS.get(plugin, plugin)])[0])
         name = base
         while name in last:
             last[base] += 1
@@ -129,11 +138,26 @@ class LightGroups:
     """The light groups of a scene.
 
     ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter;
+    ``lamps``: ids of the emitters of each group, or the names that ``auto`` gives those without, whose
+    ``places`` are texts by these names;
     ``warnings``: of patterns that match no emitter.
     """
 
-    def __init__(self, names: list[str], of_emitters: list[int], warnings: Sequence[str] = ()):
+    def __init__(
+        self,
+        names: list[str],
+        of_emitters: list[int],
+        lamps: list[str],
+        places: dict[str, str],
+        warnings: Sequence[str] = (),
+    ):
+        self._places = places
         self.names, self.of_emitters, self.warnings = tuple(names), tuple(of_emitters), tuple(warnings)
+        self.lamps: dict[str, list[str]] = {name: [] for name in names}
+        for group, lamp in zip(of_emitters, lamps, strict=True):
+            self.lamps[names[group]].append(lamp)
+        for of_group in self.lamps.values():
+            of_group.sort(key=by_numbers)
         self._table = mi.UInt32(of_emitters)
         dr.make_opaque(self._table)
 
@@ -149,13 +173,22 @@ class LightGroups:
         emitters = in_order(scene)
         if not emitters:
             raise _error(text, "the scene has no emitters; leave light_groups out")
-        groups = parsed(text)
-        chosen, warnings = _matched(text, groups, emitters) if groups else (_own(emitters), [])
+        groups, made = parsed(text), _layer_names(emitters)
+        chosen, warnings = _matched(text, groups, emitters, made) if groups else (_own(made), [])
         names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
         if len(chosen) < len(emitters):
             names.append(REST)
         of_emitters = [names.index(chosen.get(i, REST)) for i in range(len(emitters))]
-        return LightGroups(names, of_emitters, warnings)
+        lamps = [(_ids(emitter) or [name])[0] for emitter, name in zip(emitters, made, strict=True)]
+        places = {name: _place(e) for e, name in zip(emitters, made, strict=True) if not _ids(e)}
+        return LightGroups(names, of_emitters, lamps, places, warnings)
+
+    def explained(self) -> list[str]:
+        """Describe each group by its emitters, with the places of those without id."""
+        placed = {
+            name: [lamp + self._places.get(lamp, "") for lamp in lamps] for name, lamps in self.lamps.items()
+        }
+        return [f"light group {name}: {listed(lamps, 20) or 'none'}" for name, lamps in placed.items()]
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Return the groups of the emitters ``index``."""
@@ -163,15 +196,17 @@ class LightGroups:
 
 
 def _matched(
-    text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter]
+    text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter], names: list[str]
 ) -> tuple[dict[int, str], list[str]]:
-    """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`."""
-    names = _layer_names(emitters)
+    """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`.
+
+    ``names``: `_layer_names` of the ``emitters``.
+    """
     real = [_ids(emitter) for emitter in emitters]
     known = [list(dict.fromkeys([*ids, made])) for ids, made in zip(real, names, strict=True)]
     every = sorted({name for of_one in known for name in of_one})
     one_each = sorted({of_one[0] for of_one in known})
-    there = f"Emitters: {', '.join(one_each[:20])}" + (", ..." if len(one_each) > 20 else "")
+    there = f"Emitters: {listed(one_each, 20)}"
     there += f"; {_SEPARATORS}" if re.search("[,;]", "".join(every)) else ""
     found: dict[int, str] = {}
     unmatched: list[tuple[str, str]] = []
@@ -182,7 +217,8 @@ def _matched(
         if not own and is_pattern(pattern):
             unmatched.append((name, pattern))
         elif not own:
-            remedy = f"{did_you_mean(pattern, every, parts=True)}{there}"
+            colon = "separate groups by ;, not by a comma. " if ":" in pattern else ""
+            remedy = f"{colon}{did_you_mean(pattern, every, parts=True)}{there}"
             raise _error(text, f"no emitter, and no shape with one, has the id {pattern!r}; {remedy}")
         for i in own:
             if found.setdefault(i, name) != name:
@@ -198,9 +234,9 @@ def _matched(
     ]
 
 
-def _own(emitters: Sequence[mi.Emitter]) -> dict[int, str]:
-    """Return a name for each of the first `MOST_OWN` emitters by name, by index."""
-    named = sorted(enumerate(_layer_names(emitters)), key=lambda item: by_numbers(item[1]))
+def _own(names: Sequence[str]) -> dict[int, str]:
+    """Return the ``names`` of the first `MOST_OWN` emitters by name, by index."""
+    named = sorted(enumerate(names), key=lambda item: by_numbers(item[1]))
     return dict(named[:MOST_OWN])
 
 

@@ -50,6 +50,10 @@ def check_png(film: mi.Film) -> None:
         )
 
 
+STATISTICS = "bdptStatistics"
+"""Attribute of an EXR's header: the statistics of its render, as JSON."""
+
+
 def attribute(path: Path, name: str) -> str | None:
     """Return a text of an EXR header; None if it is missing, or the file is no EXR."""
     found = _header(path).get(name)

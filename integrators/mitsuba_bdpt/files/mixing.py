@@ -6,14 +6,16 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.light_groups import REST, by_numbers, is_pattern, layer_name, matches
+from ..emitters.light_groups import REST, is_pattern, listed, matches
 from ..errors import CommandError, UsageTypeError, did_you_mean
 from ..image.layers import GROUP, PATH
+from .images import STATISTICS, attribute
 
 Weight = float | Sequence[float]
 
@@ -28,13 +30,26 @@ WEIGHTS = "bdptMix"
 _Layers = dict[str, dict[str, np.ndarray]]
 
 
+@dataclass(frozen=True)
+class _Image:
+    """Layers of an image with a ``name`` for messages, by the prefix of their partition.
+
+    ``lamps``: ids of the emitters of each light group, if the file has them.
+    """
+
+    name: str
+    partitions: dict[str, _Layers]
+    lamps: dict[str, list[str]] = field(default_factory=dict)
+
+
 def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitmap:
     """Return the image with the light of each group, or of each path layer, multiplied by a weight.
 
     ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
     ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
-    for layers that are left out. ``groups.NAME``, ``path.NAME`` and ids of emitters are names too; in names
-    ``*`` and ``?`` stand for any characters; a pattern that matches no layer is a warning. The result has the
+    for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too, and in a file that the
+    command has rendered ids of emitters, if their group has no other; in names ``*`` and ``?`` stand for any
+    characters; a pattern that matches no layer is a warning. The result has the
     layers' colours, the image's alpha if it has one, in single precision, and the weights as JSON in the
     metadata ``bdptMix``. Raises ``CommandError``, and ``UsageTypeError`` for other types.
     """
@@ -44,9 +59,9 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
         raise UsageTypeError(f"weights={type(weights).__name__} must be a dictionary, by names of layers")
     name = "the image" if isinstance(image, mi.Bitmap) else repr(str(image))
     channels = _channels(image)
-    partitions = _partitions(name, channels)
-    prefix, own = _chosen(name, partitions, weights)
-    layers = partitions[prefix]
+    read = _Image(name, _partitions(name, channels), {} if isinstance(image, mi.Bitmap) else _lamps(image))
+    prefix, own = _chosen(read, weights)
+    layers = read.partitions[prefix]
     colours = list(next(iter(layers.values())))
     if set(colours) == set("RGB"):  # files have them in another order
         colours = list("RGB")
@@ -78,6 +93,16 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     return result
 
 
+def described(path: Path) -> str:
+    """Describe the layers of an EXR that can be mixed, a line for each; raises like `mix`."""
+    lamps = _lamps(path)
+    return "\n".join(
+        f"{prefix}{layer}" + (f": {listed(lamps[layer], 20)}" if prefix == GROUP and layer in lamps else "")
+        for prefix, layers in _partitions(repr(str(path)), _channels(path)).items()
+        for layer in layers
+    )
+
+
 def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
     """Return the layers of each partition of an image, by prefix: those with the image's colours."""
     image = {channel for channel in channels if "." not in channel} - {"A"}
@@ -104,21 +129,24 @@ def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str
     return found
 
 
-def _chosen(
-    image: str, partitions: dict[str, _Layers], weights: Mapping[str, Weight]
-) -> tuple[str, dict[str, str]]:
+def _lamps(path: Path | str) -> dict[str, list[str]]:
+    """Return the ids of the emitters of each light group, as the header of an EXR has them."""
+    return json.loads(attribute(Path(path), STATISTICS) or "{}").get("light_groups", {})
+
+
+def _chosen(image: _Image, weights: Mapping[str, Weight]) -> tuple[str, dict[str, str]]:
     """Return the prefix of the partition to which all names of ``weights`` belong, and the name by layer.
 
     Exact names win over patterns. Warns of patterns without a layer, unless all names are such.
     """
-    every = {name: _found(image, partitions, name) for name in weights}
+    every = {name: _found(image, name) for name in weights}
     found = {name: of_name for name, of_name in every.items() if of_name is not None}
     for name in (name for name in every if name not in found):
-        text = _missing(image, partitions, name)
+        text = _missing(image, name)
         if not found:
             raise CommandError(text)
         mi.Log(mi.LogLevel.Warn, f"bdpt: {name!r} changes nothing: {text}")
-    chosen = next((prefix for prefix, _ in found.values()), next(iter(partitions)))
+    chosen = next((prefix for prefix, _ in found.values()), next(iter(image.partitions)))
     for name, (prefix, _) in found.items():
         if prefix != chosen:
             raise CommandError(
@@ -134,7 +162,7 @@ def _chosen(
     return chosen, own
 
 
-def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, list[str]] | None:
+def _found(image: _Image, name: str) -> tuple[str, list[str]] | None:
     """Return the prefix of the partition and the layers of this ``name``, id or pattern.
 
     None for a pattern without a layer.
@@ -143,54 +171,58 @@ def _found(image: str, partitions: dict[str, _Layers], name: str) -> tuple[str, 
     def fitting(fits: Callable[[str, str], bool]) -> dict[str, list[str]]:
         text = name if isinstance(name, str) else ""
         found = {
-            prefix: [layer for layer in partitions[prefix] if fits(layer, text.removeprefix(prefix))]
-            for prefix in partitions
+            prefix: [layer for layer in layers if fits(layer, text.removeprefix(prefix))]
+            for prefix, layers in image.partitions.items()
         }
         return {prefix: layers for prefix, layers in found.items() if layers}
 
-    exact = fitting(str.__eq__)
-    found = exact or fitting(lambda layer, text: matches(layer, layer_name(text, keep="*?")))
+    found = fitting(str.__eq__) or fitting(matches) or _of_lamps(image, name)
     if len(found) > 1:
         either = " or ".join(prefix + name for prefix in found)
         if is_pattern(name):
             raise CommandError(f"{name!r} matches light groups and path layers; write {either}")
-        raise CommandError(f"{image} has a light group and a path layer {name!r}; write {either}")
-    if found and not exact and not is_pattern(name) and GROUP in found:
-        _check_is_one(name, found[GROUP][0], list(partitions[GROUP]))
+        raise CommandError(f"{image.name} has a light group and a path layer {name!r}; write {either}")
     if not found and not (isinstance(name, str) and is_pattern(name)):
-        raise CommandError(_missing(image, partitions, name))
+        raise CommandError(_missing(image, name))
     return next(iter(found.items()), None)
 
 
-def _check_is_one(name: str, layer: str, layers: list[str]) -> None:
-    """Raise ``CommandError`` if the emitter of the id ``name`` may have another layer than ``layer``.
+def _of_lamps(image: _Image, name: str) -> dict[str, list[str]]:
+    """Return the light groups of the emitters whose ids fit ``name``, by the prefix of groups.
 
-    ``light_groups=auto`` numbers names that are taken; of many emitters, the last by name are in `REST`.
+    Raises ``CommandError`` if such a group has other emitters too.
     """
-    candidates = [
-        other for other in layers if re.fullmatch(rf"{re.escape(layer)}_([2-9]|[1-9][0-9]+)", other)
-    ]
-    last = max((other for other in layers if other != REST), key=by_numbers)
-    if REST in layers and by_numbers(last) < by_numbers(f"{layer}_2"):
-        candidates.append(REST)
-    if candidates:
-        raise CommandError(
-            f"{name!r} may be the id of the light of {' or '.join([layer, *candidates])}; write the "
-            "name of the layer (an id of letters, digits, _ and - is one; other ids like it have numbers)"
-        )
+    text, layers = str(name).removeprefix(GROUP), []
+    for group, lamps in image.lamps.items():
+        own = [lamp for lamp in lamps if matches(lamp, text)]
+        if text in lamps:
+            own = [text]
+        if 0 < len(own) < len(lamps):
+            others = [lamp for lamp in lamps if lamp not in own]
+            raise CommandError(
+                f"{own[0]!r} is in the group {group}, with {listed(others, 5)}: {group}=X changes all of "
+                "these; to change it alone, render it with a group of its own"
+            )
+        layers += [group] if own else []
+    return {GROUP: layers} if layers else {}
 
 
-def _missing(image: str, partitions: dict[str, _Layers], name: str) -> str:
+def _missing(image: _Image, name: str) -> str:
     """Return a message that no layer has this ``name``."""
     there = "; ".join(
-        f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in partitions.items()
+        f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in image.partitions.items()
     )
-    names = [layer for layers in partitions.values() for layer in layers]
+    names = [layer for layers in image.partitions.values() for layer in layers]
+    names += [lamp for lamps in image.lamps.values() for lamp in lamps]
     question = did_you_mean(str(name), names, parts=True)
-    rest = (
-        f"; the light of emitters in no other group is in {REST}" if REST in partitions.get(GROUP, ()) else ""
-    )
-    return f"{image} has no layer {name!r}; {question}{there}{rest}"
+    rest = ""
+    if REST in image.partitions.get(GROUP, ()):
+        rest = (
+            f"; {REST} has the light of {listed(image.lamps[REST], 5)}"
+            if REST in image.lamps
+            else (f"; the light of emitters in no other group is in {REST}")
+        )
+    return f"{image.name} has no layer {name!r}; {question}{there}{rest}"
 
 
 def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:

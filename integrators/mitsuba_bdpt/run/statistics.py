@@ -149,6 +149,8 @@ class Statistics(TypedDict):
     """The same in the pilots."""
     unsampled_light: NotRequired[dict[int, float]]
     """Estimated share of the image's light that no strategy samples, by index in ``scene.emitters()``."""
+    light_groups: NotRequired[dict[str, list[str]]]
+    """Ids of the emitters of each light group, with ``light_groups``."""
     error: NotRequired[float | None]
     """Estimated relMSE, with ``variance``."""
     kernels: dict[str, int]
@@ -202,6 +204,8 @@ def statistics(render) -> Statistics:
         found["media"] = {name: counts[name] for name in MEDIA}
     if render.settings.merging:
         found["merging"] = {name: counts[name] for name in MERGING}
+    if render.light_groups is not None:
+        found["light_groups"] = {name: list(lamps) for name, lamps in render.light_groups.lamps.items()}
     if render.settings.variance:
         found["error"] = accumulator.error()
     return found
