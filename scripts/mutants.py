@@ -2088,6 +2088,20 @@ MUTANTS = (
         ("tests/measure/test_estimates.py::test_the_variance_of_an_unbiased_integrator[0.05]",),
     ),
     Mutant(
+        "errors: two renders, which no test can judge, leave out the bias",
+        "measure/estimates.py",
+        "return not differs and len(rows) >= FEWEST_TESTED and _has_variance(rows)",
+        "return not differs and _has_variance(rows)",
+        ("tests/measure/test_estimates.py::test_an_untested_error_has_the_bias[2]",),
+    ),
+    Mutant(
+        "errors: the jackknife of the variance takes deviations from one mean for independent ones",
+        "measure/estimates.py",
+        "return ((n - 1) / n * spread.sum() - spread) / (n - 2)",
+        "return (spread.sum() - spread) / (n - 1)",
+        ("tests/measure/test_estimates.py::test_the_interval_of_the_variance_is_that_without_each_render",),
+    ),
+    Mutant(
         "sweeps: a time limit leaves no second render of the smallest budget",
         "measure/limited.py",
         "return is_least or (left > 0 and self._predicted(group) <= left)",
