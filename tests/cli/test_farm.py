@@ -197,8 +197,8 @@ def sensors(count):
 
 
 def test_frames_are_sensors(capsys):
-    """Expected: an image of each, with its number in the name; a sensor that is not there, and options of one
-    image, are errors before any is rendered.
+    """Expected: an image of each, with its number in the name, of a seed of its own; a sensor that is not
+    there, and options of one image, are errors before any is rendered.
     """
     sensors(3)
     assert main(["render", "frames.xml", "--frames", "0-2:2", "--spp", "2", "-o", "out/shot.exr"]) == 0
@@ -209,6 +209,10 @@ def test_frames_are_sensors(capsys):
             abs(np.median(rendered.image(f"out/shot.{number:04d}.exr", "RGB")[0]) / (number + 1) - 1) < 0.02
         )
     assert capsys.readouterr().out.count("\n") == 2
+    assert main(["render", "frames.xml", "-s", "2", "--seed", "2", "--spp", "2", "-o", "one.exr"]) == 0
+    alone, frame = rendered.image("one.exr", "RGB")[0], rendered.image("out/shot.0002.exr", "RGB")[0]
+    np.testing.assert_allclose(alone, frame, rtol=1e-3)  # half precision
+    capsys.readouterr()
     for arguments, words in (
         (["--frames", "0-3"], "sensor=3 is not in the scene"),
         (["--frames", "0", "-s", "1"], "frames together with sensor"),

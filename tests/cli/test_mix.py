@@ -89,31 +89,32 @@ def test_names_may_be_patterns(tmp_path):
     assert (np.array(mix(tmp_path / "a.exr", {"c*": 2, "*direct": 0})) == 17).all()
 
 
-LAMPS = {"A_1": ["A_1"], "A_1_2": ["A.1"], "desk": ["Key Light", "Lämpchen=1"], "rest": list("abcdefg")}
+LAMPS = {
+    "A_1": [["A_1"]],
+    "A_1_2": [["A.1", "bulb"]],
+    "desk": [["Key Light"], ["Lämpchen=1"]],
+    "rest": [[one] for one in "abcdefg"],
+}
 
 
 def test_ids_are_names_of_groups_of_one(tmp_path):
     """Rationale: layers have _ in place of other signs, and numbers where names are taken. Expected: an id
     weights the group of its emitter alone; where that has others, an error names group and others; a name of
-    a layer is that layer; a pattern of ids may fit all emitters of a group; the weight follows the last =."""
+    a layer is that layer; a pattern fits layers and ids; the weight follows the last =."""
     layers = rendered(tmp_path / "a.exr", groups=LAMPS, lamps=LAMPS)
-    cases = {"A_1": "A_1", "A.1": "A_1_2", "groups.A.1": "A_1_2", "A.?": "A_1_2", "desk": "desk", "*ä*": ""}
-    for name, off in cases.items():
-        mixed = [layer for group, layer in layers.items() if group != off]
-        if not off:
-            with pytest.raises(
-                CommandError, match="'Lämpchen=1' is in the group desk, with Key Light: desk=X "
-            ):
-                mix(tmp_path / "a.exr", {name: 0})
-            continue
+    cases = {"A_1": "A_1", "A.1": "A_1_2", "groups.A.1": "A_1_2", "A.?": "A_1_2", "bulb": "A_1_2"}
+    for name, off in [*((name, (group,)) for name, group in cases.items()), ("A?1", ("A_1", "A_1_2"))]:
+        mixed = [layer for group, layer in layers.items() if group not in off]
         np.testing.assert_allclose(np.array(mix(tmp_path / "a.exr", {name: 0})), sum(mixed), rtol=1e-6)
-    with pytest.raises(CommandError, match="'c' is in the group rest, with a, b, d, e, f and 1 more: rest=X"):
-        mix(tmp_path / "a.exr", {"c": 0})
-    with pytest.raises(
-        CommandError, match="no layer 'z'; .*; rest has the light of a, b, c, d, e and 2 more"
-    ):
-        mix(tmp_path / "a.exr", {"z": 0})
-    alone = {"lamp": ["Lamp=1"], "sky": ["sky"]}
+    for name, words in {
+        "*ä*": r"'\*ä\*' fits the lamp 'Lämpchen=1' of the group desk, which has Key Light too: desk=X ",
+        "c": "'c' fits the lamp 'c' of the group rest, which has a, b, d, e, f and 1 more too: rest=X",
+        "d*": r"'d\*' fits the lamp 'd' of the group rest",
+        "z": "no layer 'z'; .*; rest has the light of a, b, c, d, e and 2 more",
+    }.items():
+        with pytest.raises(CommandError, match=words):
+            mix(tmp_path / "a.exr", {name: 0})
+    alone = {"lamp": [["Lamp=1"]], "sky": [["sky"]]}
     layers = rendered(tmp_path / "a.exr", groups=alone, lamps=alone)
     assert main(["mix", str(tmp_path / "a.exr"), "Lamp=1=0", "-o", str(tmp_path / "b.exr")]) == 0
     assert np.array_equal(np.array(mi.Bitmap(str(tmp_path / "b.exr"))), layers["sky"])
@@ -121,11 +122,13 @@ def test_ids_are_names_of_groups_of_one(tmp_path):
 
 def test_without_weights_the_layers_are_listed(tmp_path, capsys):
     """Expected: a line for each layer, with the emitters of each light group."""
-    rendered(tmp_path / "a.exr", groups=LAMPS, paths=PATHS, lamps=LAMPS)
+    lamps = LAMPS | {"none": []}
+    rendered(tmp_path / "a.exr", groups=lamps, paths=PATHS, lamps=lamps)
     assert main(["mix", str(tmp_path / "a.exr")]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "groups.desk: Key Light, Lämpchen=1" in lines and "path.caustic" in lines
-    assert len(lines) == len(LAMPS) + len(PATHS) and not (tmp_path / "a.mixed.png").exists()
+    assert "groups.A_1_2: A.1 (bulb)" in lines and "groups.none: no emitter (black)" in lines
+    assert len(lines) == len(lamps) + len(PATHS) and not (tmp_path / "a.mixed.png").exists()
 
 
 def test_a_pattern_may_match_no_layer(tmp_path, capsys):
@@ -158,7 +161,11 @@ def test_a_mix_records_its_weights(tmp_path):
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "k*=0.5,1,2", "-o", str(tmp_path / "b.exr")]) == 0
     assert json.loads(attribute(tmp_path / "b.exr", "bdptMix") or "") == {"groups.key": [0.5, 1, 2]}
-    metadata = mix(tmp_path / "a.exr", {"groups.sky": 3}).metadata()
+    again = mix(tmp_path / "a.exr", {"groups.sky": 3})
+    for one in (tmp_path / "b.exr", again):
+        with pytest.raises(CommandError, match="is a mix, which has no layers; mix the render"):
+            mix(one, {"key": 1})
+    metadata = again.metadata()
     assert json.loads(metadata["bdptMix"]) == {"groups.sky": [3, 3, 3]}
 
 

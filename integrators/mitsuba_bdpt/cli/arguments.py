@@ -21,6 +21,7 @@ import mitsuba_bdpt
 from .. import removed
 from ..errors import did_you_mean
 from ..progress import KINDS
+from ..settings import PARAMETERS
 from . import measuring, mistakes
 from .values import crop, definition, frames, number, property_, resume, size, weight
 
@@ -86,6 +87,9 @@ class Parser(argparse.ArgumentParser):
             return f"that is an option of {' and '.join(having) or self.prog}"
         if command and name.lower().endswith(".xml"):
             return f"did you mean render {name}?"
+        parameter = name.lstrip("-").replace("-", "_")
+        if parameter in PARAMETERS:
+            return f"that is a parameter of the integrator: -P {parameter}=VALUE"
         of_commands = (option for parser in self.commands.values() for option in parser.options)
         return removed.remedy(name) or did_you_mean(name, [*self.options, *self.commands, *of_commands])
 
@@ -217,6 +221,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     )
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
-    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help="default: %(default)s")
+    text = "of the random numbers; each of the --frames adds its number; default: %(default)s"
+    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help=text)
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
     add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)

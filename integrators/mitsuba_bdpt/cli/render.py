@@ -95,9 +95,9 @@ def _run(options: Namespace, ending: Ending) -> int:
 
 
 def jobs_of(options: Namespace) -> list[Namespace]:
-    """Return the options of each image, with ``sensor`` and ``output``.
+    """Return the options of each image, with ``sensor``, ``seed`` and ``output``.
 
-    One image, or one for each of the ``frames``.
+    One image, or one for each of the ``frames``, whose seeds follow one another.
     """
     output = options.output or Path("renders") / f"{options.scene.stem}.exr"
     if options.frames is None:
@@ -110,7 +110,8 @@ def jobs_of(options: Namespace) -> list[Namespace]:
     def of_frame(number: int) -> Namespace:
         named = {"output": output, "statistics": options.statistics}
         numbered = {key: path and path.with_stem(f"{path.stem}.{number:04d}") for key, path in named.items()}
-        return Namespace(**vars(options) | {"sensor": number} | numbered)
+        own = {"sensor": number, "seed": (options.seed + number) % 2**32}
+        return Namespace(**vars(options) | own | numbered)
 
     return [of_frame(number) for number in dict.fromkeys(options.frames)]
 

@@ -36,6 +36,9 @@ MOST_GROUPS = 16
 # Group of the emitters that are in no other.
 REST = "rest"
 
+# What is said of a group without emitters.
+NO_LAMP = "no emitter (black)"
+
 _EXAMPLE = "write it like 'key: lamp1, lamp2; sky: envmap'"
 _SEPARATORS = "for , and ; in an id write ?"
 
@@ -69,6 +72,11 @@ def parsed(text: str) -> dict[str, list[str]]:
 
 def _error(text: str, what: str) -> UsageError:
     return UsageError(f"light_groups={' '.join(text.split())!r}: {what}")
+
+
+def called(ids: Sequence[str]) -> str:
+    """Return the name of an emitter in messages, with its own id if its shape has another."""
+    return f"{ids[0]} ({ids[1]})" if ids[1:] and ids[1] != ids[0] else ids[0]
 
 
 def listed(names: Sequence[str], most: int) -> str:
@@ -138,8 +146,8 @@ class LightGroups:
     """The light groups of a scene.
 
     ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter;
-    ``lamps``: ids of the emitters of each group, or the names that ``auto`` gives those without, whose
-    ``places`` are texts by these names;
+    ``lamps``: of each group the ids of each emitter, of its shape and its own, or the name that ``auto``
+    gives one without, whose place is a text in ``places``;
     ``warnings``: of patterns that match no emitter.
     """
 
@@ -147,17 +155,17 @@ class LightGroups:
         self,
         names: list[str],
         of_emitters: list[int],
-        lamps: list[str],
+        lamps: list[list[str]],
         places: dict[str, str],
         warnings: Sequence[str] = (),
     ):
         self._places = places
         self.names, self.of_emitters, self.warnings = tuple(names), tuple(of_emitters), tuple(warnings)
-        self.lamps: dict[str, list[str]] = {name: [] for name in names}
+        self.lamps: dict[str, list[list[str]]] = {name: [] for name in names}
         for group, lamp in zip(of_emitters, lamps, strict=True):
             self.lamps[names[group]].append(lamp)
         for of_group in self.lamps.values():
-            of_group.sort(key=by_numbers)
+            of_group.sort(key=lambda ids: by_numbers(ids[0]))
         self._table = mi.UInt32(of_emitters)
         dr.make_opaque(self._table)
 
@@ -179,16 +187,17 @@ class LightGroups:
         if len(chosen) < len(emitters):
             names.append(REST)
         of_emitters = [names.index(chosen.get(i, REST)) for i in range(len(emitters))]
-        lamps = [(_ids(emitter) or [name])[0] for emitter, name in zip(emitters, made, strict=True)]
+        lamps = [_ids(emitter) or [name] for emitter, name in zip(emitters, made, strict=True)]
         places = {name: _place(e) for e, name in zip(emitters, made, strict=True) if not _ids(e)}
         return LightGroups(names, of_emitters, lamps, places, warnings)
 
     def explained(self) -> list[str]:
         """Describe each group by its emitters, with the places of those without id."""
         placed = {
-            name: [lamp + self._places.get(lamp, "") for lamp in lamps] for name, lamps in self.lamps.items()
+            name: [called(ids) + self._places.get(ids[0], "") for ids in lamps]
+            for name, lamps in self.lamps.items()
         }
-        return [f"light group {name}: {listed(lamps, 20) or 'none'}" for name, lamps in placed.items()]
+        return [f"light group {name}: {listed(lamps, 20) or NO_LAMP}" for name, lamps in placed.items()]
 
     def at(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32:
         """Return the groups of the emitters ``index``."""

@@ -12,7 +12,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.light_groups import REST, is_pattern, listed, matches
+from ..emitters.light_groups import NO_LAMP, REST, called, is_pattern, listed, matches
 from ..errors import CommandError, UsageTypeError, did_you_mean
 from ..image.layers import GROUP, PATH
 from .images import STATISTICS, attribute
@@ -34,12 +34,12 @@ _Layers = dict[str, dict[str, np.ndarray]]
 class _Image:
     """Layers of an image with a ``name`` for messages, by the prefix of their partition.
 
-    ``lamps``: ids of the emitters of each light group, if the file has them.
+    ``lamps``: of each light group the ids of each emitter, if the file has them.
     """
 
     name: str
     partitions: dict[str, _Layers]
-    lamps: dict[str, list[str]] = field(default_factory=dict)
+    lamps: dict[str, list[list[str]]] = field(default_factory=dict)
 
 
 def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitmap:
@@ -57,9 +57,8 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
         raise UsageTypeError(f"image={type(image).__name__} must be an mi.Bitmap or the path of an EXR")
     if not isinstance(weights, Mapping):
         raise UsageTypeError(f"weights={type(weights).__name__} must be a dictionary, by names of layers")
-    name = "the image" if isinstance(image, mi.Bitmap) else repr(str(image))
     channels = _channels(image)
-    read = _Image(name, _partitions(name, channels), {} if isinstance(image, mi.Bitmap) else _lamps(image))
+    read = _read(image, channels)
     prefix, own = _chosen(read, weights)
     layers = read.partitions[prefix]
     colours = list(next(iter(layers.values())))
@@ -95,12 +94,25 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
 
 def described(path: Path) -> str:
     """Describe the layers of an EXR that can be mixed, a line for each; raises like `mix`."""
-    lamps = _lamps(path)
+    image = _read(path, _channels(path))
+    lamps = {group: listed(list(map(called, lamps)), 20) for group, lamps in image.lamps.items()}
     return "\n".join(
-        f"{prefix}{layer}" + (f": {listed(lamps[layer], 20)}" if prefix == GROUP and layer in lamps else "")
-        for prefix, layers in _partitions(repr(str(path)), _channels(path)).items()
+        f"{prefix}{layer}" + (f": {lamps[layer] or NO_LAMP}" if prefix == GROUP and layer in lamps else "")
+        for prefix, layers in image.partitions.items()
         for layer in layers
     )
+
+
+def _read(image: mi.Bitmap | Path | str, channels: Mapping[str, np.ndarray]) -> _Image:
+    """Return the layers among the ``channels`` of an image; raises ``CommandError`` if there are none."""
+    if isinstance(image, mi.Bitmap):
+        name, is_mix, lamps = "the image", WEIGHTS in image.metadata(), {}
+    else:
+        name, is_mix = repr(str(image)), attribute(Path(image), WEIGHTS) is not None
+        lamps = json.loads(attribute(Path(image), STATISTICS) or "{}").get("light_groups", {})
+    if is_mix:
+        raise CommandError(f"{name} is a mix, which has no layers; mix the render that it was made of")
+    return _Image(name, _partitions(name, channels), lamps)
 
 
 def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
@@ -127,11 +139,6 @@ def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str
             "path_layers=true"
         )
     return found
-
-
-def _lamps(path: Path | str) -> dict[str, list[str]]:
-    """Return the ids of the emitters of each light group, as the header of an EXR has them."""
-    return json.loads(attribute(Path(path), STATISTICS) or "{}").get("light_groups", {})
 
 
 def _chosen(image: _Image, weights: Mapping[str, Weight]) -> tuple[str, dict[str, str]]:
@@ -176,7 +183,12 @@ def _found(image: _Image, name: str) -> tuple[str, list[str]] | None:
         }
         return {prefix: layers for prefix, layers in found.items() if layers}
 
-    found = fitting(str.__eq__) or fitting(matches) or _of_lamps(image, name)
+    found = fitting(str.__eq__)
+    if not found and isinstance(name, str):
+        found = fitting(matches)
+        groups = found.get(GROUP, [])
+        groups = [*groups, *_of_lamps(image, name.removeprefix(GROUP), groups)]
+        found |= {GROUP: groups} if groups else {}
     if len(found) > 1:
         either = " or ".join(prefix + name for prefix in found)
         if is_pattern(name):
@@ -187,24 +199,24 @@ def _found(image: _Image, name: str) -> tuple[str, list[str]] | None:
     return next(iter(found.items()), None)
 
 
-def _of_lamps(image: _Image, name: str) -> dict[str, list[str]]:
-    """Return the light groups of the emitters whose ids fit ``name``, by the prefix of groups.
+def _of_lamps(image: _Image, name: str, named: Sequence[str]) -> list[str]:
+    """Return the light groups whose emitters have ids that fit ``name``, beside those ``named`` by it.
 
     Raises ``CommandError`` if such a group has other emitters too.
     """
-    text, layers = str(name).removeprefix(GROUP), []
+    layers: list[str] = []
     for group, lamps in image.lamps.items():
-        own = [lamp for lamp in lamps if matches(lamp, text)]
-        if text in lamps:
-            own = [text]
+        if group in named:
+            continue
+        own = [ids for ids in lamps if any(matches(one, name) for one in ids)]
         if 0 < len(own) < len(lamps):
-            others = [lamp for lamp in lamps if lamp not in own]
+            others = listed([called(ids) for ids in lamps if ids not in own], 5)
             raise CommandError(
-                f"{own[0]!r} is in the group {group}, with {listed(others, 5)}: {group}=X changes all of "
-                "these; to change it alone, render it with a group of its own"
+                f"{name!r} fits the lamp {called(own[0])!r} of the group {group}, which has {others} too: "
+                f"{group}=X changes all of these; to change it alone, render it with a group of its own"
             )
         layers += [group] if own else []
-    return {GROUP: layers} if layers else {}
+    return layers
 
 
 def _missing(image: _Image, name: str) -> str:
@@ -213,12 +225,12 @@ def _missing(image: _Image, name: str) -> str:
         f"{_KINDS[prefix].capitalize()}: {', '.join(layers)}" for prefix, layers in image.partitions.items()
     )
     names = [layer for layers in image.partitions.values() for layer in layers]
-    names += [lamp for lamps in image.lamps.values() for lamp in lamps]
+    names += [one for lamps in image.lamps.values() for ids in lamps for one in ids]
     question = did_you_mean(str(name), names, parts=True)
     rest = ""
     if REST in image.partitions.get(GROUP, ()):
         rest = (
-            f"; {REST} has the light of {listed(image.lamps[REST], 5)}"
+            f"; {REST} has the light of {listed(list(map(called, image.lamps[REST])), 5)}"
             if REST in image.lamps
             else (f"; the light of emitters in no other group is in {REST}")
         )

@@ -149,8 +149,8 @@ class Statistics(TypedDict):
     """The same in the pilots."""
     unsampled_light: NotRequired[dict[int, float]]
     """Estimated share of the image's light that no strategy samples, by index in ``scene.emitters()``."""
-    light_groups: NotRequired[dict[str, list[str]]]
-    """Ids of the emitters of each light group, with ``light_groups``."""
+    light_groups: NotRequired[dict[str, list[list[str]]]]
+    """Of each light group the ids of each emitter: of its shape, its own; with ``light_groups``."""
     error: NotRequired[float | None]
     """Estimated relMSE, with ``variance``."""
     kernels: dict[str, int]
