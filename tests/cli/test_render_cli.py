@@ -816,7 +816,10 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
         (["render", "plain.xml", "--traget-error=1"], "did you mean --target-error?"),
         (["explain", "plain.xml", "--integrator", "path"], "that is an option of render"),
-        (["render", "plain.xml", "--light-groups", "auto"], "of the integrator: -P light_groups=VALUE"),
+        (
+            ["render", "plain.xml", "--light-groups", "auto"],
+            "that is a parameter of the integrator: -P light_groups=VALUE",
+        ),
         (["render", "plain.xml", "--sp", "4"], "did you mean --spp?"),
         (["render", "plain.xml", "--check", "4"], "did you mean --checkpoint?"),
         (["sweep", "preset", "--sched=x"], "did you mean --scheduler?"),
