@@ -22,6 +22,7 @@ from mitsuba_bdpt import workers
 from mitsuba_bdpt.cli import checkpoints, render, values
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.mistakes import TERMINATED
+from mitsuba_bdpt.measure.scenes import SceneFile
 from mitsuba_bdpt.run.snapshot import read
 from patience import PATIENCE
 
@@ -138,6 +139,21 @@ def test_equal_meters_on_two_shapes():
         assert main(command) == 0
         found.append(rendered.image(f"{index}.exr", "RGB")[0].mean())
     np.testing.assert_allclose(sorted(found), [3 / 2**1.5, 3], rtol=1e-3)  # the plate is no point
+
+
+def test_meshes_that_mitsuba_cannot_merge():
+    """Rationale: the inner side of hollow glass has ``flip_normals``, and Mitsuba merges no such mesh with
+    another. Expected: the file renders, by the command and in a sweep."""
+    walls = "".join(
+        f'<shape type="cube"><transform name="to_world"><scale value="{size}"/></transform>'
+        f'<boolean name="flip_normals" value="{flipped}"/><ref id="glass"/></shape>'
+        for size, flipped in ((1, "false"), (0.9, "true"))
+    )
+    glass, sensor = '<bsdf type="dielectric" id="glass"/>', f'<sensor type="perspective">{PIXEL}</sensor>'
+    file = Path("hollow.xml")
+    file.write_text(f'<scene version="3.0.0">{glass}{walls}<emitter type="constant"/>{sensor}</scene>')
+    assert main(["render", "hollow.xml", "--spp", "2"]) == 0
+    assert len(SceneFile("hollow", file).load().shapes()) == 2
 
 
 def test_sizes_that_are_refused(capsys):

@@ -55,7 +55,9 @@ def weight(text: str) -> tuple[str, tuple[float, ...]]:
     with contextlib.suppress(ValueError):
         if name.strip() and equals:
             return name.strip(), tuple(float(value) for value in values.split(","))
-    raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form LAYER=X or LAYER=X,Y,Z")
+    raise argparse.ArgumentTypeError(
+        f"got {text!r}, which must have the form LAYER=X or LAYER=X,Y,Z, factors of linear light"
+    )
 
 
 def size(text: str) -> tuple[int, ...]:

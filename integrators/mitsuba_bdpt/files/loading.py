@@ -6,16 +6,18 @@ import os
 import pkgutil
 import re
 from argparse import Namespace
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean
 from ..image import features
 from ..settings import NONE, PARAMETERS
+
+_Made = TypeVar("_Made")
 
 SCENES_OWN = "scene"
 """What ``--integrator`` calls the integrator of the scene file."""
@@ -175,7 +177,7 @@ def load(options: Namespace) -> Loaded:
         ) from error
     with searching(options.scene, options.append):
         try:
-            return _load(options)
+            return unless_incompatible(lambda merges: _load(options, merges))
         except RuntimeError as error:
             better = _in_words(str(error), options)
             if better is None:
@@ -183,8 +185,21 @@ def load(options: Namespace) -> Loaded:
             raise CommandError(better) from error
 
 
-def _load(options: Namespace) -> Loaded:
-    """Like `load`, for an existing scene file and with the variant set."""
+def unless_incompatible(made: Callable[[bool], _Made]) -> _Made:
+    """Return ``made(True)``, a scene with the meshes of a BSDF merged, or ``made(False)`` if they cannot be.
+
+    Mitsuba refuses to merge meshes of which some have ``flip_normals``.
+    """
+    try:
+        return made(True)
+    except RuntimeError as error:
+        if "Mesh::merge()" not in str(error):
+            raise
+    return made(False)
+
+
+def _load(options: Namespace, merges: bool) -> Loaded:
+    """Like `load`, for an existing scene file and with the variant set; ``merges`` meshes of a BSDF."""
     overrides = dict(options.properties)
     if options.time is not None:
         overrides["timeout"] = options.time
@@ -193,6 +208,7 @@ def _load(options: Namespace) -> Loaded:
         _check_kind(asked)
     defines = in_proportion(options.scene, dict(options.defines))
     config, state = parsed(options.scene, defines)
+    config.merge_meshes = merges
     _check_root(state, options.scene)
     _check_film_sizes(state)
     for film in _films_of_images(state):

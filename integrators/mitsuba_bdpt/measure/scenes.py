@@ -24,6 +24,7 @@ from ..files.loading import (
     parsed,
     searching,
     spectra,
+    unless_incompatible,
 )
 from ..host.introspection import media_of
 
@@ -61,10 +62,13 @@ class MeasuredScene(ABC):
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
         """Return the parser's state."""
 
-    def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
-        """Return the scene; with another type of ``sampler``, of equal sample count, unless None."""
+    def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
+        """Return the scene; with another type of ``sampler``, of equal sample count, unless None.
+
+        ``merges`` meshes of a BSDF.
+        """
         config = mi.parser.ParserConfig(mi.variant())
-        config.parallel = False
+        config.parallel, config.merge_meshes = False, merges
         state = self._parsed(config, definitions)
         if sampler is not None:
             sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
@@ -85,7 +89,8 @@ class MeasuredScene(ABC):
         """
         asked, known = {"resolution": resolution, "sampler": sampler}, self._parameters
         definitions |= {key: value for key, value in asked.items() if value is not None and key in known}
-        scene = self._instantiated(definitions, None if "sampler" in known else sampler)
+        own = None if "sampler" in known else sampler
+        scene = unless_incompatible(lambda merges: self._instantiated(definitions, own, merges))
         if resolution is not None and "resolution" not in known:
             _resize(scene, resolution)
         return scene
@@ -153,9 +158,9 @@ class SceneFile(MeasuredScene):
     def _parameters(self) -> Mapping[str, str]:
         return parameters(self.file, {})
 
-    def _instantiated(self, definitions: dict, sampler: str | None) -> mi.Scene:
+    def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
         with searching(self.file):
-            return super()._instantiated(definitions, sampler)
+            return super()._instantiated(definitions, sampler, merges)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
         return parse_upgraded(config, self.file, in_proportion(self.file, definitions))

@@ -4,7 +4,7 @@ Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy
 reaches the sensor; no two neighbouring vertices can be connected. `possible.unsampled_paths` decides
 whether such paths are possible. Through near-specular lobes in place of delta lobes a few samples find such
 light: it is *undersampled* if a render expects too few of them, see `merging.undersampled`. The estimate
-merges a few thousand camera subpaths with as many photons, see `merging.unsampled` for what it leaves out,
+merges camera subpaths with as many photons, see `merging.unsampled` for what it leaves out,
 and lamps seen in a mirror.
 """
 
@@ -31,9 +31,10 @@ from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
 from .possible import SHORTEST, Start, unsampled_paths
 
-# Subpaths from either end. The noise of the estimate suffices for `WORTH_A_WORD`, not for a figure to rely
-# on; see experiments, "Vertex merging".
-SUBPATHS = 1 << 13
+# Subpaths from either end: at least, at most, and one for so many samples of the render. The noise of the
+# estimate suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging". Of
+# light from infinity few photons meet a small glass: with 2^13, three of eight seeds had none.
+SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 32
 
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
@@ -124,7 +125,7 @@ def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bo
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:
     """All that the estimate for a render of ``samples`` per pixel depends on besides the scene."""
-    known = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters
+    known = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters, _subpaths(prepared, samples)
     if not is_undersampling_possible(prepared, settings):
         return known
     strategies = plan.arrival, plan.endpoints, plan.connections, plan.joined, plan.camera_paths_per_light_path
@@ -139,16 +140,16 @@ def estimate(
     Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
     value.
     """
-    pixels = int(prepared.camera.region.size.prod())
-    chosen = min(SUBPATHS, pixels)
-    batch = Batch(0, chosen, 0, SUBPATHS // chosen, spread=pixels)
+    pixels, count = int(prepared.camera.region.size.prod()), _subpaths(prepared, samples)
+    chosen = min(count, pixels)
+    batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         undersampled = is_undersampling_possible(prepared, settings)
         kernel = (counting_kernel if undersampled else delta_kernel)(prepared, plan, settings)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if undersampled else ())
         drawn = points("sobol"), points("independent")
         of = max(samples, PREVIEW) if undersampled else None
-        found = components.merging.estimate(kernel, batch, SUBPATHS, *drawn, aim, of)
+        found = components.merging.estimate(kernel, batch, count, *drawn, aim, of)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
     total = np.array(found.by_emitter).reshape(prepared.emitters.count, -1) / batch.size
     if mi.is_spectral:
@@ -171,6 +172,12 @@ def estimate(
     return UnsampledLight(
         colours, through, float(never / size), float(few / size), _names(seen or others)[:NAMED]
     )
+
+
+def _subpaths(prepared: PreparedScene, samples: int) -> int:
+    """Number of subpaths from either end, for a render of ``samples`` per pixel: a power of 2."""
+    whole = samples * int(prepared.camera.region.size.prod())
+    return max(SUBPATHS, min(1 << (whole // SAMPLES_OF_ONE).bit_length(), MOST_SUBPATHS))
 
 
 def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
