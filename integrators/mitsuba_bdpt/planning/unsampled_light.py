@@ -34,7 +34,7 @@ from .possible import SHORTEST, Start, unsampled_paths
 # Subpaths from either end: at least, at most, and one for so many samples of the render. The noise of the
 # estimate suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging". Of
 # light from infinity few photons meet a small glass: with 2^13, three of eight seeds had none.
-SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 32
+SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 64
 
 # Share of an image's light from which on a warning is given.
 WORTH_A_WORD = 0.01
