@@ -59,14 +59,14 @@ def compare_integrators(
 ) -> str:
     """Compare two integrators: time, error, efficiency of the first over the second.
 
-    ``options``: those of `options.Compare`. Returns a table in Markdown.
+    ``options``: those of `options.Compare`. Returns a table in Markdown, after a sentence on its ratios.
     """
     from . import compare as module
-    from .tables import table
+    from .tables import described
 
     asked, ways = _options(available.Compare, options), [_parameters(first), _parameters(second)]
     with _measured(scenes, project) as (found, names):
-        return table(module.HEADS, module.lines(found, names, ways, asked))
+        return module.text([described(way) for way in ways], module.lines(found, names, ways, asked))
 
 
 def compare_at_equal_time(
@@ -172,5 +172,6 @@ def _parameters(plugin: Plugin) -> dict[str, Any]:
 
 def _called(plugin: Plugin) -> str:
     """Return the caption of an integrator."""
-    found = _parameters(plugin)
-    return " ".join([found.pop("type"), *(f"{key}={value}" for key, value in found.items())])
+    from .tables import described
+
+    return described(_parameters(plugin))

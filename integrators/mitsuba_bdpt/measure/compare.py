@@ -26,9 +26,9 @@ from .project import Project
 from .record import Error, Measured
 from .reference import Reference
 from .results import relative_errors
-from .scenes import check_plugins, integrator_of
+from .scenes import check_plugins, integrator_of, samples_taken
 from .showing import steps
-from .tables import table
+from .tables import described, table
 from .timing import Render, Timed, alternating, timed
 
 HEADS = (
@@ -62,14 +62,29 @@ def measured(
         ]
 
 
-def side(parameters: Mapping[str, Any], job: Job) -> Callable[[int, int], Timed]:
-    """Return what renders with samples per pixel and a seed, by a plugin with ``parameters``.
+@dataclass(frozen=True)
+class Side:
+    """Renders a scene by an integrator with samples per pixel and a seed."""
 
-    ``sampler`` among them is the sensor's; size and depth are those of the reference's ``job``.
-    """
-    own = dict(parameters)
-    sampler = own.pop("sampler", "independent")
-    return partial(timed, job.scene.load(job.resolution, sampler), integrator_of(own, job.depth))
+    scene: mi.Scene
+    integrator: mi.Integrator
+
+    @staticmethod
+    def of(parameters: Mapping[str, Any], job: Job) -> Side:
+        """Return the side of a plugin with ``parameters``, of which ``sampler`` is the sensor's.
+
+        Size and depth are those of the reference's ``job``.
+        """
+        own = dict(parameters)
+        sampler = own.pop("sampler", "independent")
+        return Side(job.scene.load(job.resolution, sampler), integrator_of(own, job.depth))
+
+    def taken(self, spp: int) -> int:
+        """Return the samples that a render takes for ``spp``."""
+        return samples_taken(self.scene, self.integrator, spp)
+
+    def __call__(self, spp: int, seed: int) -> Timed:
+        return timed(self.scene, self.integrator, self.taken(spp), seed)
 
 
 def line(
@@ -137,13 +152,26 @@ def lines(
             own = dict(way)
             sampler = own.pop("sampler", None)
             check_plugins(str(own.get("type")), own, sampler, job.depth)
-        target, sides = obtained(job), [side(way, job) for way in ways]
-        rows += [line(scene.name, sides, target, spp, options.pairs) for spp in options.spp]
+        target, sides = obtained(job), [Side.of(way, job) for way in ways]
+        for spp in options.spp:
+            taken = dict.fromkeys(str(one.taken(spp)) for one in sides)
+            name, _, *figures = line(scene.name, sides, target, spp, options.pairs)
+            rows.append([name, " / ".join(taken), *figures])
     return rows
+
+
+def text(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return the table of the ``rows``, after what its ratios are; ``names``: of both integrators."""
+    first, second = names
+    return (
+        f"Time and errors of {first} divided by those of {second}; "
+        f"efficiency, 1 / (time · error), of {first} over {second}.\n\n{table(HEADS, rows)}"
+    )
 
 
 def run(options: Namespace) -> int:
     """Print the table that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
-    print(table(HEADS, lines(Project(options.project), options.scenes, options.sides, options)))
+    rows = lines(Project(options.project), options.scenes, options.sides, options)
+    print(text([described(way) for way in options.sides], rows))
     return 0

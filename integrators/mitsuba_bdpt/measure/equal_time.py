@@ -29,7 +29,7 @@ from .paper import check_figure
 from .project import Project
 from .reference import Reference
 from .results import relative_errors
-from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers
+from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers, samples_taken
 from .showing import steps
 from .tables import brief
 from .timing import alternating, timed
@@ -109,11 +109,12 @@ def _samples_within(limit: float, scene, made, spp: int) -> int:
     In proportion to those of ``spp``, then anew from what these took, since a part of the time is fixed. The
     last render is of these samples, for which Mitsuba compiles.
     """
-    count, taken = spp, seconds(scene, made, spp)
+    count = samples_taken(scene, made, spp)
+    taken = seconds(scene, made, count)
     for _ in range(MATCHED):
         if abs(taken / limit - 1) <= CLOSE:
             break
-        count = max(1, round(count * limit / taken))
+        count = samples_taken(scene, made, max(1, round(count * limit / taken)))
         taken = seconds(scene, made, count)
     return count
 
@@ -126,6 +127,7 @@ def shots(given: Subject, ways: dict[str, dict], spp: int) -> list[Shot]:
     scene, made = given.scene, [integrator_of(parameters, given.depth) for parameters in ways.values()]
     with steps(1 + len(made)) as step:
         step(list(ways)[-1])
+        spp = samples_taken(scene, made[-1], spp)
         limit, found = seconds(scene, made[-1], spp), []
         for name, one in zip(ways, made, strict=True):
             step(name)

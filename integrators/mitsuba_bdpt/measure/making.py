@@ -54,7 +54,7 @@ from .reference import (
     take_again,
     write,
 )
-from .scenes import MeasuredScene, integrator_of, path_tracers
+from .scenes import MeasuredScene, integrator_of, path_tracers, samples_taken
 from .showing import amount
 
 EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"}
@@ -300,9 +300,9 @@ def resized(scene: MeasuredScene, wanted: int, width: int) -> list[str]:
     """Return a message if a scene is not rendered at the width that is asked for."""
     if width == wanted:
         return []
-    size = " x ".join(map(str, scene.size(width)))
-    text = f"rendered with {size} pixels: resolution={wanted} does not divide it into {TILES} x {TILES} tiles"
-    return [f"{scene.name}: {text}"]
+    size, asked = (" x ".join(map(str, scene.size(n))) for n in (width, wanted))
+    why = f"the {asked} of resolution={wanted} do not divide into {TILES} x {TILES} tiles"
+    return [f"{scene.name}: rendered with {size} pixels: {why}"]
 
 
 def fitted(scene: MeasuredScene, wanted: int) -> int:
@@ -315,9 +315,8 @@ def fitted(scene: MeasuredScene, wanted: int) -> int:
 
 def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
     """Return the nearest width that a bias check can divide into tiles; None if far."""
-    own_width, own_height = scene.size()
     widths = range(TILES, max(math.ceil(4 * wanted), TILES + 1), TILES)
-    fitting = [n for n in widths if (round(n * own_height / own_width) or 1) % TILES == 0]
+    fitting = [n for n in widths if scene.size(n)[1] % TILES == 0]
     return min(fitting, key=lambda n: abs(n - wanted), default=None)
 
 
@@ -433,13 +432,15 @@ class Aim:
     @cached_property
     def images(self) -> list[np.ndarray]:
         """Renders of them, with a few seeds."""
-        spp, found = self.job.spp, []
+        found: list[np.ndarray] = []
         ours = {"type": "bdpt", "merging": self.by == "merging"}
-        rivals = [(ours, spp)] + [(_way(self.job.scene, self.by), TWICE * spp)] * (self.by == "path")
+        rivals = [(ours, self.job.spp)]
+        rivals += [(_way(self.job.scene, self.by), TWICE * self.job.spp)] * (self.by == "path")
         for parameters, samples in rivals:
             rival = integrator_of(parameters, self.job.depth)
             for seed in range(TRIALS):
-                image = mi.render(self.scene, integrator=rival, spp=samples, seed=seed)
+                spp = samples_taken(self.scene, rival, samples)
+                image = mi.render(self.scene, integrator=rival, spp=spp, seed=seed)
                 found.append(_pixels(image))
         return found
 
@@ -542,7 +543,8 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
 def _fitting(job: Job, scene, integrator, started: float) -> int:
     """Return the samples per pixel of renders of which all of a job's rounds fit into its seconds.
 
-    A power of two, `LEAST_SPP` to `PASS_SPP`. Prints a warning where not even the least fit.
+    A power of two, `LEAST_SPP` to `PASS_SPP`, or what the sampler makes of it. Prints a warning where not
+    even the least fit.
     """
 
     def seconds(spp: int) -> float:
@@ -561,7 +563,8 @@ def _fitting(job: Job, scene, integrator, started: float) -> int:
             f"{least:.2g} s with the fewest samples ({spent:.2g} s to load and compile)",
             flush=True,
         )
-    return min(2 ** math.floor(math.log2(max(wanted, LEAST_SPP))), PASS_SPP)
+    found = min(2 ** math.floor(math.log2(max(wanted, LEAST_SPP))), PASS_SPP)
+    return samples_taken(scene, integrator, found)
 
 
 def _refined(job: Job, halves: Halves, aim: Aim, rendered: tuple, spp: int, started: float) -> bool:
@@ -580,8 +583,9 @@ def _refined(job: Job, halves: Halves, aim: Aim, rendered: tuple, spp: int, star
             began = time.perf_counter()
             behind = [w for w in windows if w.is_behind(halves)]
             for window in behind:
-                images = _pair(window.scene, integrator, halves, WINDOW_PASSES * spp)
-                halves.add(images, window.slices, WINDOW_PASSES * times)
+                count = samples_taken(window.scene, integrator, WINDOW_PASSES * spp)
+                images = _pair(window.scene, integrator, halves, count)
+                halves.add(images, window.slices, count / PASS_SPP)
             if not behind:
                 halves.add(_pair(scene, integrator, halves, spp), times=times)
             now = halves.reference({})

@@ -31,6 +31,7 @@ from .reference import (
     reference_path,
 )
 from .scenes import MeasuredScene, digest
+from .tables import described
 
 
 def cell_file(output: Path, cell: Cell) -> Path:
@@ -341,9 +342,7 @@ NUMBERS = (
 
 def _plain(parameters: str) -> str:
     """Format parameters in JSON as TYPE KEY=VALUE ..."""
-    found = json.loads(parameters)
-    kind = found.pop("type", "")
-    return " ".join([kind, *(f"{key}={value}" for key, value in sorted(found.items()))])
+    return described(dict(sorted(json.loads(parameters).items())))
 
 
 def named_image(row: Row) -> str:

@@ -17,9 +17,7 @@ import numpy as np
 from ..errors import CommandError, message
 from ..files.loading import (
     choose_sensor,
-    in_proportion,
     named_files,
-    parameters,
     parse_upgraded,
     parsed,
     searching,
@@ -53,20 +51,12 @@ class MeasuredScene(ABC):
     def sha256(self) -> str:
         """SHA-256 of the scene and of all files that it names."""
 
-    @property
-    @abstractmethod
-    def _parameters(self) -> Mapping[str, str]:
-        """Parameters that definitions can set, with their defaults."""
-
     @abstractmethod
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
         """Return the parser's state."""
 
     def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
-        """Return the scene; with another type of ``sampler``, of equal sample count, unless None.
-
-        ``merges`` meshes of a BSDF.
-        """
+        """Return the scene; with another type of ``sampler`` unless None. ``merges`` meshes of a BSDF."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel, config.merge_meshes = False, merges
         state = self._parsed(config, definitions)
@@ -82,32 +72,25 @@ class MeasuredScene(ABC):
     def load(self, resolution: int | None = None, sampler: str | None = None, **definitions: Any) -> mi.Scene:
         """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
 
-        Keeps the film's aspect ratio; the sampler is that of the first sensor. None keeps the scene's own.
-        Sets the parameters ``$resolution`` and ``$sampler`` if the file has them, as well as ``definitions``;
-        else changes film and sampler. Raises ``CommandError`` for a scene without sensor, ``RuntimeError``
-        (of Mitsuba) for an invalid one.
+        Size and sampler are of the first sensor, see `_resize`; None keeps the scene's own. ``definitions``:
+        values of its parameters. Film and sampler are changed after parsing: what parameters such as
+        ``$resolution`` would change beside the width is the file's. Raises ``CommandError`` for a scene
+        without sensor, ``RuntimeError`` (of Mitsuba) for an invalid one.
         """
-        asked, known = {"resolution": resolution, "sampler": sampler}, self._parameters
-        definitions |= {key: value for key, value in asked.items() if value is not None and key in known}
-        own = None if "sampler" in known else sampler
-        scene = unless_incompatible(lambda merges: self._instantiated(definitions, own, merges))
-        if resolution is not None and "resolution" not in known:
+        scene = unless_incompatible(lambda merges: self._instantiated(definitions, sampler, merges))
+        if resolution is not None:
             _resize(scene, resolution)
         return scene
 
     def size(self, resolution: int | None = None) -> tuple[int, int]:
-        """Return width and height of the image.
+        """Return width and height of the image that `load` gives.
 
         Raises ``CommandError`` for a film without colours.
         """
         own = self._look.size
         if isinstance(own, CommandError):
             raise own
-        if resolution is None:
-            return own
-        if "resolution" not in self._parameters:
-            return _widened(own, resolution)
-        return _size_of(self.load(resolution), self.called)  # the file may compute the size
+        return own if resolution is None else _widened(own, resolution)
 
     @cached_property
     def max_depth(self) -> int:
@@ -154,16 +137,12 @@ class SceneFile(MeasuredScene):
             content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
         return hashlib.sha256(b"".join(content)).hexdigest()
 
-    @property
-    def _parameters(self) -> Mapping[str, str]:
-        return parameters(self.file, {})
-
     def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
         with searching(self.file):
             return super()._instantiated(definitions, sampler, merges)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        return parse_upgraded(config, self.file, in_proportion(self.file, definitions))
+        return parse_upgraded(config, self.file, definitions)
 
 
 class DictionaryScene(MeasuredScene):
@@ -198,10 +177,6 @@ class DictionaryScene(MeasuredScene):
     @property
     def sha256(self) -> str:
         return hashlib.sha256(b"".join(_bytes_of(self._dictionary, self.name))).hexdigest()
-
-    @property
-    def _parameters(self) -> Mapping[str, str]:
-        return {}
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
         if definitions:
@@ -279,6 +254,24 @@ def integrator_of(parameters: Mapping[str, Any], depth: int) -> mi.Integrator:
     return mi.load_dict({"max_depth": depth, **parameters})
 
 
+def samples_taken(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> int:
+    """Return the samples per pixel that a render takes if it is asked for ``spp``.
+
+    `bdpt` has points of its own; of other integrators the sensor's sampler may round up, as `multijitter`
+    32 to 5 x 7, with a warning that names neither. What is measured is asked for this number.
+    """
+    if hasattr(integrator, "statistics"):
+        return spp
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        fork = choose_sensor(scene, 0).sampler().fork()
+        fork.set_sample_count(spp)
+        return int(fork.sample_count())
+    finally:
+        mi.set_log_level(level)
+
+
 def check_plugins(name: str, parameters: Mapping[str, Any], sampler: str | None, depth: int) -> None:
     """Raise ``CommandError`` if the plugin ``name`` or its ``sampler`` is invalid."""
     for what, make in (
@@ -310,7 +303,7 @@ def _widened(size: tuple[int, int], width: int) -> tuple[int, int]:
 
 
 def _resize(scene, width: int) -> None:
-    """Scale the first sensor's film to a width, without crop window."""
+    """Scale the first sensor's film to a width, however the file sets its size, without crop window."""
     old_width, old_height = choose_sensor(scene, 0).film().size()
     size = list(_widened((int(old_width), int(old_height)), width))
     changed = mi.traverse(scene.sensors()[0])
@@ -321,15 +314,16 @@ def _resize(scene, width: int) -> None:
 
 
 def _replace_sampler(nodes, sensor, kind: str) -> None:
-    """Replace the sampler of ``sensor``, one of the ``nodes``, by another ``kind``."""
+    """Replace the sampler of ``sensor``, one of the ``nodes``, by another ``kind``.
+
+    Its sample count is Mitsuba's default, since all renders say theirs, see `samples_taken`.
+    """
     properties = mi.Properties(kind)
     for key in sensor.props.keys():
         held = sensor.props[key]
         if isinstance(held, mi.Properties.ResolvedReference):
             node = nodes[held.index()]
             if node.type == mi.ObjectType.Sampler:
-                if "sample_count" in node.props:
-                    properties["sample_count"] = node.props["sample_count"]
                 properties.set_id(node.props.id())
                 node.props = properties
                 return

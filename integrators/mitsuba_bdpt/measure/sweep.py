@@ -63,7 +63,7 @@ from .results import (
     take_back,
     write_tables,
 )
-from .scenes import check_plugins, integrator_of
+from .scenes import check_plugins, integrator_of, samples_taken
 from .showing import Renders
 from .timing import Timed, alternating, timed
 
@@ -125,12 +125,12 @@ class Bench:
     def spp_of(self, cell: Cell) -> int:
         """Return the samples of a cell: its budget, or those for equal time."""
         if cell.match == "spp":
-            return self._possible(cell.sampler, cell.budget)
+            return self._taken(cell, cell.budget)
         wanted = cell.budget * self._equal(cell)["samples"]
         if cell.sampler == "independent":
             return max(round(wanted), 1)
         # Mitsuba's stratified samplers are a tenth slower per sample far from a power of two.
-        return self._possible(cell.sampler, 2 ** max(round(math.log2(wanted)), 0))
+        return self._taken(cell, 2 ** max(round(math.log2(wanted)), 0))
 
     def equal_time_spp(self, cell: Cell) -> int | None:
         """Return the budget at which the seconds of a cell's integrator equal the first one's, if they do."""
@@ -153,13 +153,14 @@ class Bench:
         return self._spp[cell.method]
 
     def _time_ratio(self, first: Cell, cell: Cell, budget: int) -> float:
-        """Return the seconds of the ``first`` integrator over a cell's, at equal samples."""
-        for one in (first, cell):
-            self.compile_seconds(one, budget)
-        both = [partial(self.timed, c, budget) for c in (first, cell)]
-        turns = alternating(both, CALIBRATIONS, is_warm=True)
+        """Return the seconds of a sample by the ``first`` integrator over those by a cell's."""
+        sides = [(one, self._taken(one, budget)) for one in (first, cell)]
+        for one, spp in sides:
+            self.compile_seconds(one, spp)
+        turns = alternating([partial(self.timed, *side) for side in sides], CALIBRATIONS, is_warm=True)
         seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
-        return float(np.median([ours / theirs for ours, theirs in seconds]))
+        (_, ours), (_, theirs) = sides
+        return float(np.median([a / ours / (b / theirs) for a, b in seconds]))
 
     def _calibration_budget(self, first: Cell, cell: Cell) -> int:
         """Return the budget at which equal time is measured."""
@@ -171,17 +172,16 @@ class Bench:
         # Small renders take longer per sample than large ones, so that more may fit than the first suggest.
         while best > at:
             at = best
-            for one in (first, cell):
-                self.compile_seconds(one, at)
-            of_a_sample = sum(self.timed(one, at, 0).seconds for one in (first, cell)) / at
+            sides = [(one, self._taken(one, at)) for one in (first, cell)]
+            for side in sides:
+                self.compile_seconds(*side)
+            of_a_sample = sum(self.timed(one, spp, 0).seconds / spp for one, spp in sides)
             best = max((b for b in budgets if (1 + CALIBRATIONS) * b * of_a_sample <= patience), default=at)
         return at
 
-    def _possible(self, sampler: str, spp: int) -> int:
-        """Return the samples that a sampler takes: stratified ones may round up."""
-        fork = self.scene(sampler).sensors()[0].sampler().fork()
-        fork.set_sample_count(spp)
-        return int(fork.sample_count())
+    def _taken(self, cell: Cell, spp: int) -> int:
+        """Return the samples that a cell's render takes: stratified samplers may round up."""
+        return samples_taken(self.scene(cell.sampler), self.integrator(cell), spp)
 
 
 def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:

@@ -36,6 +36,12 @@ def by_scene(scenes: Iterable[str], columns: Mapping[str, Callable[[str], object
     return table(["scene", *columns], rows)
 
 
+def described(parameters: Mapping[str, object]) -> str:
+    """Format the parameters of a plugin as TYPE KEY=VALUE ..."""
+    found = dict(parameters)
+    return " ".join([str(found.pop("type", "")), *(f"{key}={value}" for key, value in found.items())])
+
+
 def met_text(met: bool) -> str:
     """Return whether a goal is met, as text of a table."""
     return "yes" if met else "**no**"
