@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import measure
 from mitsuba_bdpt.cli.arguments import build_parser
-from mitsuba_bdpt.errors import FailureError
+from mitsuba_bdpt.errors import FailureError, UsageTypeError
 from mitsuba_bdpt.measure import estimates, options, sweep, tables
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.results import relative_errors
@@ -186,6 +186,35 @@ def test_what_cannot_be_measured_is_named(here, call, words):
     """Expected: the error names the argument, its value and what it must be."""
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_paths_are_texts_or_paths(here):
+    """Rationale: an ``output`` given as text failed by dividing texts. Expected: wherever a path is taken, a
+    text does as well, with the same files; anything else is named."""
+    mine, given = measure.SceneDict("mine", room()), {"resolution": 8, "spp": [2], "seeds": 2}
+    Path("mine.toml").write_text('scenes = ["mine"]\nresolution = 8\nspp = [2]\nseeds = 2\n')
+    for kind in (str, Path):
+        folder = kind(f"{kind.__name__}-rows")
+        rows = measure.run_sweep(given, [mine], project=kind("p"), reference_seconds=0, output=folder)
+        again = measure.run_sweep(kind("mine.toml"), [mine], project=kind("p"), output=kind("again"))
+        assert len(rows) == len(again) == 4
+        assert (Path(folder) / "rows.csv").is_file()
+        common = {"project": kind("p"), "spp": 2, "resolution": 8}
+        measure.compare_at_equal_time(mine, output=kind(f"{kind.__name__}.png"), **common)
+        image = next((Path("again") / "images" / "mine").glob("*.exr"))
+        measure.compare_at_equal_time(mine, reference=kind(image), output=kind("a.png"), **common)
+        measure.render_pyramid(mine, output=kind(f"{kind.__name__}.exr"), **common)
+    assert len([*Path().glob("str*")]) == len([*Path().glob("Path*")]) == 5
+    for call in (
+        lambda: measure.run_sweep(given, [mine], output=3),
+        lambda: measure.run_sweep(3, [mine]),
+        lambda: measure.make_reference(mine, project=3),
+        lambda: measure.run_sweep(given, [mine], scenes=[3]),
+        lambda: measure.compare_at_equal_time(mine, reference=b"a.exr"),
+        lambda: measure.compare_at_equal_time(mine, windows=(0.5, 0.5)),
+    ):
+        with pytest.raises(UsageTypeError, match="must be a text or a path"):
+            call()
 
 
 def test_a_sweep_of_a_dictionary_says_where_its_results_go(here, capsys):

@@ -114,7 +114,8 @@ def run_sweep(
 
     asked = _options(available.Sweep, options)
     with _measured(dictionaries, project) as (found, _):
-        rows, failed = module.swept(found, preset if isinstance(preset, Mapping) else str(preset), asked)
+        named = preset if isinstance(preset, Mapping) else available.text_of_path("preset", preset)
+        rows, failed = module.swept(found, named, asked)
     if failed:
         raise FailureError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
     return rows
@@ -128,7 +129,7 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
     from .project import Project
     from .scenes import DictionaryScene
 
-    before, given, names = mi.variant(), {}, []
+    root, before, given, names = available.path_of("project", project), mi.variant(), {}, []
     mi.set_variant(VARIANT)
     try:
         for scene in [scenes] if isinstance(scenes, _SCENES) else scenes:
@@ -144,7 +145,7 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
             if isinstance(scene, DictionaryScene):
                 given[scene.name] = scene
             names.append(scene.name if isinstance(scene, DictionaryScene) else str(scene))
-        yield Project(Path(project), given), names
+        yield Project(root, given), names
     finally:
         if before is not None:
             mi.set_variant(before)
@@ -152,13 +153,13 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
 
 def _options(kind: type[Asked], given: dict) -> Asked:
     """Return the options of a measurement; raises ``CommandError`` for others."""
-    known = {field.name: field.default for field in available.options_of(kind)}
+    known = {field.name: field for field in available.options_of(kind)}
     for name in given:
         if name not in known:
             question = did_you_mean(name, known)
             raise CommandError(f"{name}={given[name]!r} is no option; {question}there are {', '.join(known)}")
     # An option of several values accepts a single one.
-    several = [name for name in given if isinstance(known[name], tuple)]
+    several = [name for name in given if available.takes_several(known[name]) and given[name] is not None]
     alone = {name: (given[name],) for name in several if not isinstance(given[name], list | tuple)}
     return kind(**given | alone)
 

@@ -11,7 +11,7 @@ from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, cast
 
-from ..errors import CommandError
+from ..errors import CommandError, UsageTypeError
 
 VARIANT = "llvm_ad_rgb"
 """Mitsuba's variant in which all measurements render."""
@@ -110,16 +110,39 @@ class Options:
     """Base of all options."""
 
     def __post_init__(self):
-        """Raise ``CommandError`` for invalid values."""
+        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none."""
         for found in options_of(type(self)):
             value: Any = getattr(self, found.name)
             bounds = found.metadata["bounds"]
-            if isinstance(bounds, type) or (value is None and found.default is None):
+            if value is None and found.default is None:
                 continue
-            several = isinstance(found.default, tuple) and isinstance(value, list | tuple)
+            if bounds is Path:
+                object.__setattr__(self, found.name, path_of(found.name, value))
+                continue
+            several = isinstance(value, list | tuple) and takes_several(found)
             values = cast(Sequence[object], value if several else [value])
-            if not all(map(bounds.holds, values)):
+            if bounds is str:
+                texts = [text_of_path(found.name, one) for one in values]
+                object.__setattr__(self, found.name, tuple(texts) if several else texts[0])
+            elif not all(map(bounds.holds, values)):
                 raise CommandError(f"{found.name}={value!r} must be {bounds}")
+
+
+def text_of_path(name: str, value: Any) -> str:
+    """Return the ``value`` of an argument as text; raises ``UsageTypeError`` unless it is that or a path."""
+    if not isinstance(value, str | Path):
+        raise UsageTypeError(f"{name}={value!r} must be a text or a path")
+    return str(value)
+
+
+def path_of(name: str, value: Any) -> Path:
+    """Return the path that the argument ``name`` is; raises ``UsageTypeError`` if it is none."""
+    return Path(text_of_path(name, value))
+
+
+def takes_several(found: Field[Any]) -> bool:
+    """Return whether an option has several values."""
+    return isinstance(found.default, tuple) or "nargs" in found.metadata["declared"]
 
 
 def options_of(kind: type) -> list[Field[Any]]:

@@ -39,7 +39,7 @@ class Row(Measured):
     scene_sha256: str
     resolution: int
     max_depth: int
-    sampler: str
+    sampler: str  # of `bdpt` its points
     match: str  # "spp" or "seconds": what is equal to the first integrator's
     equal_time_spp: NotRequired[int | None]  # budget of equal seconds; missing in older sweeps
     clock: NotRequired[str]  # "wall" or "processor": the seconds that decide; missing in older sweeps

@@ -157,8 +157,19 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[Row]:
             image = _image(output, cell)
             row |= errors(image, *judge_of(*cells.where()), cell.seed == FIRST_SEED)
             write_json(file, row)
-        found.append(row)
+        found.append(_with_points(row))
     return found
+
+
+def _with_points(row: Row) -> Row:
+    """Set the ``sampler`` of a row to what made its random numbers, of `bdpt` its ``points``; return it.
+
+    Files of cells and older tables have the sensor's, which `bdpt` does not use.
+    """
+    given = json.loads(row["parameters"])
+    if given.get("type") == "bdpt":
+        row["sampler"] = given.get("points", "sobol")
+    return row
 
 
 def _image(output: Path, cell: Cell) -> np.ndarray:
@@ -233,7 +244,7 @@ def _stored(file: Path) -> list[Row]:
     """Return the rows of a file; older sweeps have the variance as ``spread``."""
     table = pyarrow.parquet.read_table(file)
     names = ["variance" if name == "spread" else name for name in table.column_names]
-    return table.rename_columns(names).to_pylist()
+    return [_with_points(row) for row in table.rename_columns(names).to_pylist()]
 
 
 def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[Row]:
@@ -260,7 +271,7 @@ def lost(table: list[Row], output: Path) -> list[str]:
         return []
     keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
     try:
-        before = pyarrow.parquet.read_table(file, columns=[*keys, "scene_sha256"]).to_pylist()
+        before = _stored(file)
     except pyarrow.ArrowInvalid:  # damaged: it is written anew
         return []
     kept = {tuple(row[key] for key in keys) for row in table}
@@ -297,17 +308,11 @@ def missing_of(output: Path) -> dict[str, dict[str, str]]:
     return read_json(file, "delete it, and sweep again") if file.exists() else {}
 
 
-def _sampler(row: Row) -> str:
-    """Return the random numbers of a render: `bdpt` has its own, its ``points``."""
-    given = json.loads(row["parameters"])
-    return given.get("points", "sobol") if given.get("type") == "bdpt" else row["sampler"]
-
-
 COLUMNS: dict[str, Callable[[Row], object]] = {
     "scene": lambda row: row["scene"],
     "integrator": lambda row: row["method"],
     "parameters": lambda row: _plain(row["parameters"]),
-    "sampler": _sampler,
+    "sampler": lambda row: row["sampler"],
     "spp": lambda row: row["spp"],
     "seed": lambda row: row["seed"],
     "clock": lambda row: row.get("clock", "wall"),
