@@ -382,6 +382,30 @@ def test_a_bar_in_a_name_ends_no_cell():
     )
 
 
+def test_what_path_lacks_may_be_a_known_difference(results):
+    """Rationale: `path` lacked 4 % of the light of lamps on meshes, where its density is wrong, and the
+    report knew light that it does not find alone. Expected: a sentence names both, and the page; none where
+    `path` lacks nothing."""
+    made = dict.fromkeys(("box", "dark"), image_of_two())
+    sentence = "see *Differences from path and volpath* (docs/user/differences.md)"
+    assert sentence in report.page(results, made, [], {}, "x")
+    only = replace(
+        results, rows=[row for row in results.rows if row["scene"] == "box" and row["method"] != "ptracer"]
+    )
+    assert sentence not in report.page(only, {"box": made["box"]}, [], {}, "x")
+
+
+def test_integrators_are_in_the_order_of_the_preset():
+    """Rationale: an integrator of media alone came after all others. Expected: in the table of errors of a
+    scene with media the order of its rows, those of the preset."""
+    plain = [row for name in ("bdpt", "path", "merging", "all") for row in runs(name, 3)]
+    fog = [row | {"scene": "fog"} for name in ("bdpt", "volpath", "all") for row in runs(name, 3)]
+    found = Results(plain + fog, {"box": KNOWN, "fog": KNOWN}, {})
+    assert found.methods == ["bdpt", "path", "merging", "volpath", "all"]
+    lines = [line.split(" | ") for line in report.errors_table(found).splitlines()]
+    assert [line[1] for line in lines if line[0] == "| `fog`"] == ["bdpt", "volpath", "all"]
+
+
 def test_what_a_biased_integrator_lacks_is_said():
     """Too dark, too bright, and right as a whole but wrong in a tile."""
 

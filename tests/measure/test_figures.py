@@ -96,6 +96,48 @@ def saved(monkeypatch, module):
     return found
 
 
+@pytest.mark.parametrize("plot", ["samples", "efficiency"])
+def test_what_looks_alike_is_one_entry(monkeypatch, plot):
+    """Rationale: `path`, and `volpath` of scenes with media, had an entry each with the same mark. Expected:
+    one entry of both, and the marks of all entries differ."""
+    found = results()
+    fog = {"path": "volpath", "path multijitter": "volpathmis"}
+    rows = [
+        row | {"method": fog.get(row["method"], row["method"])} if row["scene"] == "b" else row
+        for row in found.rows
+    ]
+    shown = saved(monkeypatch, figures)
+    figures.PLOTS[plot](replace(found, rows=rows), None, 1, found.scenes)
+    entries = shown[0].legends[0].legend_handles
+    before = "over " if plot == "efficiency" else ""
+    labels = [entry.get_label() for entry in entries]
+    assert f"{before}path / volpath" in labels and f"{before}path multijitter / volpathmis" in labels
+    looks = [
+        (entry.get_color(), entry.get_marker()) for entry in entries if entry.get_marker() not in ("", "None")
+    ]
+    named = [look for look, label in zip(looks, labels, strict=False) if label.startswith(before)]
+    assert len({*named}) == len(named)
+
+
+def test_a_legend_is_not_taller_than_its_plot(monkeypatch):
+    """Rationale: a legend of seven lines stood under a plot of six. Expected: in a column of a journal the
+    legend of two scenes and three integrators is less high than the plot, within the figure."""
+    found = results(("atelier", "tunnel"))
+    other = {"path multijitter": "bdpt + merging", METHODS[3]: "BDPT (all strategies)"}
+    rows = [
+        row | {"method": other.get(row["method"], row["method"])}
+        for row in found.rows
+        if row["method"] != METHODS[4]
+    ]
+    rows = [row for row in rows if row["seed"] < 3 or row["scene"] == "atelier"]
+    shown = saved(monkeypatch, figures)
+    figures.PLOTS["efficiency"](replace(found, rows=rows), None, 1, found.scenes)
+    figure = shown[0]
+    legend, plot = figure.legends[0].get_window_extent(), figure.axes[0].get_window_extent()
+    assert legend.height < plot.height and len(figure.legends[0].get_texts()) == 7
+    check_texts(figure)
+
+
 @pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (1, 4), (2, 5)])
 def test_images_stand_side_by_side(monkeypatch, columns, count):
     """Expected: of two scenes, one of them wide, a column per image and one of the reference: image, two
@@ -107,7 +149,7 @@ def test_images_stand_side_by_side(monkeypatch, columns, count):
     assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
     check_texts(figure)
     texts = [text.get_text() for text in figure.texts]
-    assert not [text for text in texts if re.search(r"\n(s|spp)\b", text)]
+    assert not [text for text in texts if re.search(r"\n(s|spp)\b|[≤≥~]\n", text)]
     images = [axis for axis in figure.axes if axis.images]
     assert len(images) == 2 * (3 * (count + 1) + count)
     boxes = [axis.get_position() for axis in figure.axes]
@@ -383,7 +425,10 @@ def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "crops"}
     for scenes in (None, ["b"]):
         figures.run(Namespace(**ALL | words | {"scenes": scenes}, columns=2))
-    assert re.search(r"a.pdf is 4\d cm tall, more .*: draw fewer scenes by --scenes", capsys.readouterr().out)
+    assert re.search(
+        r"a.pdf is 4\d cm tall, more than the text on a journal's page.*: draw fewer scenes by --scenes",
+        capsys.readouterr().out,
+    )
     assert found[1].get_size_inches()[1] * 2.54 < figures.PAGE
     crops.draw([block(3)], None, 1)
     for figure in found:

@@ -1,16 +1,19 @@
 """Figures of a report, computed again from rows.csv as docs/development/measuring.md says."""
 
 import csv
+import json
 import math
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.measure import estimates, metrics, page, report, tables
+from mitsuba_bdpt.measure import estimates, metrics, page, reference, report, tables
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
-from mitsuba_bdpt.measure.results import NUMBERS, relative_errors, write_tables
+from mitsuba_bdpt.measure.results import COLUMNS, NUMBERS, relative_errors, write_tables
+from mitsuba_bdpt.run.statistics import RAYS
 from scipy import stats
 
 SHAPE = (32, 32, 3)
@@ -55,6 +58,7 @@ def rendered(own):
             seconds = {"seconds": float(rng.uniform(1, 2)), "cpu_seconds": 2.0}
             names = {"method": method, "key": f"{method}{seed}", "seed": seed, "variance": variance}
             measured = relative_errors(image, kept) | {"tile_means": tile_columns(image).tolist()}
+            measured |= {"mean": float(image.mean())}
             rows.append(PLAIN | names | seconds | measured)
     return rows, kept.means
 
@@ -114,6 +118,30 @@ def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
         assert getattr(found.variance, end) == pytest.approx(getattr(expected, end))
 
 
+def test_energies_follow_from_the_table_and_the_header_of_the_reference(tmp_path):
+    """Expected: the energy of each integrator with its interval, of two renders too, by the formula of the
+    page, from rows.csv and what the reference's file has, which Mitsuba reads as the page says; the image of
+    a reference likewise."""
+    rows, means = rendered(0.02)
+    write_tables(rows, tmp_path)
+    renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
+    image = TRUTH.astype(np.float16).astype(float)
+    reference.write(tmp_path / "box.exr", Reference(image, 0.01 * image, means, {}))
+    kept = json.loads(mi.Bitmap(str(tmp_path / "box.exr")).metadata()["provenance"])["means"]["whole"]
+    shown = np.array(dict(mi.Bitmap(str(tmp_path / "box.exr")).split())["<root>"])
+    np.testing.assert_array_equal(shown, image)
+    (r,), (e,), found = kept["mean"], kept["error"], Results(rows, {"box": means}, {})
+    for name in ("bdpt", "path", "few"):
+        here = [float(row["mean"]) for row in renders if row["integrator"] == name]
+        x, n = np.mean(here), len(here)
+        own = stats.t.ppf(0.975, n - 1) * np.std(here, ddof=1) / (r * math.sqrt(n))
+        half = math.hypot(own, stats.t.ppf(0.975, kept["freedom"]) * x * e / r**2)
+        energy = found.surplus("box", name)
+        assert (energy.value, energy.low, energy.high) == pytest.approx(
+            (x / r - 1, *(x / r - 1 + half * np.array([-1, 1]))), abs=1e-6
+        )
+
+
 def test_pages_have_the_errors_of_the_table():
     """Rationale: the page had the measured error of the first seed, with the reference's in it. Expected: in
     its table of renders the errors of the report, with their bounds."""
@@ -128,7 +156,8 @@ def test_pages_have_the_errors_of_the_table():
 
 
 def test_the_columns_of_the_table_are_described():
-    """Expected: each column of rows.csv has a line on the page about measuring."""
+    """Expected: each column of rows.csv has a line on the page about measuring, with each kind of rays."""
     text = (Path(__file__).resolve().parents[2] / "docs" / "user" / "measuring_scenes.md").read_text()
-    for name in ("scene", "integrator", "parameters", "sampler", "spp", "seed", "clock", *NUMBERS, "image"):
+    rays = [f"rays_{kind}" for kind in (*RAYS, "photon", "guided", "features")]
+    for name in (*COLUMNS, *NUMBERS, *rays, "image"):
         assert f"`{name}`" in text.partition("## Columns of rows.csv")[2].partition("\n## ")[0]

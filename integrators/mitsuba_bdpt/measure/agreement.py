@@ -214,15 +214,19 @@ def _student(value, error, freedom, confidence) -> Estimate:
 def missing_energy(image: Sample, reference: Sample) -> Estimate:
     """Return 1 - mean(image) / mean(reference) with its 95 % interval (m = 1).
 
-    Variance of the ratio to first order: v_x / r^2 + x^2 v_r / r^4, Student's t with the degrees of freedom
-    of `satterthwaite`.
+    Variance of the ratio to first order: v_x / r^2 + x^2 v_r / r^4. The interval is Banerjee's, of half width
+    sqrt(t_x^2 v_x / r^2 + t_r^2 x^2 v_r / r^4) with Student's quantile of each side, which holds the value in
+    95 % of cases or more; with the degrees of freedom of `satterthwaite` it is 88 % for two renders. Source:
+    S. K. Banerjee, Sankhya 22, 1960.
     """
     x, r = float(image.mean[0]), float(reference.mean[0])
     if not r > 0:
         raise CommandError(f"references have mean {r:g}; no share of it can be missing.")
-    parts = float(image.error[0] / r) ** 2, float(x * reference.error[0] / r**2) ** 2
-    freedom = satterthwaite(parts[0], image.freedom, parts[1], reference.freedom)
-    return _student(1 - x / r, math.sqrt(sum(parts)), freedom, CONFIDENCE)
+    errors = float(image.error[0] / r), float(x * reference.error[0] / r**2)
+    tail = (1 - CONFIDENCE) / 2
+    sides = zip(errors, (image.freedom, reference.freedom), strict=True)
+    half = math.hypot(*(stats.t.isf(tail, freedom) * error for error, freedom in sides))
+    return Estimate(1 - x / r, 1 - x / r - half, 1 - x / r + half)
 
 
 def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE) -> BiasCheck:

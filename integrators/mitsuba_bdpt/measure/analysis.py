@@ -265,8 +265,18 @@ class Results:
 
     @cached_property
     def methods(self) -> list[str]:
-        """Integrators; the others are compared with the first."""
-        return list(dict.fromkeys([self.rows[0]["first"], *(row["method"] for row in self.rows)]))
+        """Integrators; the others are compared with the first.
+
+        In the order of the preset, as far as scenes show it: before those that follow them in a scene.
+        """
+        order: list[str] = [self.rows[0]["first"]]
+        for scene in self.scenes:
+            names = list(dict.fromkeys(row["method"] for row in self.rows if row["scene"] == scene))
+            for i, name in enumerate(names):
+                if name not in order:
+                    following = [order.index(later) for later in names[i + 1 :] if later in order[1:]]
+                    order.insert(min(following, default=len(order)), name)
+        return order
 
     @cached_property
     def rivals(self) -> list[str]:

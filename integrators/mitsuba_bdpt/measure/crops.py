@@ -106,8 +106,7 @@ class _Layout:
         width = (wide - (count + 1) * GAP) / count
         most = max(int(width / CHARACTER), 8)
         captions = [*(column.caption for column in block.columns), ("reference",)]
-        # A number and its unit stay in one line.
-        captions = [[re.sub(r"(\d) (s|spp)\b", "\\1\u00a0\\2", line) for line in one] for one in captions]
+        captions = [[_kept_together(line) for line in one] for one in captions]
         wrapped = ["\n".join(textwrap.fill(line, most) for line in one) for one in captions]
         lines = max(text.count("\n") for text in wrapped) + 1
         return _Layout(width, width * block.target.shape[0] / block.target.shape[1], tuple(wrapped), lines)
@@ -124,6 +123,11 @@ class _Layout:
     @property
     def whole(self) -> float:
         return self.head + self.height + self.window + max(self.height, SCALE) + 3 * GAP
+
+
+def _kept_together(line: str) -> str:
+    """Return a line of a caption in which a number stays in one line with its unit, and with its bound."""
+    return re.sub(r"([≤≥~]) (?=\d)", "\\1\u00a0", re.sub(r"(\d) (s|spp)\b", "\\1\u00a0\\2", line))
 
 
 def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:

@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.path import Path as MarkerPath
+from matplotlib.textpath import TextPath
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from ..errors import CommandError
@@ -77,7 +78,11 @@ SLOPE = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 0.8}
 KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
 SHORT = 30.0  # ratio of the ends of a logarithmic axis
-PAGE = 29.7  # cm, the height of A4
+PAGE = 24.0  # cm, the height of the text on a journal's page
+POINTS = 72.0  # of an inch
+ENTRY = 5.0 * PAPER["legend.fontsize"]  # points beside the text of an entry of a legend: handle and gaps
+LOWEST = 0.7  # inches of a plot of efficiencies
+LINE = 0.13  # inches of a line of a legend
 BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
 
 
@@ -116,7 +121,7 @@ def convergence(
             if i % across == 0:
                 axis.set_ylabel("relMSE")
         shown = [name for name in results.methods if any(results.of(scene, name) for scene in scenes)]
-        handles = [Line2D([], [], label=name, **style(results.methods, name)) for name in shown]
+        handles = _entries(results.methods, shown)
         handles += [
             Line2D([], [], color="black", linestyle=DASHES[kind], label=text) for kind, text in KINDS.items()
         ]
@@ -126,16 +131,36 @@ def convergence(
         save(figure, path)
 
 
+def _entries(methods: Sequence[str], shown: Sequence[str], before: str = "", **more) -> list[Line2D]:
+    """Return the entries of integrators in a legend: one of those that look alike, as in different scenes."""
+    alike: dict[tuple, list[str]] = {}
+    for name in shown:
+        alike.setdefault(tuple(style(methods, name).items()), []).append(name)
+    return [
+        Line2D([], [], label=before + " / ".join(names), **dict(look) | more) for look, names in alike.items()
+    ]
+
+
+def _across(labels: Sequence[str], width: float) -> int:
+    """Return how many columns of a legend fit into the ``width`` in inches."""
+    sizes = [TextPath((0, 0), label, size=PAPER["legend.fontsize"]).get_extents().width for label in labels]
+
+    def taken(across: int) -> float:
+        columns = np.array_split(np.array(sizes), across)  # as Matplotlib fills them
+        return sum(float(column.max()) + ENTRY for column in columns) / POINTS
+
+    return max(n for n in range(1, len(labels) + 1) if n == 1 or taken(n) <= width)
+
+
 def _legend(figure, handles: Sequence, is_beside: bool = False) -> None:
     """Put a legend under the axes, and make the figure higher by it, or beside them."""
     if is_beside:
         figure.legend(handles=handles, loc="outside right center")
         return
-    longest = max(len(handle.get_label()) for handle in handles)
     width, height = figure.get_size_inches()
-    across = max(1, min(len(handles), int(width / (0.4 + 0.055 * longest))))
-    figure.set_size_inches(width, height + 0.15 * math.ceil(len(handles) / across) + 0.1)
-    figure.legend(handles=handles, loc="outside lower center", ncols=across)
+    across = _across([handle.get_label() for handle in handles], width)
+    figure.set_size_inches(width, height + LINE * math.ceil(len(handles) / across) + 0.1)
+    figure.legend(handles=handles, loc="outside lower center", ncols=across, labelspacing=0.3)
 
 
 def _curves(axis, results: Results, scene: str, against: str) -> bool:
@@ -218,10 +243,8 @@ def efficiencies(
     scenes = scenes or results.scenes
     with plt.rc_context(PAPER):
         most = max(len(_present(results, scene, rivals)) for scene in scenes)
-        pitch = 0.08 * max(most, 1) + 0.06
-        figure, axis = plt.subplots(
-            figsize=(WIDTHS[columns], pitch * len(scenes) + 0.4), layout="constrained"
-        )
+        high = max((0.08 * max(most, 1) + 0.06) * len(scenes), LOWEST)
+        figure, axis = plt.subplots(figsize=(WIDTHS[columns], high + 0.4), layout="constrained")
         counts: set[int] = set()
         for place, scene in enumerate(scenes):
             if place % 2:
@@ -241,16 +264,12 @@ def efficiencies(
         axis.grid(axis="x")
         axis.set_axisbelow(True)
         shown = [rival for rival in rivals if any(results.of(scene, rival) for scene in scenes)]
-        looks = [style(results.methods, rival) for rival in shown]
-        handles = [
-            Line2D([], [], label=f"over {rival}", **look | {"linestyle": ""})
-            for rival, look in zip(shown, looks, strict=True)
-        ]
-        plain = {"color": "#666666", "linestyle": "", "marker": looks[0]["marker"] if looks else "o"}
+        handles = _entries(results.methods, shown, "over ", linestyle="")
+        plain = {"color": "#666666", "linestyle": "", "marker": handles[0].get_marker() if handles else "o"}
         handles += [
+            Line2D([], [], label=_interval(counts), color="#666666", linewidth=0.8),
             Line2D([], [], label="trimmed", **plain),
             Line2D([], [], label="raw", markerfacecolor="white", **plain),
-            Line2D([], [], label=_interval(counts), color="#666666", linewidth=0.8),
         ]
         if axis.texts:
             arrows = plain | {"marker": "$\\leftrightarrow$", "markersize": 7}
@@ -396,8 +415,8 @@ def run(options: Namespace) -> int:
         tall = 2.54 * crops.draw(blocks, output, options.columns, crops.centres(options.windows))
         if tall > PAGE:
             print(
-                f"warning: {output} is {tall:.0f} cm tall, more than a page (A4 has {PAGE:g} cm): draw fewer "
-                f"scenes by --scenes, such as --scenes {scenes[0]!r}"
+                f"warning: {output} is {tall:.0f} cm tall, more than the text on a journal's page (about "
+                f"{PAGE:g} cm): draw fewer scenes by --scenes, such as --scenes {scenes[0]!r}"
             )
     else:
         PLOTS[options.plot](results, output, options.columns, scenes)

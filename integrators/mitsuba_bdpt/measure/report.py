@@ -795,6 +795,17 @@ narrow (it holds the median in 90 % of cases, not 95 %).
 {_clock(results)}"""
 
 
+def _differences(results: Results) -> str:
+    """Return the sentence on energy that integrators lack or have in excess; nothing where none does."""
+    others = [name for name in results.methods if results.kind(name) != "bdpt"]
+    if not any(results.lacks(scene, name) for scene in results.scenes for name in others):
+        return ""
+    return (
+        "Energy that an integrator of Mitsuba's lacks or has in excess may be light that it does not find,\n"
+        "or a known difference: see *Differences from path and volpath* (docs/user/differences.md).\n\n"
+    )
+
+
 def _by_budget(results: Results) -> str:
     """Return the table of efficiencies by budget with its sentence; nothing where there are none."""
     found = budgets_table(results)
@@ -813,13 +824,14 @@ def page(
     """Return the page of all tables, as Markdown, under a title; ``missing``: see `missing_text`."""
     if unknown := sorted(set(notes) - set(results.scenes)):
         raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
+    picture = "![Efficiency per scene](efficiency.png)"
     return f"""# {name}
 
 {missing}{busy_text(results)}{_introduction(results)}
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}
-{"![Efficiency per scene](efficiency.png)" if results.has_efficiency(results.scenes) else ""}
+{_differences(results)}{picture if results.has_efficiency(results.scenes) else ""}
 
 {_by_budget(results)}{first_images_table(results)}How much of the error single values carry:
 raw over trimmed relMSE at {results.deciding} samples per pixel:

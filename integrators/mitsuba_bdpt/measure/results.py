@@ -166,7 +166,7 @@ def _with_points(row: Row) -> Row:
 
     Files of cells and older tables have the sensor's, which `bdpt` does not use.
     """
-    given = json.loads(row["parameters"])
+    given = json.loads(row.get("parameters", "{}"))
     if given.get("type") == "bdpt":
         row["sampler"] = given.get("points", "sobol")
     return row
