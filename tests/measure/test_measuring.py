@@ -697,6 +697,7 @@ def test_samples_in_equal_time_are_matched_again(monkeypatch):
         return 1 + 0.01 * spp
 
     monkeypatch.setattr(equal_time, "seconds", seconds)
+    monkeypatch.setattr(equal_time, "samples_taken", lambda scene, made, spp: spp)
     assert equal_time._samples_within(3.0, None, None, 64) == pytest.approx(200, rel=0.08)
     assert asked[0] == 64 and len(asked) <= 4
     asked.clear()
