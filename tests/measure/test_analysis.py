@@ -14,7 +14,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
-from mitsuba_bdpt.measure import analysis, estimates, reference, report, tables
+from mitsuba_bdpt.measure import analysis, estimates, reference, report, sweep, tables
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Refused, Results
 from mitsuba_bdpt.measure.preset import read_preset
@@ -45,6 +45,7 @@ def row(method="bdpt", seed=1, **values):
         "height": 8,
         "max_depth": 3,
         "machine": "a machine",
+        "started": "2026-11-28T15:23:37+00:00",
         "versions": '{"mitsuba": "3.9.1", "source": "s"}',
         "first": "bdpt",
         "reference_sha256": "",
@@ -584,6 +585,29 @@ def test_other_programs_are_noticed(wall, processor, is_busy):
         assert not report.busy_text(replace(found, aside=("path",)))
         page = report.page(found, {"box": image_of_two()}, [], {}, "Box")
         assert page.index(text) < page.index("Efficiency is")
+
+
+def test_renders_of_different_runs_are_said():
+    """Rationale: an integrator that was added to a folder was compared with renders of three minutes before,
+    as one that followed them. Expected: the report names it first, and not those that did follow."""
+    rows = runs("bdpt", 2, started="2026-11-28T15:23:37+00:00")
+    rows += runs("path", 2, started="2026-11-28T15:23:40+00:00")
+    rows += runs("bdpt merged", 2, started="2026-11-28T15:26:10+00:00")
+    found = Results(rows, {"box": KNOWN}, {})
+    text = report.apart_text(found)
+    assert "bdpt merged in `box`" in text and "path" not in text and "(`-o`)" in text
+    page = report.page(found, {"box": image_of_two()}, [], {}, "Box")
+    assert page.index(text) < page.index("Efficiency is")
+    assert not report.apart_text(replace(found, rows=rows[:4]))
+
+
+def test_a_report_of_one_integrator_compares_none(capsys):
+    """Expected: a sentence in place of a table without columns; the sweep says so too."""
+    found = Results(runs("bdpt", 2), {"box": KNOWN}, {})
+    assert "no integrator to compare bdpt with" in report.efficiency_table(found)
+    table = [one | {"parameters": "{}"} for one in found.rows]
+    sweep._tell(SimpleNamespace(cut={}, scenes=[], failed=[], output="results"), table)  # pyright: ignore
+    assert "bdpt is the only integrator" in capsys.readouterr().out
 
 
 def test_a_report_has_the_name_of_its_preset(results, tmp_path):

@@ -27,7 +27,7 @@ PLAIN = {
     "statistics": "{}",
     "versions": "{}",
     "machine": "a",
-    "started": "now",
+    "started": "2026-11-28T15:23:37+00:00",
     "budget": 64,
     "spp": 64,
 }

@@ -1053,7 +1053,7 @@ def test_the_table_is_tidy(tmp_path):
         "statistics": '{"rays": 3}',
         "versions": '{"mitsuba": "3.9.1"}',
         "machine": "a",
-        "started": "now",
+        "started": "2026-11-28T15:23:37+00:00",
         "key": "abc",
         "budget": 8,
         "seconds": 1.5,

@@ -14,6 +14,7 @@ from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -72,6 +73,8 @@ def efficiency_table(results: Results) -> str:
 
     A table per set of rivals: scenes with media have others.
     """
+    if not results.rivals:
+        return f"There is no integrator to compare {results.methods[0]} with; add one to the preset.\n"
     groups: dict[tuple[str, ...], list[str]] = {}
     for scene in results.scenes:
         rivals = tuple(rival for rival in results.rivals if results.of(scene, rival))
@@ -767,6 +770,35 @@ def busy_text(results: Results) -> str:
     return f"**Other programs ran meanwhile**: {why}. {'; '.join(found)}. {how}.\n\n"
 
 
+# Seconds, and multiples of those of both renders, within which the renders of one seed follow one another.
+APART, APART_TIMES = 60.0, 10.0
+
+
+def _is_apart(first: Row, second: Row) -> bool:
+    """Return whether two renders that are compared are of different runs of a sweep."""
+    began = (datetime.fromisoformat(row["started"]).timestamp() for row in (first, second))
+    between = abs(next(began) - next(began))
+    return between > APART + APART_TIMES * (first["seconds"] + second["seconds"])
+
+
+def apart_text(results: Results) -> str:
+    """Return the paragraph about integrators whose renders did not follow those of the first; or nothing."""
+    found: dict[str, list[str]] = {}
+    for scene in results.scenes:
+        firsts = {row["seed"]: row for row in results.of(scene, results.methods[0], results.deciding)}
+        for name in results.rivals:
+            rows = results.of(scene, name, results.deciding)
+            if any(_is_apart(firsts[row["seed"]], row) for row in rows if row["seed"] in firsts):
+                found.setdefault(name, []).append(f"`{scene}`")
+    if not found:
+        return ""
+    what = "; ".join(f"{name} in {', '.join(scenes)}" for name, scenes in found.items())
+    why = "and efficiencies have what changed on the machine between them"
+    how = "A sweep into another folder (`-o`) renders all anew"
+    first = results.methods[0]
+    return f"**Seconds of different runs** are compared with those of {first}, {why}: {what}. {how}.\n\n"
+
+
 def _ranges(rows: Sequence[Row]) -> str:
     wall, processor = (
         "–".join(f"{end(row.get(name, 0.0) for row in rows):.3g}" for end in (min, max))
@@ -827,7 +859,7 @@ def page(
     picture = "![Efficiency per scene](efficiency.png)"
     return f"""# {name}
 
-{missing}{busy_text(results)}{_introduction(results)}
+{missing}{busy_text(results)}{apart_text(results)}{_introduction(results)}
 {f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
 
 {efficiency_table(results)}

@@ -650,6 +650,11 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
     for text in [text for cells in sweep.scenes for text in equal_elsewhere(cells, table)]:
         print(text)
+    if len({row["method"] for row in table}) == 1:
+        print(
+            f"{table[0]['method']} is the only integrator, and compared with none; tables [[integrator]] of "
+            "the preset replace the default ones: list these too"
+        )
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
     for text in [*short_of_target(table), *poor]:
         print(f"warning: {text}")

@@ -273,9 +273,7 @@ def in_words(
 def explained(
     prepared: PreparedScene, plan: Plan, unsampled: UnsampledLight, samples: int, mean: float | None
 ) -> str:
-    """`in_words` of undersampled light of any share; its radiance if the image's ``mean`` is not known."""
-    if not unsampled.is_undersampled:
-        return ""
+    """`in_words` of light of any share; its radiance if the image's ``mean`` is not known."""
     shares = unsampled.radiance if mean is None else predicted_shares(unsampled, mean)
     all_of_it = sum(shares.values())
     share = f"light of mean radiance {all_of_it:.2g}"

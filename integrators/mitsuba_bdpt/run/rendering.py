@@ -402,14 +402,12 @@ class Render:
         return unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
 
     def explained_warning(self) -> str:
-        """Return `predicted_warning`, or what is undersampled though there is no warning."""
+        """Return `predicted_warning`, or what is not sampled though there is no warning."""
         if text := self.predicted_warning():
             return text
-        undersampled = unsampled_light.is_undersampling_possible(self.prepared, self.settings)
-        unsampled = self._unsampled() if undersampled else None
-        if unsampled is None:
+        unsampled, mean = self._unsampled(), self._predicted_mean()
+        if unsampled is None or (mean is None and not unsampled.is_undersampled):
             return ""
-        mean = self._predicted_mean()
         return unsampled_light.explained(self.prepared, self.plan, unsampled, self._samples(), mean)
 
     def _predicted_mean(self) -> float | None:
