@@ -533,8 +533,8 @@ def equal_elsewhere(cells: Cells, table: list[Row]) -> list[str]:
     name, first = cells.subject.name, cells.methods[0].name
     at = {row["method"]: row.get("equal_time_spp") for row in analysis.select(table, scene=name)}
     return [
-        f"{name}: times of {method} and {first} are equal at {spp} spp, the largest that time allowed; to "
-        "measure it at a larger budget, sweep into another folder (-o) with more --seconds"
+        f"{name}: times of {method} and {first} were made equal at {spp} spp, the largest that time "
+        "allowed; to measure it at a larger budget, sweep into another folder (-o) with more --seconds"
         for method, spp in at.items()
         if spp is not None and spp < max(cells.subject.spp)
     ]
