@@ -82,7 +82,7 @@ class Emitters:
         redrawn = [group.redraws for group in self.groups if group.redraws]
         self._drawn_by_mitsuba = Mask([not any(of[i] for of in redrawn) for i in range(self.count)])
         self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
-        dr.make_opaque(self._group, self._pmf, self._inverse)
+        dr.make_opaque(self._group, self._pmf, self._inverse, self._pointers)
 
     def _summarize(self, emitters, types):
         """Set the properties that depend on all emitters; ``types``: their groups."""
