@@ -261,6 +261,13 @@ MUTANTS = (
         ("tests/planning/test_unsampled_light.py::test_lamps_of_several_colours_are_lost_together",),
     ),
     Mutant(
+        "emitters: the pointer of a single one is part of the kernel",
+        "emitters/emitters.py",
+        "self._inverse, self._pointers)",
+        "self._inverse)",
+        ("tests/test_properties.py::test_no_recompilation[spp = 20_000]",),
+    ),
+    Mutant(
         "emitters: lamps on meshes are in Mitsuba's order",
         "emitters/order.py",
         "sorted(on_meshes, key=key)",
