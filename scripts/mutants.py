@@ -2090,7 +2090,7 @@ MUTANTS = (
     Mutant(
         "errors: the reference's own error counts",
         "measure/estimates.py",
-        "found = measured - own\n",
+        "found = measured - _column(rows, OWN[error])\n",
         "found = measured\n",
         ("tests/measure/test_estimates.py::test_the_variance_of_an_unbiased_integrator[0.05]",),
     ),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 
 class UsageError(ValueError):
@@ -46,6 +46,12 @@ def did_you_mean(name: str, known: Iterable[str], parts: bool = False) -> str:
     around = [other for other in by_case if parts and name and name.lower() in other]
     near = sorted(around, key=len) or difflib.get_close_matches(name.lower(), by_case, 1)
     return f"did you mean {by_case[near[0]]}? " if near else ""
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Join the first ``most`` names, and say how many there are beside them."""
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def behind(error: BaseException, *kinds: type[BaseException]) -> BaseException | None:

@@ -10,7 +10,7 @@ from fnmatch import fnmatchcase
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UsageError, did_you_mean
+from ..errors import UsageError, did_you_mean, listed
 from .order import in_order
 
 # Names of the plugins of Mitsuba's emitters, by class.
@@ -77,12 +77,6 @@ def _error(text: str, what: str) -> UsageError:
 def called(ids: Sequence[str]) -> str:
     """Return the name of an emitter in messages, with its own id if its shape has another."""
     return f"{ids[0]} ({ids[1]})" if ids[1:] and ids[1] != ids[0] else ids[0]
-
-
-def listed(names: Sequence[str], most: int) -> str:
-    """Join the first ``most`` names, and say how many there are beside them."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def is_pattern(name: str) -> bool:

@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import mitsuba as mi
 
-from ..errors import CommandError, did_you_mean
+from ..errors import CommandError, did_you_mean, listed
 from ..image import features
 from ..settings import NONE, PARAMETERS
 
@@ -370,9 +370,8 @@ def _scenes_near(scene: Path) -> str:
     there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() == ".xml")
     if not there:
         return f"the folder {str(folder)!r} has no scene files (.xml)"
-    more = f" and {len(there) - LISTED} more" if len(there) > LISTED else ""
-    listed = f"the folder {str(folder)!r} has the scene files {', '.join(there[:LISTED])}{more}"
-    return f"{listed}; {did_you_mean(scene.name, there)}".rstrip("; ")
+    found = f"the folder {str(folder)!r} has the scene files {listed(there, LISTED)}"
+    return f"{found}; {did_you_mean(scene.name, there)}".rstrip("; ")
 
 
 def _files_near(options: Namespace, name: str) -> str:

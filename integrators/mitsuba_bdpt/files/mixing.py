@@ -12,8 +12,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ..emitters.light_groups import NO_LAMP, REST, called, is_pattern, listed, matches
-from ..errors import CommandError, UsageTypeError, did_you_mean
+from ..emitters.light_groups import NO_LAMP, REST, called, is_pattern, matches
+from ..errors import CommandError, UsageTypeError, did_you_mean, listed
 from ..image.layers import GROUP, PATH
 from .images import STATISTICS, attribute
 
@@ -228,12 +228,10 @@ def _missing(image: _Image, name: str) -> str:
     names += [one for lamps in image.lamps.values() for ids in lamps for one in ids]
     question = did_you_mean(str(name), names, parts=True)
     rest = ""
-    if REST in image.partitions.get(GROUP, ()):
-        rest = (
-            f"; {REST} has the light of {listed(list(map(called, image.lamps[REST])), 5)}"
-            if REST in image.lamps
-            else (f"; the light of emitters in no other group is in {REST}")
-        )
+    if REST in image.lamps:
+        rest = f"; {REST} has the light of {listed(list(map(called, image.lamps[REST])), 5)}"
+    elif REST in image.partitions.get(GROUP, ()):
+        rest = f"; the light of emitters in no other group is in {REST}"
     return f"{image.name} has no layer {name!r}; {question}{there}{rest}"
 
 

@@ -74,8 +74,8 @@ def seed_errors(rows: Sequence[Errors], error: Error, differs: bool) -> tuple[li
     the mean of `metrics.spread`, whose own values are not of one seed: each has a part of the others'
     fireflies.
     """
-    measured, own = (np.array([row[key] for row in rows], dtype=np.float64) for key in (error, OWN[error]))
-    found = measured - own
+    measured = _column(rows, error)
+    found = measured - _column(rows, OWN[error])
     is_noisy = _is_noisy(rows, error)
     if error == "rel_mse" and _has_variance(rows):
         spread = _column(rows, "variance")

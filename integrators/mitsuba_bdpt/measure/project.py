@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import CommandError, did_you_mean
+from ..errors import CommandError, did_you_mean, listed
 from ..files.texts import read_toml, table_of, whole_of
 from .scenes import DictionaryScene, MeasuredScene, SceneFile
 
@@ -104,8 +104,7 @@ class Project:
         known = self.scene_names()
         if not known:
             return f", or put it into {str(self.scenes)!r} and give its name"
-        more = f" and {len(known) - LISTED} more" if len(known) > LISTED else ""
-        text = f", or a name; there are {', '.join(known[:LISTED])}{more}; {did_you_mean(name, known)}"
+        text = f", or a name; there are {listed(known, LISTED)}; {did_you_mean(name, known)}"
         return text.rstrip("; ")
 
     def depth(self, scene: MeasuredScene) -> int:

@@ -776,8 +776,8 @@ APART, APART_TIMES = 60.0, 10.0
 
 def _is_apart(first: Row, second: Row) -> bool:
     """Return whether two renders that are compared are of different runs of a sweep."""
-    began = (datetime.fromisoformat(row["started"]).timestamp() for row in (first, second))
-    between = abs(next(began) - next(began))
+    began, other = (datetime.fromisoformat(row["started"]) for row in (first, second))
+    between = abs((began - other).total_seconds())
     return between > APART + APART_TIMES * (first["seconds"] + second["seconds"])
 
 

@@ -31,9 +31,9 @@ from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
 from .possible import SHORTEST, Start, unsampled_paths
 
-# Subpaths from either end: at least, at most, and one for so many samples of the render. The noise of the
-# estimate suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging". Of
-# light from infinity few photons meet a small glass: with 2^13, three of eight seeds had none.
+# Subpaths from either end: the fewest, the most, and samples of the render per subpath. The noise of the
+# estimate suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging". Few
+# photons from infinity meet a small glass: of 2^13, none did for three of eight seeds.
 SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 64
 
 # Share of an image's light from which on a warning is given.

@@ -8,6 +8,7 @@ import math
 import mitsuba as mi
 
 from ..emitters.light_groups import LightGroups
+from ..errors import listed
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
 from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
@@ -45,13 +46,13 @@ def warn_of_parameters(scene, sensor):
             "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
             "grows; keep such parameters at 1 or below"
         )
-        warn_once(scene, sensor, f"bdpt: {_some(bright)}: {text}")
+        warn_once(scene, sensor, f"bdpt: {listed(bright, NAMED)}: {text}")
     if narrow:
         text = (
             "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
             "strategies do not agree about it; make it 0.2 degrees or more"
         )
-        warn_once(scene, sensor, f"bdpt: {_some(narrow)}: {text}")
+        warn_once(scene, sensor, f"bdpt: {listed(narrow, NAMED)}: {text}")
 
 
 def warn_of_light_groups(scene, sensor, groups: LightGroups | None):
@@ -86,12 +87,6 @@ def warn_of_unsampled_light(prepared, plan, text: str):
         warn_once(prepared.scene, prepared.camera.sensor, text, ("unsampled light", plan.splat, plan.direct))
 
 
-def _some(found: list[str]) -> str:
-    """Return the first `NAMED` entries, and the number of the others."""
-    more = f" and {len(found) - NAMED} more" if len(found) > NAMED else ""
-    return ", ".join(found[:NAMED]) + more
-
-
 def warn_of_late_decisions(decisions, passes: int):
     """Warn of ``decisions`` for passes beyond the render's ``passes``."""
     late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
@@ -115,7 +110,7 @@ def warn_of_non_finite(statistics: dict, scene):
     parts = [f"invalid samples (NaN or infinite) count as zero: {some}"]
     named = not_finite(scene)
     parts.append(
-        f"NaN or infinity is in {_some(named)}"
+        f"NaN or infinity is in {listed(named, NAMED)}"
         if named
         else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
     )
