@@ -23,22 +23,6 @@ def test_each_commit_is_checked_as_by_make_lint():
     assert [hook["entry"] for hook in hooks] == commands
 
 
-def fields(form):
-    """The fields of an issue form by their id, and whether each is required."""
-    body = yaml.safe_load(form.read_text())["body"]
-    return {part["id"]: part.get("validations", {}).get("required", False) for part in body if "id" in part}
-
-
-@pytest.mark.parametrize(
-    "name, required",
-    [("bug", "what scene command doctor"), ("noise", "scene doctor"), ("feature", "what doctor")],
-)
-def test_reports_have_what_reproduces_them(name, required):
-    """Expected: a report of a bug or noise cannot be sent without a scene, none without `doctor`'s output."""
-    asked = fields(ROOT / ".github" / "ISSUE_TEMPLATE" / f"{name}.yml")
-    assert all(asked[field] for field in required.split())
-
-
 COMMAND = r"(?:python -m mitsuba_bdpt|mitsuba-bdpt) "
 
 

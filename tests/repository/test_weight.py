@@ -1,0 +1,56 @@
+"""The most that each subpackage may weigh: a change that needs more takes it from another one."""
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
+
+# Most lines of `*.py`, docstrings included, by folder.
+MOST = {
+    "measure": 7776,
+    "transport merging guided_emission": 7053,
+    "planning": 2894,
+    "emitters": 2577,
+    "cli": 1770,
+    "media": 1740,
+    "geometry": 1504,
+    "image": 1497,
+    "files": 1239,
+    "run": 1216,
+    "scene sampling": 1032,
+    "host": 1000,
+    "sensors": 934,
+    "": 1520,  # top files
+}
+OUTSIDE = {"scripts": 6220, "tests": 45668}
+MOST_WORDS = 70636
+
+
+def _lines(files):
+    return sum(len(file.read_text().splitlines()) for file in files)
+
+
+@pytest.mark.parametrize("folders", MOST)
+def test_subpackages_keep_their_weight(folders):
+    if folders:
+        files = [file for folder in folders.split() for file in (PACKAGE / folder).rglob("*.py")]
+    else:
+        files = [*PACKAGE.glob("*.py"), *PACKAGE.parent.glob("*.py")]
+    assert _lines(files) <= MOST[folders]
+
+
+def test_every_subpackage_has_a_limit():
+    limited = {folder for folders in MOST for folder in folders.split()}
+    assert limited == {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+
+
+@pytest.mark.parametrize("folder", OUTSIDE)
+def test_scripts_and_tests_keep_their_weight(folder):
+    assert _lines((ROOT / folder).rglob("*.py")) <= OUTSIDE[folder]
+
+
+def test_documents_keep_their_weight():
+    files = [file for file in ROOT.rglob("*.md") if file.relative_to(ROOT).parts[0] in ("docs", file.name)]
+    assert sum(len(file.read_text().split()) for file in files) <= MOST_WORDS
