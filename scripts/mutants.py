@@ -1931,27 +1931,6 @@ MUTANTS = (
         ("tests/emitters/test_lamps.py::test_textured_lamps_beside_shapes_without_points[None]",),
     ),
     Mutant(
-        "plugins: textures are believed",
-        "scene/plugin_claims.py",
-        "    if not texture.is_spatially_varying():",
-        "    if False:",
-        ("tests/scene/test_plugin_claims.py::test_statements_are_compared_with_answers[varying texture]",),
-    ),
-    Mutant(
-        "plugins: flags of BSDFs are believed",
-        "scene/plugin_claims.py",
-        "if seen.mean() > _OFF and not flags & int(_LOBES[lobe]):",
-        "if False:",
-        ("tests/scene/test_plugin_claims.py::test_statements_are_compared_with_answers[bsdf without flags]",),
-    ),
-    Mutant(
-        "plugins: flags of emitters are believed",
-        "scene/plugin_claims.py",
-        "if sampled_delta.any() and not delta:",
-        "if False:",
-        ("tests/scene/test_plugin_claims.py::test_statements_are_compared_with_answers[delta sky]",),
-    ),
-    Mutant(
         "scale: points of textured disks are found by Mitsuba's rays of one unit of length",
         "emitters/textured.py",
         "return shape.shape_type() != mi.ShapeType.Rectangle.value or shape.has_flipped_normals()",

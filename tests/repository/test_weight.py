@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1520,  # top files
 }
-OUTSIDE = {"scripts": 6220, "tests": 45668}
+OUTSIDE = {"scripts": 6220, "tests": 45565}
 MOST_WORDS = 70636
 
 

@@ -22,7 +22,6 @@ from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
 from ..transport.near_specular import near_specular
 from ..transport.photons.aim import EVEN_SKY
-from .plugin_claims import check_plugins
 
 # Area of an emitter over the square of the scene's diagonal, pi / 64 / 10: at this size a tenth of a subpath
 # hits it, of 64 that are scattered diffusely.
@@ -45,7 +44,6 @@ class PreparedScene:
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
         check_not_animated([*all_shapes(scene), *scene.emitters(), sensor, *views(sensor)])
         self.scene = scene
-        check_plugins(scene, sensor)
         self.surfaces = bool(scene.shapes())
         facts = ShapeFacts.of(scene, sensor)
         self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.hits)
