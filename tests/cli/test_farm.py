@@ -197,6 +197,12 @@ def test_ranges_of_frames():
     assert values.frames("0-10:5,7") == [0, 5, 10, 7]
 
 
+def test_frames_have_seeds_of_their_own():
+    command = ["render", "a.xml", "--frames", "0-3", "--seed", str(2**32 - 2)]
+    jobs = render.jobs_of(build_parser().parse_args(command))
+    assert [job.seed for job in jobs] == [2**32 - 2, 2**32 - 1, 0, 1]
+
+
 def sensors(count):
     """A scene file with sensors that look at lamps of radiance 1, 2, ..."""
     text = '<scene version="3.0.0">'

@@ -55,6 +55,18 @@ def test_a_seed_has_one_image_in_every_load():
         np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-5)
 
 
+def test_light_groups_are_those_of_the_tables():
+    """Expected: the layer of each lamp has its colour, whose red over green is its number. Tolerance: sums of
+    some ten numbers in single precision."""
+    bdpt = mi.load_dict({"type": "bdpt", "light_groups": "auto", "max_depth": 2})
+    image = np.array(bdpt.render(room(["b", "c", "a", "d"]), seed=3, spp=4))
+    layers = dict(zip(bdpt.aov_names(), np.moveaxis(image[..., -12:], -1, 0), strict=True))
+    for number, name in enumerate("bcad", 1):
+        red, green = layers[f"groups.{name}.R"], layers[f"groups.{name}.G"]
+        assert green.max() > 0.01
+        np.testing.assert_allclose(red, number * green, rtol=1e-5, atol=1e-5)
+
+
 def test_other_emitters_keep_their_places():
     """Expected: emitters on no mesh stay where the scene has them."""
     lamps = {name: {"type": "point", "position": [i, 0, 0]} for i, name in enumerate("cab")}

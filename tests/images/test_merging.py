@@ -529,6 +529,14 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     assert expected.any()
 
 
+def test_the_radius_shrinks_within_a_replicate(monkeypatch):
+    """Expected: the radius of each pass follows from the passes of its replicate, two of which have three."""
+    done, bdpt = [], {"type": "bdpt", "max_depth": 4, "merging": True, "spp_per_pass": 1}
+    monkeypatch.setattr(passes, "in_pass", lambda first, before: done.append(before) or first)
+    mi.load_dict(bdpt | {"layers": "variance"}).render(mi.load_dict(under_glass(point())), spp=18)
+    assert done == [0, 1, 2] * 2 + [0, 1] * 6
+
+
 def test_joined_renders_are_their_mean():
     """Rationale: a part of a render knows nothing of the others. Expected: renders that are joined, of
     several passes each, are the mean of their images by samples (to rounding of sums, box filter): the radius
