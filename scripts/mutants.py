@@ -644,7 +644,7 @@ MUTANTS = (
         "image/accumulator.py",
         "self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride)",
         "self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride - 1)",
-        ("tests/image/test_films.py::test_many_samples_of_a_pixel",),
+        ("tests/image/test_splat_filters.py::test_strips_of_camera_samples_are_apart",),
     ),
     Mutant(
         "film: the filter's taps begin a pixel early",

@@ -324,14 +324,3 @@ def test_depth_zero_is_black_and_clear(hide):
     for kind in ("bdpt", "path"):
         image = renders(scene, integrator(kind, max_depth=0, hide_emitters=hide), [0], 4)
         assert (image == 0).all()
-
-
-def test_many_samples_of_a_pixel():
-    """Rationale: single precision loses 5e-5 of 2^16 samples of a pixel, so a long pass has several sums.
-    Expected: with a filter, a crop window and a border, which sums of neighbouring rows might mix, the image
-    of short passes (of the same samples) within twice the 4e-6 of 2^12 samples."""
-    crop = {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 3, "crop_height": 2, "sample_border": True}
-    scene = lamp_in_a_sphere(rgb_film(rfilter="gaussian", **crop))
-    ways = [{"type": "bdpt", "max_depth": 3, "skip": "none", "spp_per_pass": n} for n in (10_000, 2_500)]
-    long, short = (np.array(mi.load_dict(way).render(scene, spp=10_000)) for way in ways)
-    np.testing.assert_allclose(long, short, rtol=8e-6)
