@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
@@ -908,6 +909,40 @@ def test_scenes_that_are_refused():
     empty = mi.load_dict({"type": "scene", "lamp": {"type": "point"}})
     with pytest.raises(ValueError, match="no sensor"):
         bdpt.render(empty)
+
+
+@pytest.mark.parametrize("call", ["render", "explain", "decide"])
+def test_what_is_not_yet_a_scene_is_loaded_first(call):
+    """Expected: the function of Mitsuba that loads it, not another variant."""
+    unloaded = (("a.xml", "load_file"), (Path("a.xml"), "load_file"), ({"type": "scene"}, "load_dict"))
+    for scene, remedy in (*unloaded, (None, "must be a scene"), (mi.load_dict(diffuse()), "BSDF must")):
+        with pytest.raises(TypeError, match=remedy):
+            getattr(integrator(), call)(scene)
+
+
+def test_parameters_cannot_be_set_later():
+    """Rationale: they were accepted, and ignored. Expected: an error that says where they belong, also of the
+    base class's `hide_emitters` and of names that do not exist; other attributes as documented, and those of
+    users' subclasses, can be set."""
+    bdpt = mi.load_dict({"type": "bdpt"})
+    for name, value in (("merging", True), ("max_depth", 3), ("hide_emitters", True)):
+        with pytest.raises(AttributeError, match=rf"load_dict\({{'type': 'bdpt', '{name}': {value}}}\)"):
+            setattr(bdpt, name, value)
+    assert not bdpt.settings.hide_emitters and not bdpt.hide_emitters
+    with pytest.raises(AttributeError, match="max_dept cannot be set.*did you mean max_depth"):
+        bdpt.max_dept = 3
+    bdpt.on_pass, bdpt.statistics = print, {"passes": []}
+
+    class Own(type(bdpt)):
+        def __init__(self, props):
+            super().__init__(props)
+            self.mine = 1
+
+    mi.register_integrator("own_bdpt", Own)
+    own = mi.load_dict({"type": "own_bdpt", "max_depth": 4})
+    assert (own.mine, own.max_depth) == (1, 4)
+    with pytest.raises(AttributeError, match="merging"):
+        own.merging = True
 
 
 def grouped(shapes):

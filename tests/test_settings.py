@@ -55,8 +55,8 @@ def test_layers_are_a_list(given, layers):
         ("denoise", "layers='denoise': there is no layer 'denoise'; did you mean denoised?"),
         ("variance;stokes", "there is no layer 'variance;stokes'"),
         ("variance,", "there is no layer ''.*variance, denoised, stokes, strategies"),
-        (True, "layers=True must be a list such as 'variance,denoised'"),
-        (False, "layers=False must be a list"),
+        (True, "layers=True must be a text with commas between, such as 'variance,denoised'"),
+        (False, "layers=False must be a text"),
     ],
 )
 def test_bad_layers_are_refused(given, words):

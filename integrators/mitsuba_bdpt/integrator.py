@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
 from .emitters.light_groups import parsed
-from .errors import UnsupportedError, UsageError, UsageTypeError
+from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host import tracebacks
 from .image.layers import film_layers
 from .planning.budget import is_open
@@ -104,6 +104,19 @@ class BDPTIntegrator(metaclass=ABCMeta):
         self._cancelled = False
         # Of the last scene.
         self._light_groups, self._colours = tuple(parsed(settings.light_groups)), tuple("RGB")
+
+    def __setattr__(self, name: str, value):
+        """Set an attribute; raises ``AttributeError`` for parameters, and for names that do not exist."""
+        exists = name.startswith("_") or name in {*vars(BDPTIntegrator), *BDPTIntegrator.__annotations__}
+        if name in PARAMETERS or not (exists or type(self) not in _classes.values()):
+            remedy = f"mi.load_dict({{'type': 'bdpt', {name!r}: {value!r}}})"
+            if name not in PARAMETERS:
+                remedy = f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
+            raise AttributeError(
+                f"bdpt: {name} cannot be set, and the render would not change: parameters are given when the "
+                f"integrator is made; {remedy}"
+            )
+        mi.SamplingIntegrator.__setattr__(self, name, value)
 
     @property
     def max_depth(self) -> int:

@@ -172,9 +172,10 @@ class Settings:
     layers: tuple[str, ...] = _converted(
         "",
         (),
-        "a list such as 'variance,denoised'",
-        """Adds other layers to the image, a list of ``variance`` (of each pixel), ``denoised`` (by Intel's
-        Open Image Denoise), ``stokes`` (Stokes vectors) and ``strategies`` (an image of each).""",
+        "a text with commas between, such as 'variance,denoised'",
+        """Adds other layers to the image, a text with commas between: ``variance`` (of each pixel),
+        ``denoised`` (by Intel's Open Image Denoise), ``stokes`` (Stokes vectors), ``strategies`` (an image of
+        each).""",
     )
     light_groups: str = _parameter(
         "",
