@@ -7,7 +7,7 @@ INSTALLED := $(VENV)/.installed
 # Every scene of the benchmark.
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
-.PHONY: render test costly slow costs lint gallery pictures notebook docs package references benchmark sweep stress same \
+.PHONY: render test costly slow one-core costs lint gallery pictures notebook docs package references benchmark sweep stress same \
 	endurance mutants scale
 
 render: $(INSTALLED)
@@ -19,6 +19,10 @@ PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
 # The cheap tests, and all that see planted bugs (tests/support/costs.py).
 test: $(INSTALLED)
 	$(PYTEST)
+
+# The commands and their images on one core, where what waits for a second thread hangs: a minute.
+one-core: $(INSTALLED)
+	timeout 600 taskset -c 0 $(VENV)/bin/python -m pytest tests/image tests/cli
 
 # The tests that take seconds.
 costly: $(INSTALLED)

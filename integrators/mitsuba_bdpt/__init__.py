@@ -2,7 +2,7 @@
 
 ``import mitsuba_bdpt`` selects the LLVM library that Dr.Jit loads (see `llvm`) and registers the plugin
 ``bdpt`` for the current variant and all later ones. Import it before ``mitsuba`` and ``drjit``, which load
-LLVM when first imported.
+LLVM when first imported. On one core Dr.Jit gets two threads: Mitsuba reads no EXR with one.
 """
 
 import sys as _sys
@@ -49,6 +49,7 @@ def _runs_own_command(arguments: list[str]) -> bool:
 try:
     llvm_choice = _llvm.prepare()
     from .files.mixing import mix
+    from .host.jit import ensure_two_threads as _ensure_two_threads
     from .integrator import BDPTIntegrator
     from .integrator import register as _register
     from .run.rendering import PassReport
@@ -56,6 +57,7 @@ try:
     from .run.statistics import Statistics
 
     _register()
+    _ensure_two_threads()
 except ImportError as _error:
     # Python imports the package before its __main__. The command continues, since `doctor` explains the
     # failure; __main__ reports it for every other command.

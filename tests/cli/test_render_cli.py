@@ -770,11 +770,6 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
         ),
         (('"constant"', '"cnstant"'), [], 'Plugin "cnstant" not found! Did you mean constant?'),
         (('"hdrfilm"', '"hdr"'), [], "Did you mean hdrfilm?"),
-        (
-            ("<emitter", '<bsdf type="principled"><float name="spec_tnt" value="1"/></bsdf><emitter'),
-            [],
-            'property in bsdf plugin of type "principled".*"spec_tnt".*; did you mean spec_tint?\n',
-        ),
         (("<emitter", '<bsdf type="hair"><float name="xyzzy" value="1"/></bsdf><emitter'), [])
         + ('"xyzzy": 1\n',),
         (("<emitter", '<shape type="ply"><string name="filename" value="blal.ply"/></shape><emitter'), [])

@@ -13,16 +13,16 @@ MOST = {
     "transport merging guided_emission": 7053,
     "planning": 2894,
     "emitters": 2577,
-    "cli": 1770,
+    "cli": 1781,
     "media": 1740,
     "geometry": 1504,
     "image": 1497,
-    "files": 1239,
+    "files": 1204,
     "run": 1225,
     "scene sampling": 1009,
-    "host": 1000,
+    "host": 1022,
     "sensors": 934,
-    "": 1534,  # top files
+    "": 1536,  # top files
 }
 OUTSIDE = {"scripts": 6220, "tests": 45565}
 MOST_WORDS = 70636

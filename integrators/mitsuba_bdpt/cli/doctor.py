@@ -31,7 +31,8 @@ import json, sys
 import mitsuba_bdpt
 import drjit as dr, mitsuba as mi
 backends = [name for name in ("LLVM", "CUDA") if dr.has_backend(getattr(dr.JitBackend, name))]
-print(json.dumps({"variants": mi.variants(), "backends": backends}), flush=True)
+threads = dr.thread_count()
+print(json.dumps({"variants": mi.variants(), "backends": backends, "threads": threads}), flush=True)
 mi.set_variant(sys.argv[1])
 scene = mi.cornell_box()
 scene["integrator"] = {"type": "bdpt", "max_depth": 4}
@@ -75,7 +76,7 @@ def versions() -> list[Finding]:
     system = f"{platform.system()} {platform.machine()}"
     findings = [
         Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
-        Finding("ok", "platform", f"{system}, {os.cpu_count()} processors"),
+        Finding("ok", "platform", system),
         Finding("ok", "mitsuba-bdpt", mitsuba_bdpt.__version__),
     ]
     for package in PACKAGES:
@@ -127,8 +128,17 @@ def render_in_child(
     for line in child.stdout.splitlines():
         if line.startswith("{"):
             report.update(json.loads(line))
-    findings = [variants(report["variants"], report.get("backends", []))] if "variants" in report else []
+    findings = [threads(report["threads"])] if "threads" in report else []
+    if "variants" in report:
+        findings.append(variants(report["variants"], report.get("backends", [])))
     return [*findings, judge(child, report, variant)]
+
+
+def threads(count: int) -> Finding:
+    """Report Dr.Jit's ``count`` of threads, and why there are two on one processor."""
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    why = ", two of which Mitsuba needs to read and write EXR files" if available == 1 < count else ""
+    return Finding("ok", "threads", f"{count}{why}; processors: {available}")
 
 
 def variants(installed: list[str], backends: list[str]) -> Finding:

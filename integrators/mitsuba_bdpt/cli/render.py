@@ -126,7 +126,6 @@ def loaded(options: Namespace) -> Loaded:
         if behind(error, KeyboardInterrupt) or is_mistake(error) or of_plugin:
             raise
         raise CommandError(in_words(error)) from error
-    # After loading: with one thread Mitsuba cannot read EXR, see `two_threads`.
     if options.threads is not None:
         dr.set_thread_count(options.threads)
     return found

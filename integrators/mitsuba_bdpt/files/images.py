@@ -5,16 +5,15 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Iterable, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import OpenEXR
 
 from ..errors import CommandError
+from ..host.jit import two_threads
 from ..image.layers import DENOISED
 from .whole import MAGIC, check_format, check_writable, replacing
 
@@ -131,19 +130,6 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
         bitmap.write(stream, file_format)
     with replacing(path) as temporary:
         temporary.write_bytes(stream.raw_buffer())
-
-
-@contextmanager
-def two_threads():
-    """Within, Dr.Jit has at least two threads: with one, Mitsuba deadlocks at an EXR."""
-    before = dr.thread_count()
-    if before < 2:
-        dr.set_thread_count(2)
-    try:
-        yield
-    finally:
-        if before < 2:
-            dr.set_thread_count(before)
 
 
 def check_output(path: Path, suffix: str) -> None:

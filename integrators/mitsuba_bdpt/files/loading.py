@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeVar
 import mitsuba as mi
 
 from ..errors import CommandError, did_you_mean, listed
+from ..host.jit import two_threads
 from ..image import features
 from ..settings import NONE, PARAMETERS
 
@@ -190,12 +191,13 @@ def unless_incompatible(made: Callable[[bool], _Made]) -> _Made:
 
     Mitsuba refuses to merge meshes of which some have ``flip_normals``.
     """
-    try:
-        return made(True)
-    except RuntimeError as error:
-        if "Mesh::merge()" not in str(error):
-            raise
-    return made(False)
+    with two_threads():  # for textures in EXR files
+        try:
+            return made(True)
+        except RuntimeError as error:
+            if "Mesh::merge()" not in str(error):
+                raise
+        return made(False)
 
 
 def _load(options: Namespace, merges: bool) -> Loaded:
@@ -417,8 +419,6 @@ def _in_words(error: str, options: Namespace) -> str | None:
     )
     if missing:
         return f"{error}{_files_near(options, missing[1])}"
-    if suggested := _unused_parameters(error, options):
-        return suggested
     if ours := _of_the_command(error, options):
         return ours
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
@@ -446,29 +446,6 @@ def _of_the_command(error: str, options: Namespace) -> str | None:
     """
     found = re.search(r'integrator plugin of type "bdpt": .*\b\w+Error: bdpt: ((\w+)\b.*)', error, re.DOTALL)
     return f"-P {found[1]}" if found and found[2] in dict(options.properties) else None
-
-
-def _unused_parameters(error: str, options: Namespace) -> str | None:
-    """Return a message for Mitsuba's ``error`` about unused parameters of a plugin.
-
-    None for other errors, and for names that resemble no parameter of the plugin.
-    """
-    found = re.search(r'Found \d+ unreferenced \w+ in \w+ plugin of type "([^"]*)"', error)
-    names = re.findall(r'^  - \w+ "([^"]*)"', error, re.MULTILINE) if found else []
-    if found is None or set(names) & {key for key, _ in options.properties}:
-        return None
-    questions = "".join(did_you_mean(name, words_of(found[1])) for name in names)
-    return f"{error.rstrip()}; {questions.rstrip()}" if questions else None
-
-
-def words_of(plugin: str) -> list[str]:
-    """Return words in the library of a plugin, most of its parameter names among them.
-
-    Mitsuba cannot list parameters that are not given. Empty for plugins in Python.
-    """
-    library = next((Path(mi.__file__).parent / "plugins").glob(f"{plugin}.*"), None)
-    words = re.findall(rb"(?<=\0)[a-z][a-z0-9_]{2,}(?=\0)", library.read_bytes()) if library else []
-    return [word.decode() for word in words]
 
 
 def parameters(scene: Path, definitions: Mapping[str, object]) -> dict[str, str]:

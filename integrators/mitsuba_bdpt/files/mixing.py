@@ -14,6 +14,7 @@ import numpy as np
 
 from ..emitters.light_groups import NO_LAMP, REST, called, is_pattern, matches
 from ..errors import CommandError, UsageTypeError, did_you_mean, listed
+from ..host.jit import two_threads
 from ..image.layers import GROUP, PATH
 from .images import STATISTICS, attribute
 
@@ -242,7 +243,8 @@ def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
         if not path.is_file():
             raise CommandError(f"there is no image {str(path)!r}; give the EXR of a render")
         try:
-            image = mi.Bitmap(str(path))
+            with two_threads():
+                image = mi.Bitmap(str(path))
         except RuntimeError as error:
             raise CommandError(f"{str(path)!r} cannot be read ({error}); give the EXR of a render") from error
     pixels = np.array(image).astype(np.float64)

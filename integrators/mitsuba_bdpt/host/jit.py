@@ -32,6 +32,28 @@ def registered_emitters() -> list[str]:
     return found
 
 
+def ensure_two_threads() -> int:
+    """Give Dr.Jit a second thread if it has one only; returns the number before.
+
+    Mitsuba's reader and writer of EXR files wait for another thread than the caller's, for ever with one.
+    """
+    before = dr.thread_count()
+    if before < 2:
+        dr.set_thread_count(2)
+    return before
+
+
+@contextlib.contextmanager
+def two_threads():
+    """Within, Dr.Jit has at least two threads, also if the user has set one."""
+    before = ensure_two_threads()
+    try:
+        yield
+    finally:
+        if before < 2:
+            dr.set_thread_count(before)
+
+
 @contextlib.contextmanager
 def evaluated_mode(on=True):
     """Evaluate loops, calls and branches instead of recording (for `timed_sunsky`)."""
