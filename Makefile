@@ -30,7 +30,7 @@ costly: $(INSTALLED)
 
 # All tests that make test leaves out.
 slow: $(INSTALLED)
-	$(PYTEST) -m "slow or costly"
+	$(PYTEST) -m "slow or costly" -o faulthandler_timeout=14400
 
 # What tests cost, in tests/support/costs.json, by which make test leaves them out.
 costs: $(INSTALLED)

@@ -15,7 +15,6 @@ from costs import (  # noqa: F401  (hooks of pytest)
     pytest_sessionfinish,
 )
 from mitsuba_bdpt.host.jit import registered_emitters
-from patience import PATIENCE
 
 VARIANT = variants.of("rgb")
 mi.set_variant(VARIANT)
@@ -34,7 +33,7 @@ def _variant():
 @pytest.fixture
 def workers(_cluster, monkeypatch):
     """A dask.distributed cluster, whose scheduler may answer as late as the machine's load makes it."""
-    monkeypatch.setattr(mitsuba_bdpt.workers, "ANSWERS_WITHIN", PATIENCE)
+    monkeypatch.setattr(mitsuba_bdpt.workers, "ANSWERS_WITHIN", 1000.0)
     return _cluster
 
 

@@ -24,7 +24,6 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.mistakes import TERMINATED
 from mitsuba_bdpt.measure.scenes import SceneFile
 from mitsuba_bdpt.run.snapshot import read
-from patience import PATIENCE
 
 SCENE = Path(__file__).parents[2] / "scenes" / "cornell_box.xml"
 SMALL = ["render", str(SCENE), "--size", "16x16", "-P", "spp_per_pass=4"]
@@ -46,13 +45,11 @@ def test_sigterm_ends_as_ctrl_c_does():
         stderr=subprocess.PIPE,
         text=True,
     )
-    deadline = time.monotonic() + PATIENCE
     while process.poll() is None and not Path("ended.png").exists():  # the first pass is over
-        assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(signal.SIGTERM)
     process.send_signal(signal.SIGTERM)
-    out, err = process.communicate(timeout=PATIENCE)
+    out, err = process.communicate()
     assert process.returncode == TERMINATED == 143, err
     pixels, statistics = rendered.image("ended.exr", "RGB")
     assert statistics["interrupted"] and 0 < statistics["spp"] < 4000000 and np.all(np.isfinite(pixels))
@@ -505,6 +502,6 @@ def test_nobody_listens_any_more():
     command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "8", "-o", "a.exr"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()
-    assert process.wait(timeout=PATIENCE) == 0, process.stderr.read()
+    assert process.wait() == 0, process.stderr.read()
     process.stderr.close()
     assert rendered.image("a.exr", "RGB")[1]["spp"] == 8

@@ -9,7 +9,6 @@ import pytest
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.image import film_limits
 from mitsuba_bdpt.image.accumulator import Channels
-from patience import PATIENCE
 
 GIB = 2**30
 
@@ -114,7 +113,7 @@ FILMS = {"plain": {}, "aovs": {"aovs": "a:albedo,b:sh_normal,d:depth"}, "varianc
 def child():
     """What `CHILD` has found: its films, and its limits by the option of ``ulimit``."""
     command = [sys.executable, "-c", CHILD, json.dumps(list(FILMS.values()))]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -7,7 +7,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.host.introspection import all_shapes, children, named, own_parameters
-from patience import PATIENCE
 
 OBJECTS = {
     "point": {"type": "point", "position": [1, 2, 3]},
@@ -91,7 +90,7 @@ def test_scenes_that_the_cycle_collector_frees():
     cycle collector runs. While a kernel was being recorded, Dr.Jit aborted the process. Expected: renders
     beside such scenes end, however often the collector runs."""
     command = [sys.executable, "-c", FREED_MEANWHILE]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]
 
 
@@ -130,7 +129,7 @@ def test_an_error_of_another_scenes_emitter_hints_at_it():
     """Rationale: virtual calls visit the emitters of all scenes that live. Expected: the error of a sound
     scene says that there is another, a refusal of `bdpt` itself and the other's own error do not. (In a
     process of its own: the traceback of an error keeps the broken scene alive.)"""
-    done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
     sound, refused, broken = done.stdout.splitlines()
     assert sound.startswith("RuntimeError bdpt: other scenes in this process have 1 foreign emitters")

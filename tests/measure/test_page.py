@@ -12,7 +12,6 @@ import pytest
 from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.measure import page, tables
 from mitsuba_bdpt.measure.analysis import NOTHING, Refused, Summary
-from patience import PATIENCE
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian's package chromium)")
@@ -106,7 +105,7 @@ def opened(file) -> dict:
     """What `PROBE` saw in headless Chromium."""
     command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=5000"]
     command += [f"--user-data-dir={file.parent / 'profile'}", "--dump-dom", f"file://{file}"]
-    dom = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE).stdout
+    dom = subprocess.run(command, capture_output=True, text=True).stdout
     found = re.search(r'<pre id="seen">(.*?)</pre>', dom, re.DOTALL)
     assert found, dom[:2000]
     return json.loads(found[1])

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -41,7 +42,6 @@ from mitsuba_bdpt.measure.project import Project, depth_in
 from mitsuba_bdpt.measure.results import errors, keep_missing, load, lost, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
-from patience import PATIENCE
 
 ROOT = Path(__file__).resolve().parents[2]
 PRESET = """
@@ -703,11 +703,11 @@ def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
         "import sys; from mitsuba_bdpt.cli.arguments import main\n"
         f"sys.exit(main(['sweep', {str(path)!r}, '-o', {str(output)!r}, '--project', {str(folder)!r}]))\n"
     )
-    done = subprocess.run([sys.executable, "-c", KILLED + code], stdout=subprocess.DEVNULL, timeout=PATIENCE)
+    done = subprocess.run([sys.executable, "-c", KILLED + code], stdout=subprocess.DEVNULL)
     assert done.returncode == -signal.SIGKILL
     kept = {p: json.loads(p.read_text()) for p in (output / "cells").glob("*.json")}
     assert len(kept) == 5
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(list((output / "cells").glob("*.json"))) == 40
     assert all(json.loads(p.read_text()) == row for p, row in kept.items())
@@ -983,8 +983,9 @@ def test_a_first_image_without_kernel_cache():
     fails is raised."""
     wanted = {"file": str(ROOT / "scenes" / "cornell_box.xml"), "resolution": 8, "sampler": "independent"}
     wanted |= {"parameters": {"type": "path"}, "max_depth": 3, "spp": 2}
+    began = time.perf_counter()
     found = probes.first_image(wanted)
-    assert 0 < found["seconds"] < PATIENCE and 0 < found["cpu_seconds"] < PATIENCE
+    assert 0 < found["seconds"] < time.perf_counter() - began and found["cpu_seconds"] > 0
     with pytest.raises(RuntimeError, match="gone.xml"):
         probes.first_image(wanted | {"file": "gone.xml"})
 

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import repository
 from mitsuba_bdpt.measure import reference
-from patience import PATIENCE
 
 SCRIPT = Path(endurance.__file__)
 TINY = ["--render-samples", "2048"]
@@ -92,7 +91,6 @@ def test_an_interrupted_run_goes_on(tmp_path):
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(SCRIPT.parent), *sys.path])},
         capture_output=True,
         text=True,
-        timeout=PATIENCE,
         # A shell's background jobs ignore SIGINT, and Python keeps what it inherits.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
