@@ -587,8 +587,8 @@ def test_a_report_that_cannot_be_written_names_the_folder(here, capsys, monkeypa
 def test_an_edited_scene_is_rendered_anew(here, capsys):
     """Rationale: an edit ended the sweep; after it images of both versions lay side by side, under names that
     did not tell them apart. Expected: the reference of the edited scene is made anew in the limit of time;
-    its renders replace the others, which is said, with their number, and go to a folder of their own, those
-    of another scene stay; when the edit is reverted they are used again, and nothing is rendered."""
+    its renders replace the others in the tables and among the named images, which is said, with their number,
+    those of another scene stay; when the edit is reverted they are used again, and nothing is rendered."""
     text = (here / "elsewhere" / "room.xml").read_text()
     (here / "elsewhere" / "other.xml").write_text(text)
     head = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "2")
@@ -598,14 +598,11 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
 
     def found():
         files = [file.relative_to(out) for file in sorted(out.rglob("*"))]
-        kept = [file for file in files if file.suffix == ".exr" or file.parent.name in ("cells", "first")]
+        kept = [file for file in files if file.suffix == ".exr" or file.parent.name == "cells"]
         rows = pyarrow.parquet.read_table(out / "rows.parquet").to_pylist()
         return {file: (out / file).read_bytes() for file in kept}, {row["key"]: row["mean"] for row in rows}
 
     assert main(words) == 0
-    for cell in (out / "cells").iterdir():  # as if all had a first image
-        (out / "first").mkdir(exist_ok=True)
-        (out / "first" / cell.name).write_text("[1.0]")
     (before, first), _ = found(), capsys.readouterr()
     (here / "elsewhere" / "room.xml").write_text(text.replace("3, 2, 1", "6, 4, 2"))
     assert main(words) == 0
@@ -613,24 +610,21 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
     assert (
         "room: the scene has changed since its reference at 16 and depth 4 was made; making one anew" in said
     )
-    assert (
-        "room: the scene has changed: 4 renders of it before are no longer in the tables; they are in" in said
-    )
+    assert "room: the scene has changed: 4 renders of it before are no longer in the tables, and used" in said
     assert "rows are not of this preset" not in said and "8 rows" in said
     kept, images = set(first) & set(second), Path("images")
-    assert len(kept) == 4 and {name for name in before if "other" in str(name)} < set(after)
-    now = [name for name in after if name.parts[0] == "images"]
-    assert len(now) == 16 and len([name for name in now if name.parent == images]) == 8
-    assert {name.stem for name in now if name.parent != images} == set(second)
-    assert {name.stem for name in after if name.parent == Path("cells")} == set(second)
-    apart = {Path("earlier") / name for name in before if name.stem in set(first) - kept}
-    assert apart == {name for name in after if name.parts[0] == "earlier"} and len(apart) == 12
+    assert len(kept) == 4 and all(
+        after[name] == data for name, data in before.items() if "other" in str(name)
+    )
+    named = {name: data for name, data in after.items() if name.parent == images}
+    rendered = [after[images / ("room" if key not in kept else "other") / f"{key}.exr"] for key in second]
+    assert len(named) == 8 and set(named.values()) == set(rendered)
     (here / "elsewhere" / "room.xml").write_text(text)
     assert main(words) == 0
-    said, (again, third) = capsys.readouterr().out, found()
-    assert "room: again the scene of 4 renders in out/earlier, which are used" in said
-    assert third == first and all(again[name] == data for name, data in before.items())
-    assert {name for name in again if name.parts[0] != "earlier"} == set(before)
+    again, third = found()
+    assert third == first and all(
+        again[name] == data for name, data in before.items() if name.suffix == ".exr"
+    )
 
 
 def test_samples_of_a_render_that_stops_are_its_own(here):

@@ -51,7 +51,6 @@ from .reference import (
     put_aside,
     reference_path,
     source_digest,
-    take_again,
     write,
 )
 from .scenes import MeasuredScene, integrator_of, path_tracers, samples_taken
@@ -216,15 +215,10 @@ def obtained(job: Job) -> Reference:
 
 
 def check(job: Job) -> None:
-    """Raise ``CommandError``, before rendering, if a reference cannot be made.
-
-    Takes the kept one again if the scene has become what it was, see `take_again`.
-    """
+    """Raise ``CommandError``, before rendering, if a reference cannot be made."""
     Recipe.of(job.project, job.scene.name)
     check_size(job)
     try:
-        if take_again(job.path, job.scene_sha256):
-            print(f"{job.scene.name}: again the scene of its earlier reference, which is used", flush=True)
         if job.is_missing:
             job.path.parent.mkdir(parents=True, exist_ok=True)
             check_writable(job.path)
@@ -253,7 +247,7 @@ def make(job: Job) -> tuple[Reference, bool]:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
     if outdated:
-        print(f"{job.scene.name}: {put_aside(job.path)}, and used again if the scene is reverted", flush=True)
+        print(f"{job.scene.name}: the reference before is now {str(put_aside(job.path))!r}", flush=True)
     write(job.path, reference)
     return reference, reached
 

@@ -3,13 +3,12 @@
 Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
 two halves of its samples (difference.R ...), a sample of its own error, and the provenance as JSON in the
 header, with the data of bias checks. `making` makes them. Beside one may lie that of an earlier version of
-the scene, see `put_aside` and `take_again`.
+the scene, see `put_aside`.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -103,11 +102,6 @@ def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_
     return found
 
 
-def earlier_path(path: Path) -> Path:
-    """Return where the reference of an earlier version of a scene is kept."""
-    return path.with_name(f"{path.stem}_earlier{path.suffix}")
-
-
 def header_of(path: Path) -> dict[str, Any]:
     """Return the provenance in the header of a reference; empty if the file is missing or no reference."""
     try:
@@ -121,38 +115,11 @@ def is_outdated(path: Path, scene_sha256: str) -> bool:
     return header_of(path).get("scene_sha256", scene_sha256) != scene_sha256
 
 
-def take_again(path: Path, scene_sha256: str) -> bool:
-    """Exchange a missing or outdated reference with the kept one if that is of this version of the scene.
-
-    Returns whether it is.
-    """
-    earlier = earlier_path(path)
-    if header_of(earlier).get("scene_sha256") != scene_sha256:
-        return False
-    if not path.exists():
-        os.replace(earlier, path)
-    elif is_outdated(path, scene_sha256):
-        between = path.with_name(f".{path.name}.tmp")
-        os.replace(path, between)
-        os.replace(earlier, path)
-        os.replace(between, earlier)
-    else:
-        return False
-    return True
-
-
-def put_aside(path: Path) -> str:
-    """Move an outdated reference to `earlier_path`, and describe that.
-
-    Of two the one with the smaller error stays, which took longer.
-    """
-    earlier = earlier_path(path)
-    kept, last = (header_of(file).get("rel_mse", math.inf) for file in (earlier, path))
-    if kept < last:
-        path.unlink()
-        return f"the reference of a version before, better than the last, stays in {str(earlier)!r}"
+def put_aside(path: Path) -> Path:
+    """Rename an outdated reference, in place of an earlier one; returns where it is."""
+    earlier = path.with_name(f"{path.stem}_earlier{path.suffix}")
     os.replace(path, earlier)
-    return f"the reference before is kept in {str(earlier)!r}"
+    return earlier
 
 
 def too_few(name: str, make: str) -> str:

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -45,53 +46,6 @@ def first_image_file(output: Path, cell: Cell) -> Path:
 
 def image_file(output: Path, cell: Cell) -> Path:
     return output / "images" / cell.scene / f"{cell.key}.exr"
-
-
-def earlier_folder(output: Path) -> Path:
-    """Return the folder of the renders of earlier versions of scenes, see `set_apart`."""
-    return output / "earlier"
-
-
-def _move(scene: str, key: str, source: Path, target: Path) -> None:
-    """Move a cell's files from a folder to another, the cell last, by which an interrupted move goes on."""
-    for file in (f"images/{scene}/{key}.exr", f"first/{key}.json", f"cells/{key}.json"):
-        if (source / file).exists():
-            (target / file).parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source / file, target / file)
-
-
-def set_apart(cells: Cells, table: Sequence[Row], output: Path) -> None:
-    """Move the renders of other versions of a scene that has rows in the ``table`` to `earlier_folder`.
-
-    With their images' names; prints how many.
-    """
-    name, now, count = cells.subject.name, cells.common["scene_sha256"], 0
-    if not any(row["scene"] == name for row in table):
-        return
-    for file in sorted((output / "cells").glob("*.json")):
-        try:
-            row = read_json(file, "")
-        except CommandError:  # damaged: `rows` says so
-            continue
-        if row["scene"] == name and row["scene_sha256"] != now:
-            _move(name, file.stem, output, earlier_folder(output))
-            (output / "images" / named_image(row)).unlink(missing_ok=True)
-            count += 1
-    if count:
-        print(
-            f"{name}: the scene has changed: {count} renders of it before are no longer in the tables; they "
-            f"are in {earlier_folder(output)}, and used again if it is reverted"
-        )
-
-
-def take_back(cells: Cells, output: Path) -> None:
-    """Move the renders of a scene that are in `earlier_folder` back; prints how many."""
-    earlier = earlier_folder(output)
-    found = [cell for cell in cells.possible() if cell_file(earlier, cell).exists()]
-    for cell in found:
-        _move(cell.scene, cell.key, earlier, output)
-    if found:
-        print(f"{cells.subject.name}: again the scene of {len(found)} renders in {earlier}, which are used")
 
 
 def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
@@ -264,7 +218,7 @@ def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[
 def lost(table: list[Row], output: Path) -> list[str]:
     """Return messages about stored rows whose render is not among those of the ``table``.
 
-    Except for those of other versions of its scenes, see `set_apart`.
+    A row of another version of its scene has one of its own.
     """
     file = output / "rows.parquet"
     if not table or not file.exists():
@@ -276,16 +230,27 @@ def lost(table: list[Row], output: Path) -> list[str]:
         return []
     kept = {tuple(row[key] for key in keys) for row in table}
     versions = {row["scene"]: row["scene_sha256"] for row in table}
-    before = [row for row in before if versions.get(row["scene"], row["scene_sha256"]) == row["scene_sha256"]]
+    edited = Counter(row["scene"] for row in before if _is_of_another(row, versions))
+    told = [
+        f"{name}: the scene has changed: {count} renders of it before are no longer in the tables, and used "
+        "again if it is reverted"
+        for name, count in edited.items()
+    ]
+    before = [row for row in before if not _is_of_another(row, versions)]
     gone = [row for row in before if tuple(row[key] for key in keys) not in kept]
     if not gone:
-        return []
+        return told
     names = ", ".join(dict.fromkeys(f"{row['scene']} by {row['method']}" for row in gone))
     text = (
         f"{output}: {len(gone)} rows are not of this preset, and no longer in the tables: {names}. Their "
         "renders are kept: sweep the earlier preset again to have its rows, and name another folder by -o"
     )
-    return [text]
+    return [*told, text]
+
+
+def _is_of_another(row: Row, versions: Mapping[str, str]) -> bool:
+    """Return whether a row is of another version of its scene than that of ``versions``."""
+    return versions.get(row["scene"], row["scene_sha256"]) != row["scene_sha256"]
 
 
 def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:
@@ -357,7 +322,10 @@ def named_image(row: Row) -> str:
 
 
 def _name_images(table: list[Row], output: Path) -> list[str]:
-    """Link the images of the rows under their names; returns these, empty where there is no image."""
+    """Link the images of the rows under their names; returns these, empty where there is no image.
+
+    Names of other rows are removed.
+    """
     names: list[str] = []
     for row in table:
         stored, name = output / "images" / row["scene"] / f"{row['key']}.exr", named_image(row)
@@ -368,6 +336,9 @@ def _name_images(table: list[Row], output: Path) -> list[str]:
                     os.link(stored, temporary)
                 except OSError:  # no links on this file system
                     shutil.copyfile(stored, temporary)
+    for file in (output / "images").glob("*.exr"):
+        if file.name not in names:
+            file.unlink()
     return names
 
 

@@ -58,9 +58,7 @@ from .results import (
     lost,
     read_rows,
     rows,
-    set_apart,
     store,
-    take_back,
     write_tables,
 )
 from .scenes import check_plugins, integrator_of, samples_taken
@@ -267,8 +265,6 @@ class Sweep:
         self.cut, self.wanted = dict[str, str](), 0
         self.failed = list(preset.left_out)
         self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
-        for cells in self.scenes:
-            take_back(cells, output)
         self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
         self._judges, self._tried = {}, set()
         self._progress = Renders()  # placeholder until `run`
@@ -590,8 +586,6 @@ def swept(
         table = beside(table, whole.scenes, output)
     for told in lost(table, output):
         print(f"warning: {told}")
-    for cells in sweep.scenes:
-        set_apart(cells, table, output)
     if table:
         write_tables(table, output)
     command = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
