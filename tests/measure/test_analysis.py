@@ -150,9 +150,11 @@ def test_convergence_without_the_references_error():
     """Errors 0.32 / spp at 4, 16 and 64, to all of which the reference adds 1.9e-4."""
     rows = []
     for spp, error in ((4, 0.08), (16, 0.02), (64, 0.005)):
-        rows += runs("bdpt", 2, budget=spp, spp=spp, rel_mse=error + 1.9e-4, reference_rel_mse=1.9e-4)
+        rows += runs("bdpt", 5, budget=spp, spp=spp, rel_mse=error + 1.9e-4, reference_rel_mse=1.9e-4)
     found = analysis.convergence(rows)
     assert (found.value, found.low, found.high) == pytest.approx((-1, -1, -1))
+    few = tables.said(analysis.convergence, [r for r in rows if r["seed"] < 5])
+    assert few == "-1.00 (too few renders for an interval)"
     with pytest.raises(Refused, match="fewer than two budgets"):
         analysis.convergence([r for r in rows if r["budget"] == 4])
 
@@ -340,7 +342,7 @@ def test_goals_stand_beside_what_is_measured(results):
 
 def test_slopes_need_an_explanation():
     """Errors that fall as samples^-2: marked where slopes are explained in notes, unless this one is."""
-    rows = runs("bdpt", 2, budget=4, spp=4) + runs("bdpt", 2, rel_mse=0.02 / 256)
+    rows = runs("bdpt", 5, budget=4, spp=4) + runs("bdpt", 5, rel_mse=0.02 / 256)
     results = Results(rows, {"box": KNOWN}, {})
     for notes, expected in (({"pool": "x"}, ", **unexplained**"), ({"box": "points"}, ""), ({}, "")):
         assert (
@@ -351,7 +353,7 @@ def test_slopes_need_an_explanation():
 
 def test_slopes_between_decisions():
     """Rationale: budgets at which something else is skipped are not one method. Expected: said so."""
-    rows = runs("bdpt", 2, budget=4, spp=4, decisions="[]") + runs("bdpt", 2, rel_mse=0.02 / 256)
+    rows = runs("bdpt", 5, budget=4, spp=4, decisions="[]") + runs("bdpt", 5, rel_mse=0.02 / 256)
     text = report.checks_table(Results(rows, {"box": KNOWN}, {}), MADE, {})
     assert cells(text, "`box`")[1].endswith("(-2.00 to -2.00), between decisions")
     assert "ptracer" not in text and "skip=none" not in text  # not rendered
@@ -528,7 +530,7 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     assert (energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
     line = report.errors_table(found).splitlines()[2]
     assert (
-        line.count("| 2.00e-02 (2.00e-02–2.00e-02) |") == 2
+        line.count("| 2.00e-02 (too few renders for an interval) |") == 2
         and line.endswith("| +2 % ± 2.5 |")
         and "–" not in line.split("|")[9]
     )
@@ -651,12 +653,17 @@ def image_of_two():
 
 
 def test_an_interval_that_says_nothing_is_none():
-    """Rationale: two seeds gave "9.29e+02 (7.09e-08–1.22e+13)". Expected: words from a ratio of 1000 on."""
+    """Rationale: two seeds gave "9.29e+02 (7.09e-08–1.22e+13)", three an interval of the squared bias below
+    zero. Expected: words from a ratio of 1000 on, and below five renders; the squared bias may be 0."""
     made = [
-        tables.relative(estimates.RelativeError(analysis.Estimate(1.0, low, high), "", None, None))
+        tables.relative(estimates.RelativeError(analysis.Estimate(1.0, low, high), "", 5))
         for low, high in ((0.1, 10), (1e-3, 10), (0.0, 10))
     ]
     assert made == ["1.00e+00 (1.00e-01–1.00e+01)", *["1.00e+00 (too few renders for an interval)"] * 2]
+    for count, interval in ((3, "too few renders for an interval"), (5, "-1.00e-02 to 0.00e+00")):
+        rows = [row(seed=seed, variance=0.03) for seed in range(count)]
+        bias = estimates.squared_bias(rows)
+        assert tables.signed(bias, count) == f"-1.00e-02 ({interval})"
 
 
 def test_parts_of_the_readme_are_replaced():

@@ -214,7 +214,7 @@ def test_a_reference_noisier_than_the_renders():
 
 def test_one_and_two_renders():
     """Expected: a number each; of one render its error to the reference less the reference's own, without
-    an interval; of two both parts too, which two renders give no interval of."""
+    an interval; of two both parts too, without intervals."""
     reference = halves(0.05)
     images = [TRUTH + noise(seed) for seed in range(2)]
     one = cell(images[:1], reference)
@@ -225,8 +225,8 @@ def test_one_and_two_renders():
     assert two.variance.value == pytest.approx(known(0.1 * TRUTH, reference), rel=0.05)
     assert two.total.low < two.total.value < two.total.high < math.inf
     assert two.total.value == pytest.approx(two.variance.value + two.squared_bias.value)
-    assert tables.positive(two.variance, 2).endswith("(two renders: no interval)")
-    assert tables.signed(two.squared_bias, 2).endswith("(two renders: no interval)")
+    assert tables.positive(two.variance, 2).endswith("(too few renders for an interval)")
+    assert tables.signed(two.squared_bias, 2).endswith("(too few renders for an interval)")
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.measure import estimates, metrics, page, reference, report, tables
+from mitsuba_bdpt.measure import estimates, figures, metrics, page, reference, report, tables
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
@@ -116,6 +116,21 @@ def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
     for end in ("value", "low", "high"):
         assert getattr(found.total, end) == pytest.approx(getattr(expected, end))
         assert getattr(found.variance, end) == pytest.approx(getattr(expected, end))
+
+
+@pytest.mark.parametrize("error", ["rel_mse", "rel_mse_trimmed"])
+def test_points_of_figures_are_the_errors_of_the_table(error):
+    """Rationale: the report had means, 0.0040, and the figure medians, 0.0032. Expected: of each integrator
+    the cell of the table of errors, with its interval and bound: value and ends; no ends of two renders."""
+    rows, means = rendered(0.01)
+    found = Results(rows, {"box": means}, {})
+    column = {"rel_mse_trimmed": 6, "rel_mse": 7}[error]
+    for line in report.errors_table(found).splitlines()[2:]:
+        cells = [cell.strip() for cell in line.split("|")]
+        ((x, low, middle, high),), (bound,) = figures._points(found, "box", cells[2], "spp", error)
+        ends = "too few renders for an interval" if np.isnan(low) else f"{low:.2e}–{high:.2e}"
+        assert f"{bound} {middle:.2e} ({ends})".lstrip() == cells[column]
+        assert x == 64 and np.isnan(high) == (cells[2] == "few")
 
 
 def test_energies_follow_from_the_table_and_the_header_of_the_reference(tmp_path):

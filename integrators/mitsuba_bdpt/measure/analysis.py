@@ -19,7 +19,16 @@ import numpy as np
 
 from ..errors import CommandError
 from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means, missing_energy
-from .estimates import Bound, RelativeError, bound_of_ratio, mean_differs, relative_error, seed_errors, unlike
+from .estimates import (
+    FEWEST_WITH_INTERVAL,
+    Bound,
+    RelativeError,
+    bound_of_ratio,
+    mean_differs,
+    relative_error,
+    seed_errors,
+    unlike,
+)
 from .metrics import CONFIDENCE, Estimate, number_of, values_of
 from .record import Error, Row
 
@@ -205,7 +214,8 @@ def convergence(
 ) -> Estimate:
     """Return the slope of log(error) over log(samples), over all renders of a method.
 
-    ``differs``: whether the mean differs from the reference at a budget.
+    ``differs``: whether the mean differs from the reference at a budget. The interval is infinite where a
+    budget has fewer than `FEWEST_WITH_INTERVAL` renders.
     """
     if not rows:
         raise Refused("not rendered")
@@ -217,7 +227,9 @@ def convergence(
             runs[float(np.median([row["spp"] for row in at]))] = errors
     if len(runs) < 2:
         raise Refused("fewer than two budgets with two renders")
-    return slope(list(runs), list(runs.values()))
+    found = slope(list(runs), list(runs.values()))
+    is_few = min(map(len, runs.values())) < FEWEST_WITH_INTERVAL
+    return Estimate(found.value, -math.inf, math.inf) if is_few else found
 
 
 def bias(rows: Sequence[Row], reference: Means) -> BiasCheck:

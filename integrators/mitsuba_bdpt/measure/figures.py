@@ -35,13 +35,13 @@ from .analysis import (
     Refused,
     Results,
 )
-from .estimates import Bound, seed_errors
+from .estimates import FEWEST_WITH_INTERVAL, Bound
 from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
 from .record import Error
 from .reference import Reference
 from .results import load
-from .tables import FEW
+from .tables import has_interval
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
@@ -83,7 +83,6 @@ POINTS = 72.0  # of an inch
 ENTRY = 5.0 * PAPER["legend.fontsize"]  # points beside the text of an entry of a legend: handle and gaps
 LOWEST = 0.7  # inches of a plot of efficiencies
 LINE = 0.13  # inches of a line of a legend
-BAND = (0.25, 0.5, 0.75)  # quantiles of seeds
 
 
 def style(methods: Sequence[str], method: str) -> dict:
@@ -98,8 +97,8 @@ def convergence(
 ) -> None:
     """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene, raw and trimmed.
 
-    Medians over seeds, with the quartiles of the raw error; the dotted line has slope -1. A single panel in
-    two columns has the legend beside it.
+    Means over seeds, those of the report's tables, with the 95 % interval of the raw error, and the median of
+    the seconds; the dotted line has slope -1. A single panel in two columns has the legend beside it.
     """
     scenes = scenes or results.scenes
     across = min(PANELS[columns], len(scenes)) if len(scenes) > PANELS[1] or columns == 2 else 1
@@ -211,7 +210,10 @@ def _ticks(side) -> None:
 def _points(
     results: Results, scene: str, method: str, against: str, error: Error
 ) -> tuple[np.ndarray, list[Bound]]:
-    """Return an integrator's points (n, 4), abscissa and quantiles of positive errors, and their bounds."""
+    """Return an integrator's points (n, 4) and their bounds.
+
+    Abscissa, low end, mean and high end of positive errors; the ends are NaN without an interval.
+    """
     points: list[list[float]] = []
     bounds: list[Bound] = []
     counts = Counter(row["budget"] for row in results.of(scene, method))
@@ -219,11 +221,13 @@ def _points(
     several = [budget for budget in counts if counts[budget] > 1]
     for budget in sorted(several or counts):
         rows = results.of(scene, method, budget)
-        errors, bound = seed_errors(rows, error, results.differs(scene, method, budget))
-        low, middle, high = np.quantile(errors, BAND)
-        if low > 0:
-            points.append([float(np.median([row[against] for row in rows])), low, middle, high])
-            bounds.append(bound)
+        found = results.error(scene, method, error, budget)
+        total = found.total
+        ends = [total.low, total.high] if has_interval(total, found.count) else [math.nan] * 2
+        if total.value > 0:
+            middle = float(np.median([row[against] for row in rows]))
+            points.append([middle, ends[0], total.value, ends[1]])
+            bounds.append(found.bound)
     order = np.argsort([point[0] for point in points])
     return np.array(points)[order] if points else np.empty((0, 4)), [bounds[i] for i in order]
 
@@ -237,8 +241,8 @@ def efficiencies(
 ) -> None:
     """Plot efficiencies per scene, the first integrator's over each of the ``rivals``.
 
-    Median with its 95 % interval, of fewer than `FEW` seeds their range; trimmed filled, raw hollow; arrows
-    where a ratio is a bound.
+    Median with its 95 % interval, of fewer than `FEWEST_WITH_INTERVAL` seeds their range; trimmed filled, raw
+    hollow; arrows where a ratio is a bound.
     """
     scenes = scenes or results.scenes
     with plt.rc_context(PAPER):
@@ -285,11 +289,11 @@ def _present(results: Results, scene: str, rivals: Sequence[str]) -> list[str]:
 
 def _interval(counts: set[int]) -> str:
     """Name what lines of medians of these ``counts`` of seeds show: that of few is their range."""
-    few = sorted(count for count in counts if count < FEW)
+    few = sorted(count for count in counts if count < FEWEST_WITH_INTERVAL)
     if not few:
         return "95 % interval"
     if len(few) < len(counts):
-        return f"95 % interval; range if n < {FEW}"
+        return f"95 % interval; range if n < {FEWEST_WITH_INTERVAL}"
     return f"range of {few[0]} seeds" if len(few) == 1 else f"range of {few[0]} to {few[-1]} seeds"
 
 

@@ -125,7 +125,10 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
 
 
 def lines(results: Results) -> list[list]:
-    """Return the table's lines: medians over seeds, relMSE as in reports, [number, bound] where it is one."""
+    """Return the table's lines: relMSE as in reports, [number, bound] where it is one.
+
+    Over seeds the mean of errors, and the median of samples and seconds.
+    """
     found = []
     for scene in results.scenes:
         for method in results.methods:
@@ -138,7 +141,8 @@ def lines(results: Results) -> list[list]:
                         line.append([error.total.value, error.bound] if error.bound else error.total.value)
                         continue
                     values = [row[column] for row in rows if row[column] is not None]
-                    middle = float(np.median(values)) if values else math.nan
+                    average = np.median if column in ("spp", "seconds") else np.mean
+                    middle = float(average(values)) if values else math.nan
                     line.append(middle if math.isfinite(middle) else None)
                 line[4] = int(line[4])
                 found.append(line)

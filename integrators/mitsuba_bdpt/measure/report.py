@@ -871,10 +871,10 @@ raw over trimmed relMSE at {results.deciding} samples per pixel:
 {gaps_table(results)}
 ## Errors
 
-At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds; of few
-seeds with rare bright values it is too narrow); of seconds the median (smallest–largest). Variance and
-squared bias add up to the raw error where the mean of the renders differs from the reference, and of two
-renders, which show no interval of them; elsewhere the squared bias is 0 within its noise, and may be
+At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds, from five
+renders on; of few seeds with rare bright values it is too narrow); of seconds the median (smallest–largest).
+Variance and squared bias add up to the raw error where the mean of the renders differs from the reference,
+and of two renders; elsewhere the squared bias is 0 within its noise, and may be
 negative. Energy: that of the image over the reference's, as a difference with its 95 % interval, or what is
 missing by the bias check.
 

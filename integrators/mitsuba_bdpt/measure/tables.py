@@ -9,14 +9,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from ..errors import CommandError
 from .analysis import Refused, Summary
-from .estimates import RelativeError
+from .estimates import FEWEST_WITH_INTERVAL, RelativeError
 from .metrics import Estimate
 
 WIDE = 1e3
 """Ratio of the ends of an interval from which on it says nothing."""
-
-FEW = 5
-"""Values below which their number stands beside a range, since it holds the median too rarely."""
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -54,7 +51,7 @@ def ratio(x: float) -> str:
 
 def ranged(found: Summary) -> str:
     """Format bound, median (smallest–largest)."""
-    few = f"; n = {found.count}" if found.count < FEW else ""
+    few = f"; n = {found.count}" if found.count < FEWEST_WITH_INTERVAL else ""
     middle = f"{ratio(found.median)} ({ratio(found.smallest)[:-1]}–{ratio(found.largest)[:-1]}{few})"
     return f"{found.bound} {middle}".lstrip()
 
@@ -66,22 +63,25 @@ def relative(found: RelativeError) -> str:
 
 def positive(found: Estimate, count: int) -> str:
     """Format a positive error of ``count`` renders (its interval), or why there is none."""
-    if math.isinf(found.high):
-        return f"{found.value:.2e} ({_no_interval(count)})"
-    if found.high > WIDE * found.low:
-        return f"{found.value:.2e} (too few renders for an interval)"
-    return f"{found.value:.2e} ({found.low:.2e}–{found.high:.2e})"
+    if has_interval(found, count):
+        return f"{found.value:.2e} ({found.low:.2e}–{found.high:.2e})"
+    return f"{found.value:.2e} ({_no_interval(count)})"
+
+
+def has_interval(found: Estimate, count: int) -> bool:
+    """Return whether a positive error of ``count`` renders has an interval that says something."""
+    return count >= FEWEST_WITH_INTERVAL and found.high <= WIDE * found.low
 
 
 def signed(found: Estimate, count: int) -> str:
     """Format an error of ``count`` renders that may be negative (its interval), or why there is none."""
-    if math.isinf(found.high):
+    if count < FEWEST_WITH_INTERVAL:
         return f"{found.value:.2e} ({_no_interval(count)})"
     return f"{found.value:.2e} ({found.low:.2e} to {found.high:.2e})"
 
 
 def _no_interval(count: int) -> str:
-    return "one render" if count == 1 else "two renders: no interval"
+    return "one render" if count == 1 else "too few renders for an interval"
 
 
 def spanned(values: Sequence[float]) -> str:
@@ -106,6 +106,8 @@ def said(figure: Callable[..., object], *given: object) -> str:
     if isinstance(found, RelativeError):
         return relative(found)
     if isinstance(found, Estimate):
+        if math.isinf(found.high):
+            return f"{found.value:.2f} (too few renders for an interval)"
         return f"{found.value:.2f} ({found.low:.2f} to {found.high:.2f})"
     return str(found)
 
