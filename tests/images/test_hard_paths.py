@@ -242,7 +242,7 @@ def test_stored_vertices_keep_their_merges():
         guides_near_specular=False,
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
-        path_layers=None,
+        path_layers=False,
         space=None,
         plan=SimpleNamespace(joined=1),
         last_stored=mi.UInt32(9),

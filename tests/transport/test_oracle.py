@@ -51,7 +51,7 @@ from mitsuba_bdpt.transport import (
 )
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer, Shared
-from mitsuba_bdpt.transport.path_layers import CAUSTIC, DIRECT, INDIRECT, NAMES, PathLayers
+from mitsuba_bdpt.transport.path_layers import CAUSTIC, DIRECT, INDIRECT, NAMES
 from mitsuba_bdpt.transport.photons import guided_hits, photon_guide, photon_pass
 
 from instruments import oracle
@@ -247,7 +247,7 @@ class World:
         others[..., 0, 0] = 1
         self.matrices, self.backwards = others
         self.values, self.layers = {}, {}  # of each s
-        self.path_layers: PathLayers | None = None
+        self.path_layers = False
         self.demands = []  # masks that must hold
         self.scene, self.merged = Scene(self), {}
 
@@ -1022,12 +1022,10 @@ def test_kernel_with_merges_on_hard_paths(name, classes, lens, least, monkeypatc
     assert total > 100
 
 
-def layers_of(paths, narrow: bool) -> np.ndarray:
+def layers_of(paths) -> np.ndarray:
     """Path layers by definition, of each path: by its rough events, and those beyond the first one."""
-    specular = paths.delta[:, 1 : paths.k].copy()
-    if narrow:
-        densities = np.minimum(paths.to_camera, paths.to_light)[:, 1 : paths.k]
-        specular |= densities >= near_specular.NARROW
+    densities = np.minimum(paths.to_camera, paths.to_light)[:, 1 : paths.k]
+    specular = paths.delta[:, 1 : paths.k] | (densities >= near_specular.NARROW)
     found = []
     for events in specular:  # from the emitter to the camera
         (rough,) = np.nonzero(~events)
@@ -1037,12 +1035,11 @@ def layers_of(paths, narrow: bool) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("narrow", [False, True])
-@pytest.mark.parametrize("kind", ["", "merging", "hard"])
-def test_strategies_agree_on_path_layers(kind, narrow, monkeypatch):
+@pytest.mark.parametrize("kind", ["alone", "merging", "hard"])
+def test_strategies_agree_on_path_layers(kind, monkeypatch):
     """Rationale: each strategy knows the events of two halves of a path, and makes one or two by connecting
     them. Paths and photons as above, half of the vertices delta, the others near-specular at half of the
-    densities (``narrow``). Expected: every strategy that samples a path, merges too, states the layer that
+    densities. Expected: every strategy that samples a path, merges too, states the layer that
     follows from its definition."""
     from mitsuba_bdpt.merging.hard_paths import HardMerging
     from mitsuba_bdpt.merging.merging import Merging
@@ -1051,16 +1048,16 @@ def test_strategies_agree_on_path_layers(kind, narrow, monkeypatch):
     monkeypatch.setattr(near_specular, "NARROW", 0.3)
     monkeypatch.setattr(mis, "HARD", 0.0)
     rng, met = np.random.default_rng(4), np.zeros((len(NAMES), 2), dtype=int)
-    for k in {"": (1, 2, 3, 4, 5), "merging": (4,), "hard": (3,)}[kind]:
+    for k in {"alone": (1, 2, 3, 4, 5), "merging": (4,), "hard": (3,)}[kind]:
         world, merges = World(rng, 800, k, True, delta=0.5), None
-        world.path_layers = PathLayers(narrow)
-        if kind:
+        world.path_layers = True
+        if kind != "alone":
             radius = Radius(mi.Point3f(0.0), *(mi.Float(x) for x in (0.0, 1e-3, 2.5e-4, 2e-3)))
             aim, made = (UnaimedAt(no_sky=False), HardMerging) if kind == "hard" else (Unaimed(), Merging)
             merges = made(radius, mi.Float(1e4), mi.Float(0.3), aim)
         with monkeypatch.context() as patch:
             kernel_weights(world, COEFFICIENTS["odd"], "balance", patch, merges)
-        expected, paths = layers_of(world.paths, narrow), world.paths
+        expected, paths = layers_of(world.paths), world.paths
         used = oracle.Explicit(paths, COEFFICIENTS["odd"]).used
         found = [(f"s={s}", layer, used[:, s]) for s, layer in world.layers.items()]
         assert len(found) == k + 2
@@ -1071,7 +1068,7 @@ def test_strategies_agree_on_path_layers(kind, narrow, monkeypatch):
             layer = np.broadcast_to(layer.numpy(), len(expected))
             np.testing.assert_array_equal(layer[sampled], expected[sampled], err_msg=f"{k}, {strategy}")
             met[:, int(strategy.startswith("merge"))] += np.bincount(layer[sampled], minlength=len(NAMES))
-    merged = {"": (), "merging": (CAUSTIC,), "hard": (DIRECT, INDIRECT, CAUSTIC)}[kind]
+    merged = {"alone": (), "merging": (CAUSTIC,), "hard": (DIRECT, INDIRECT, CAUSTIC)}[kind]
     assert (met[:, 0] > 20).all() and (met[merged, 1] > 20).all()
 
 

@@ -24,10 +24,9 @@ import mitsuba as mi
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
-from ..transport import bsdf, mis, spectra
+from ..transport import bsdf, mis, path_layers, spectra
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
-from ..transport.path_layers import joined
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon, same_surface
 from ..transport.sds import SdsStrategy, State, begun
@@ -225,9 +224,9 @@ def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelengt
 def with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Contribution:
     """The contribution ``c`` of ``drawn`` with its light group and path layer, if there are such layers."""
     photon, path_layer = drawn.photon, None
-    if kernel.path_layers is not None:
-        of_camera = kernel.path_layers.evaluated(z.layer, drawn.f, None, adjoint=False)
-        path_layer = joined(of_camera, photon.layer)
+    if kernel.path_layers:
+        of_camera = path_layers.evaluated(z.layer, drawn.f, None, adjoint=False)
+        path_layer = path_layers.joined(of_camera, photon.layer)
     return replace(c, light_group=kernel.light_group(photon.emitter, c.active), path_layer=path_layer)
 
 

@@ -217,7 +217,7 @@ class Render:
         if self.light_groups is not None:
             kernel.use_light_groups(self.light_groups)
         if self.settings.path_layers:
-            kernel.use_path_layers(bool(self.prepared.near_specular))
+            kernel.use_path_layers()
         return kernel
 
     def _steps(self) -> Iterator[Step]:

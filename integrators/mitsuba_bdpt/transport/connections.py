@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
-from . import mis, scattering, spectra
+from . import mis, path_layers, scattering, spectra
 from .contribution import (
     MEDIA,
     Contribution,
@@ -24,7 +24,6 @@ from .contribution import (
 )
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
-from .path_layers import INDIRECT
 from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
 from .visibility import ShadowRay, guessed, seen
@@ -64,7 +63,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
     weight, shares = h.weigh(*sides, merges=merges)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
-    path_layer = None if kernel.path_layers is None else kernel.path_layers.connected(z, f_z, y, f_y)
+    path_layer = path_layers.connected(z, f_z, y, f_y) if kernel.path_layers else None
     return replace(c, light_group=y.light_group, path_layer=path_layer)
 
 
@@ -179,9 +178,9 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     end = mi.UInt32(0) if small else mi.Point3f(z.si.p)
     nonzero, lost = mi.UInt32(0), mi.UInt32(0)
     kept = None
-    varies = kernel.path_layers is not None and kernel.path_layers.near_specular
-    # As wide as the lanes, see `Walk.begin`.
-    path_layer = dr.full(mi.UInt32, INDIRECT, dr.width(candidates)) if varies else None
+    path_layer = None
+    if kernel.path_layers:  # as wide as the lanes, see `Walk.begin`
+        path_layer = dr.full(mi.UInt32, path_layers.INDIRECT, dr.width(candidates))
     if kernel.space is not None:
         empty = kernel.heuristic.zero()
         kept = dr.zeros(mi.Spectrum), empty, empty, mi.Float(0)
@@ -202,8 +201,6 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         lost += c.counted.non_finite
         slot += 1
     # One light subpath: all vertices are of one emitter.
-    if kernel.path_layers is not None and not varies:
-        path_layer = mi.UInt32(INDIRECT)
     own = layers(path.light_group, path_layer)
     drawn = _Drawn(value, total, end, u, candidates, nonzero, lost, layers=own)
     if kept is not None:

@@ -13,7 +13,6 @@ import mitsuba as mi
 from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
-from .path_layers import PathLayers
 from .plan import Plan
 from .sds import SdsStrategy
 
@@ -127,8 +126,8 @@ class Kernel:
         self.near_specular = bool(prepared.near_specular)
         # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
         self.light_groups: LightGroups | None = None
-        # Path layers, likewise (`Contribution.path_layer`).
-        self.path_layers: PathLayers | None = None
+        # Whether they store their path layer (`Contribution.path_layer`).
+        self.path_layers = False
         # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 
@@ -157,11 +156,9 @@ class Kernel:
         """Let contributions store their light group."""
         self.light_groups, self.emitters = groups, self.emitters.with_indices()
 
-    def use_path_layers(self, near_specular: bool):
-        """Let contributions store their path layer; ``near_specular``: the scene has near-specular lobes."""
-        self.path_layers = PathLayers(near_specular)
-        if near_specular:
-            self.traits = replace(self.traits, reverse=True)
+    def use_path_layers(self):
+        """Let contributions store their path layer, for which events need both densities."""
+        self.path_layers, self.traits = True, replace(self.traits, reverse=True)
 
     def light_group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32 | None:
         """The light group of the emitter ``index``; None without such layers."""

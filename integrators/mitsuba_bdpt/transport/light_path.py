@@ -131,7 +131,6 @@ class LightPath:
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
     size, several = kernel.store_size, kernel.plan.joined > 1
-    layered = kernel.path_layers is not None and kernel.path_layers.near_specular
     return LightPath(
         si=dr.alloc_local(mi.SurfaceInteraction3f, size),
         throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
@@ -145,7 +144,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
         light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
         light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
-        layers=dr.alloc_local(mi.UInt32, size) if layered else None,
+        layers=dr.alloc_local(mi.UInt32, size) if kernel.path_layers else None,
         proxies=ProxyVertices.allocate(kernel, size) if several else None,
         flags=dr.alloc_local(mi.UInt32, size) if kernel.guides_near_specular else None,
     )

@@ -1,8 +1,8 @@
 """Path layers: a partition of paths by their events, the same whichever strategy samples a path.
 
-An event is *specular* if a delta lobe was sampled, or if it is near-specular (`near_specular.is_narrow`, by
-the densities of both directions at the vertex); other events, and those in media, are *rough*. Null events,
-which pass straight on, are none. Of a path with
+An event is *specular* if a delta lobe was sampled, or if it is near-specular by its densities from both
+sides (`near_specular.is_narrow`), of whatever BSDF and in whatever scene; other events, and those in media,
+are *rough*. Null events, which pass straight on, are none. Of a path with
 
 * no rough event: ``emission`` (an emitter seen directly, in mirrors or through glass);
 * one rough event, and no event between it and the emitter: ``direct``;
@@ -32,36 +32,29 @@ EMISSION, DIRECT, INDIRECT, CAUSTIC = range(len(NAMES))
 _SPECULAR = len(NAMES)
 
 
-class PathLayers:
-    """The layers of paths in a scene; ``near_specular``: it has near-specular lobes."""
+def sampled(layer: mi.UInt32, step: Step, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
+    """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before.
 
-    def __init__(self, near_specular: bool):
-        self.near_specular = near_specular
+    ``volume``: the vertex is in a medium; None in scenes without media.
+    """
+    specular = step.delta | _is_specular(step, volume)
+    return dr.select(step.null, layer, _after(layer, specular, adjoint))
 
-    def sampled(self, layer: mi.UInt32, step: Step, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
-        """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before.
 
-        ``volume``: the vertex is in a medium; None in scenes without media.
-        """
-        specular = step.delta | self._is_narrow(step, volume)
-        return dr.select(step.null, layer, _after(layer, specular, adjoint))
+def evaluated(layer: mi.UInt32, f: Evaluation, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
+    """The same after an event whose directions were given, with evaluation ``f``."""
+    return _after(layer, _is_specular(f, volume), adjoint)
 
-    def evaluated(self, layer: mi.UInt32, f: Evaluation, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
-        """The same after an event whose directions were given, with evaluation ``f``."""
-        return _after(layer, self._is_narrow(f, volume), adjoint)
 
-    def connected(self, z, f_z: Evaluation, y, f_y: Evaluation) -> mi.UInt32:
-        """Layer of the path that connects the vertices ``z`` and ``y`` of a camera and a light subpath."""
-        if not self.near_specular:  # both events are rough
-            return mi.UInt32(INDIRECT)
-        of_camera = self.evaluated(z.layer, f_z, z.volume, adjoint=False)
-        return joined(of_camera, self.evaluated(y.layer, f_y, y.volume, adjoint=True))
+def connected(z, f_z: Evaluation, y, f_y: Evaluation) -> mi.UInt32:
+    """Layer of the path that connects the vertices ``z`` and ``y`` of a camera and a light subpath."""
+    of_camera = evaluated(z.layer, f_z, z.volume, adjoint=False)
+    return joined(of_camera, evaluated(y.layer, f_y, y.volume, adjoint=True))
 
-    def _is_narrow(self, event: Step | Evaluation, volume: mi.Bool | None) -> mi.Bool:
-        if not self.near_specular:
-            return mi.Bool(False)
-        narrow = is_narrow(event)
-        return narrow if volume is None else narrow & ~volume
+
+def _is_specular(event: Step | Evaluation, volume: mi.Bool | None) -> mi.Bool:
+    narrow = is_narrow(event)
+    return narrow if volume is None else narrow & ~volume
 
 
 def joined(of_camera: mi.UInt32, of_light: mi.UInt32) -> mi.UInt32:

@@ -16,10 +16,9 @@ from ..emitters.records import Direct, Emission
 from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection, SensorHit
-from . import bsdf, mis, spectra
+from . import bsdf, mis, path_layers, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
-from .path_layers import EMISSION, joined
 from .sds import SdsStrategy
 from .visibility import ShadowRay, seen
 from .walk import (
@@ -165,8 +164,8 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: SdsStrategy | Non
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(e.index, active)
-    if kernel.path_layers is not None:
-        c.path_layer = kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False)
+    if kernel.path_layers:
+        c.path_layer = path_layers.evaluated(z.layer, f, z.volume, adjoint=False)
     return seen(kernel, c, shadow_ray)
 
 
@@ -210,8 +209,8 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", connection.position, counted, sides)
     c = replace(c, towards=connection.d)
-    if kernel.path_layers is not None:
-        c.path_layer = mi.UInt32(EMISSION)
+    if kernel.path_layers:
+        c.path_layer = mi.UInt32(path_layers.EMISSION)
     return seen(kernel, c, ShadowRay(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
 
 
@@ -261,9 +260,9 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     medium = y.medium_towards(kernel, connection.d)
     shadow_ray = ShadowRay(ray, medium=medium, hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
-    if kernel.path_layers is not None:
-        of_light = kernel.path_layers.evaluated(y.layer, f, y.volume, adjoint=True)
-        c.path_layer = joined(mi.UInt32(EMISSION), of_light)
+    if kernel.path_layers:
+        of_light = path_layers.evaluated(y.layer, f, y.volume, adjoint=True)
+        c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), of_light)
     return seen(kernel, c, shadow_ray.numbered(kernel, stream, y.event))
 
 
@@ -313,7 +312,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     ends = walk.edges + 1, mi.UInt32(0)
     c = Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
     if walk.layer is not None:
-        c.path_layer = joined(mi.UInt32(EMISSION), walk.layer)
+        c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), walk.layer)
     return c
 
 

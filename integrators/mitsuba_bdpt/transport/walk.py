@@ -17,12 +17,11 @@ from ..emitters.records import Direct
 from ..geometry import polarization, rays
 from ..sampling.points import Purpose
 from ..sensors.records import CameraConnection
-from . import bsdf, mis, scattering, spectra
+from . import bsdf, mis, path_layers, scattering, spectra
 from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
-from .path_layers import EMISSION
 from .sds import SdsStrategy, State, is_specular
 
 
@@ -74,7 +73,7 @@ class Walk:
             active=active,
             edge=edge,
             # As wide as the lanes: Dr.Jit treats an index of local memory of width 1 as equal in all lanes.
-            layer=None if kernel.path_layers is None else dr.full(mi.UInt32, EMISSION, dr.width(pi)),
+            layer=dr.full(mi.UInt32, path_layers.EMISSION, dr.width(pi)) if kernel.path_layers else None,
         )
 
     @property
@@ -414,8 +413,8 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
 
     seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     layer = walk.layer
-    if kernel.path_layers is not None:
-        layer = kernel.path_layers.sampled(layer, step, vertex.volume, side.adjoint)
+    if kernel.path_layers:
+        layer = path_layers.sampled(layer, step, vertex.volume, side.adjoint)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
     after = Walk(
         pi=walk.pi,

@@ -26,7 +26,7 @@ import mitsuba as mi
 from ...geometry import rays
 from ...sampling import sobol
 from ...sampling.points import Purpose, Stream
-from .. import bsdf, mis, spectra, techniques
+from .. import bsdf, mis, path_layers, spectra, techniques
 from ..contribution import one
 from ..inputs import Kernel
 from ..near_specular import GUIDED
@@ -241,6 +241,6 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
         state = replace(state, isolated=mi.Bool(True), only_delta=mi.Bool(False))
         state = replace(state, specular=specular, diffuse=~specular, narrow=specular)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
-    if kernel.path_layers is not None:
-        walk = replace(walk, layer=kernel.path_layers.evaluated(z.layer, f, z.volume, adjoint=False))
+    if kernel.path_layers:
+        walk = replace(walk, layer=path_layers.evaluated(z.layer, f, z.volume, adjoint=False))
     return walk

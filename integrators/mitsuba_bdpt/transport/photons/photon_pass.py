@@ -88,7 +88,7 @@ def trace(
     kernel.last_light = kernel.last_merged if kernel.merges_hard else kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        out = _kind(kernel, kept).zeros(capacity, kernel.path_layers is not None)
+        out = _kind(kernel, kept).zeros(capacity, kernel.path_layers)
         traced = _traced(kernel, aim, count, kept, out)
         if traced.count <= capacity:
             return traced
