@@ -36,6 +36,43 @@ def test_what_is_not_finite_counts_as_zero(name):
     assert outcome.ok, outcome.happened
 
 
+BLACK = {"type": "bitmap", "bitmap": mi.Bitmap(np.zeros((4, 4, 3), dtype=np.float32)), "raw": True}
+UNLIT = {
+    "projector": {"type": "projector", "irradiance": BLACK},
+    "textured plate": {"type": "rectangle", "lamp": {"type": "area", "radiance": BLACK}},
+    "textured ball": {"type": "sphere", "radius": 0.2, "lamp": {"type": "area", "radiance": BLACK}},
+    "spot": {"type": "spot", "texture": BLACK},
+    "scaled": {"type": "projector", "irradiance": 1.0, "scale": 0.0},
+    "point": {"type": "point", "intensity": 0.0},
+    "sky": {"type": "envmap", "bitmap": BLACK["bitmap"]},
+}
+
+
+SUN = {"sun": {"type": "directional", "direction": [0, 0, -1]}}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "lit"), [({"skip": "none"}, {}), ({"merging": True}, {}), ({"skip": "none"}, SUN)], ids=str
+)
+def test_lamps_without_light_are_left_out(parameters, lit):
+    """Rationale: a black picture has no density, and every sample of it was NaN, for which a warning blamed
+    plugins. Expected: nothing is NaN and nothing warned of, `explain` names each lamp,
+    and the image is black unless there is another."""
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    eye = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(9)}
+    sensor = {"type": "perspective", "to_world": eye, "film": film}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "floor": floor} | UNLIT | lit)
+    bdpt = mi.load_dict({"type": "bdpt", **parameters})
+    with Warned() as texts:
+        image = np.array(bdpt.render(scene, spp=16))
+    assert bdpt.statistics["non_finite"] == bdpt.statistics["non_finite_in_pilot"] == 0
+    assert image.any() == bool(lit)
+    assert [text for text in texts if "NaN" in text] == []
+    text = bdpt.explain(scene)
+    assert all(f"emitter '{name}': it emits no light" in text for name in UNLIT)
+
+
 @pytest.mark.parametrize("held", ["bare", "masked", "beside a two-sided one", "step by step"])
 def test_a_blend_seen_from_behind_is_black(held):
     """Rationale: behind its surface Mitsuba's rough conductor (Beckmann) draws a direction that is NaN and

@@ -12,6 +12,7 @@ from .directional_area import DirectionalAreaEmitters
 from .group import Context, Group, HitOnlyEmitters, weight_over
 from .infinite import InfiniteEmitters
 from .position import PositionEmitters
+from .radiance import BlackEmitters, is_black
 from .records import Chosen, Direct, Hit
 
 
@@ -79,12 +80,19 @@ KINDS: dict[str, type[Group]] = {
 MITSUBAS = frozenset(KINDS)
 
 # In the order of dispatch in a kernel.
-GROUPS: tuple[type[Group], ...] = (*dict.fromkeys(KINDS.values()), HitOnlyEmitters, ThirdPartyEmitters)
+GROUPS: tuple[type[Group], ...] = (
+    *dict.fromkeys(KINDS.values()),
+    HitOnlyEmitters,
+    BlackEmitters,
+    ThirdPartyEmitters,
+)
 
 
 def group_of(emitter) -> type[Group]:
     """Return the group of an emitter; raises as `Group.of` does."""
-    return KINDS.get(emitter.class_name(), ThirdPartyEmitters).of(emitter)
+    kind = KINDS.get(emitter.class_name(), ThirdPartyEmitters)
+    group = kind.of(emitter)
+    return BlackEmitters if kind is not ThirdPartyEmitters and is_black(emitter) else group
 
 
 def is_third_party(class_name: str) -> bool:

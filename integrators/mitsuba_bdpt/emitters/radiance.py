@@ -1,0 +1,86 @@
+"""Emitters whose radiance is 0 everywhere, or negative."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..host.introspection import children, named, number, own_parameters
+from .group import Context, HitOnlyEmitters
+
+# Names of the textures that scale the light of Mitsuba's emitters.
+_FACTORS = ("radiance", "intensity", "irradiance", "texture")
+
+# Classes of textures whose `mean` is 0 where they are black.
+_KNOWN = ("SRGBReflectanceSpectrum", "UniformSpectrum", "BitmapTexture")
+
+# Largest array that is copied from a GPU.
+_QUICKLY_COPIED = 1 << 20
+
+
+class BlackEmitters(HitOnlyEmitters):
+    """Mitsuba's emitters without light, whose textures have no density (NaN) to sample by."""
+
+    limits = "it emits no light: its radiance is 0 everywhere"
+
+    @classmethod
+    def left_out(cls, emitter) -> list[tuple[str, str]]:
+        return [(f"emitter {named(emitter.get_shape() or emitter)}", cls.limits)]
+
+    def __init__(self, emitters, context: Context):
+        self.redraws = [emitter is not None for emitter in emitters]
+
+
+def is_black(emitter: mi.Emitter) -> bool:
+    """Whether one of Mitsuba's emitters is known to emit no light."""
+    found = children(emitter)
+    textures = [found[name] for name in _FACTORS if isinstance(found.get(name), mi.Texture)]
+    if any(map(_is_black, textures)):
+        return True
+    if "sun_scale" in found:
+        own = own_parameters(emitter)
+        return number(own["sun_scale"]) == number(own["sky_scale"]) == 0
+    if "scale" not in found:
+        return False
+    own = own_parameters(emitter)
+    return number(own["scale"]) == 0 or ("data" in own and not _any_lit(own["data"]))
+
+
+def is_negative(emitter: mi.Emitter) -> bool:
+    """Whether one of Mitsuba's emitters is known to have negative radiance somewhere."""
+    own = own_parameters(emitter)
+    if "scale" in own and number(own["scale"]) < 0:
+        return True
+    if mi.is_spectral:  # data are coefficients of spectra
+        return False
+    held = [value for name, value in children(emitter).items() if name in _FACTORS]
+    data = [own.get("data"), *(_data(texture) for texture in held if isinstance(texture, mi.Texture))]
+    return any((values < 0).any() for values in map(_values, data) if values is not None)
+
+
+def _is_black(texture: mi.Texture) -> bool:
+    if not texture.class_name().startswith(_KNOWN) or number(texture.mean()) != 0:
+        return False
+    return mi.is_spectral or not _any_lit(_data(texture))
+
+
+def _data(texture: mi.Texture):
+    """Return the values of a texture of a class in `_KNOWN`, None of others."""
+    own = own_parameters(texture) if texture.class_name().startswith(_KNOWN) else {}
+    return own.get("data", own.get("value"))
+
+
+def _any_lit(data) -> bool:
+    values = None if mi.is_spectral else _values(data)
+    return values is None or bool((values != 0).any())
+
+
+def _values(data) -> np.ndarray | None:
+    """Return an array's values, without a copy in LLVM variants; None where a copy takes long."""
+    if data is None:
+        return None
+    data = dr.detach(data.array if dr.is_tensor_v(data) else data)
+    if dr.depth_v(data) == 1 and dr.backend_v(data) == dr.JitBackend.LLVM:
+        return np.from_dlpack(data)
+    return np.array(data) if dr.width(data) <= _QUICKLY_COPIED else None
