@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -30,6 +31,9 @@ DEFAULT_VARIANT = "llvm_ad_rgb"
 
 def main(arguments: Sequence[str] | None = None) -> int | None:
     """Run a command line (default: the process's own) and return its exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # output must not fail for its encoding
+            stream.reconfigure(errors="backslashreplace")
     parser = build_parser()
     options = parser.parse_args(arguments)
     if options.command == "doctor":

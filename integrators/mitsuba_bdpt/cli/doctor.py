@@ -121,7 +121,7 @@ def render_in_child(
     """Render 16x16 pixels of the Cornell box in a child process; report its outcome."""
     command = [sys.executable, "-c", PROBE, variant]
     try:
-        child = start(command, capture_output=True, text=True, timeout=TIME_LIMIT)
+        child = start(command, capture_output=True, text=True, errors="replace", timeout=TIME_LIMIT)
     except subprocess.TimeoutExpired:
         return [Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")]
     report: dict = {}

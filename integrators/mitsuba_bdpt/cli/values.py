@@ -51,6 +51,7 @@ def whole(text: str) -> int:
 
 def weight(text: str) -> tuple[str, tuple[float, ...]]:
     """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer; ids may have ``=``."""
+    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     name, equals, values = text.rpartition("=")
     with contextlib.suppress(ValueError):
         if name.strip() and equals:
@@ -103,7 +104,8 @@ def resume(text: str) -> str:
 
 
 def definition(text: str) -> tuple[str, str]:
-    """Parse ``KEY=VALUE``."""
+    """Parse ``KEY=VALUE``; Mitsuba's texts are in UTF-8, whatever the encoding of the locale."""
+    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")

@@ -15,7 +15,7 @@ import OpenEXR
 from ..errors import CommandError
 from ..host.jit import two_threads
 from ..image.layers import DENOISED
-from .whole import MAGIC, check_format, check_writable, replacing
+from .whole import MAGIC, check_format, check_writable, replacing, utf8
 
 PNG_SIDE = 1_000_000
 """Pixels in a row or column of a PNG, at most: libpng's limit."""
@@ -69,7 +69,7 @@ def _header(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        return OpenEXR.File(str(path), header_only=True).header()
+        return OpenEXR.File(utf8(path), header_only=True).header()
     except (OSError, RuntimeError, ValueError):
         return {}
 
@@ -171,7 +171,7 @@ def write_layers(
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
         temporary.touch()  # OpenEXR does not report the cause
-        file.write(str(temporary))
+        file.write(utf8(temporary))
         try:
             read_layers(temporary, *layers)
         except CommandError as error:  # OpenEXR does not report a full disk
@@ -189,7 +189,7 @@ def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, A
     if start != MAGIC[".exr"]:
         raise CommandError(f"{str(path)!r} is not an EXR")
     try:
-        opened = OpenEXR.File(str(path), separate_channels=True)
+        opened = OpenEXR.File(utf8(path), separate_channels=True)
     except (RuntimeError, ValueError) as error:
         raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
     with opened as file:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pkgutil
 import re
 from argparse import Namespace
@@ -17,6 +16,7 @@ from ..errors import CommandError, did_you_mean, listed
 from ..host.jit import two_threads
 from ..image import features
 from ..settings import NONE, PARAMETERS
+from .whole import from_utf8, utf8
 
 _Made = TypeVar("_Made")
 
@@ -57,9 +57,9 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
     """Within, Mitsuba looks for files beside the ``scene`` file first, and in ``folders`` last."""
     former = mi.file_resolver()
     own = mi.FileResolver(former)
-    own.prepend(str(scene.resolve().parent))
+    own.prepend(utf8(scene.resolve().parent))
     for folder in folders:
-        own.append(str(folder.resolve()))
+        own.append(utf8(folder.resolve()))
     mi.set_file_resolver(own)
     try:
         yield
@@ -92,7 +92,7 @@ def parse_upgraded(
     config: mi.parser.ParserConfig, scene: Path, definitions: Mapping[str, object]
 ) -> mi.parser.ParserState:
     """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6."""
-    state = mi.parser.parse_file(config, str(scene), **definitions)
+    state = mi.parser.parse_file(config, utf8(scene), **definitions)
     mi.parser.transform_upgrade(config, state)  # no change when `transform_all` repeats it
     return state
 
@@ -102,9 +102,9 @@ def named_files(state: mi.parser.ParserState) -> list[Path]:
 
     Those of spectra are left out, see `spectra`. Has to be called within `searching`.
     """
-    names = (str(mi.file_resolver().resolve(name)) for name in _filenames(state))
-    files = [str(file) for file in state.files]
-    return [Path(name) for name in dict.fromkeys((*files, *filter(os.path.isfile, names)))]
+    names = (from_utf8(str(mi.file_resolver().resolve(name))) for name in _filenames(state))
+    files = [from_utf8(str(file)) for file in state.files]
+    return list(dict.fromkeys((*files, *filter(Path.is_file, names))))
 
 
 def spectra(state: mi.parser.ParserState) -> list[str]:
@@ -455,7 +455,7 @@ def parameters(scene: Path, definitions: Mapping[str, object]) -> dict[str, str]
     """
     with searching(scene):
         state = parsed(scene, definitions, strict=False)[1]
-    text = "".join(Path(str(file)).read_text(errors="replace") for file in state.files)
+    text = "".join(from_utf8(str(file)).read_text(encoding="utf-8", errors="replace") for file in state.files)
     text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
     defaults = dict(reversed(re.findall(r'<default\s+name="(\w+)"\s+value="([^"]*)"', text)))
     return {name: defaults.get(name, "") for name in re.findall(r"\$(\w+)", text)}

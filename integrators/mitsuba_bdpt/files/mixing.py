@@ -17,6 +17,7 @@ from ..errors import CommandError, UsageTypeError, did_you_mean, listed
 from ..host.jit import two_threads
 from ..image.layers import GROUP, PATH
 from .images import STATISTICS, attribute
+from .whole import utf8
 
 Weight = float | Sequence[float]
 
@@ -244,7 +245,7 @@ def _channels(image: mi.Bitmap | Path | str) -> dict[str, np.ndarray]:
             raise CommandError(f"there is no image {str(path)!r}; give the EXR of a render")
         try:
             with two_threads():
-                image = mi.Bitmap(str(path))
+                image = mi.Bitmap(utf8(path))
         except RuntimeError as error:
             raise CommandError(f"{str(path)!r} cannot be read ({error}); give the EXR of a render") from error
     pixels = np.array(image).astype(np.float64)

@@ -15,7 +15,7 @@ from .whole import replacing
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file; raises ``CommandError`` naming it if invalid, or ``OSError``."""
     try:
-        return tomllib.loads(path.read_text())
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:  # invalid TOML, or not UTF-8
         raise CommandError(f"{path} is not TOML: {error}") from error
 
@@ -23,7 +23,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 def read_json(path: Path, remedy: str) -> Any:
     """Read a JSON file; raises ``CommandError`` with the ``remedy`` if it is damaged."""
     try:
-        return json.loads(path.read_text())
+        return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise CommandError(f"{str(path)!r} is damaged ({error}); {remedy}") from error
 
@@ -61,7 +61,7 @@ def write_text(path: Path, text: str) -> None:
     """Write a text by `replacing`; creates the folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -12,6 +12,24 @@ MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 """The first four bytes of an image's file, by suffix."""
 
 
+def utf8(path: Path) -> str:
+    """Return a path as Mitsuba and OpenEXR take it: in UTF-8, whatever the encoding of the locale.
+
+    Raises ``CommandError`` for a path in another encoding.
+    """
+    try:
+        return os.fsencode(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise CommandError(
+            f"{str(path)!r} is not in UTF-8, the encoding of Mitsuba's paths; rename the file or folder"
+        ) from error
+
+
+def from_utf8(name: str) -> Path:
+    """Return the path of a ``name`` that Mitsuba gives, see `utf8`."""
+    return Path(os.fsdecode(name.encode("utf-8")))
+
+
 def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
 
@@ -35,7 +53,8 @@ def check_format(path: Path, output: Path) -> None:
 
 def check_own(path: Path, mark: str, remedy: str) -> None:
     """Raise ``CommandError`` with the ``remedy`` if a text file lacks ``mark``."""
-    if path.is_file() and mark not in (text := path.read_text(errors="replace")) and text.strip():
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    if text.strip() and mark not in text:
         raise CommandError(f"{str(path)!r} exists and was made by something else; {remedy}")
 
 

@@ -176,7 +176,7 @@ def page(folder: Path, report: Report) -> str:
         # Only "</" could end a script element.
         "DATA": json.dumps(data, allow_nan=False).replace("</", "<\\/"),
     }
-    text = FRAME.read_text()
+    text = FRAME.read_text(encoding="utf-8")
     for name, part in parts.items():
         text = text.replace(f"@{name}@", part)
     return text

@@ -60,7 +60,9 @@ def numbers(
 ) -> list[float]:
     """Return the numbers that a new process prints, run in a ``folder``."""
     command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=folder)
+    done = subprocess.run(
+        command, env=environment, capture_output=True, text=True, errors="replace", cwd=folder
+    )
     if done.returncode:
         raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
     return [float(word) for word in done.stdout.split() if _is_number(word)]

@@ -976,7 +976,7 @@ PARTS: dict[str, Callable[[Report], str]] = {
 
 def _filled(file: Path, found: Report) -> str:
     """Return the text of a Markdown file with its parts filled; ``CommandError`` if it has none."""
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     names = re.findall(r"<!-- report: (.*?) -->", text)
     for name in names:
         if name not in PARTS:

@@ -356,7 +356,8 @@ def write_tables(table: list[Row], output: Path) -> None:
         | {"image": image}
         for row, image in zip(table, _name_images(table, output), strict=True)
     ]
-    with replacing(output / "rows.csv") as temporary, temporary.open("w", newline="") as file:
+    encoded = {"encoding": "utf-8", "errors": "backslashreplace", "newline": ""}
+    with replacing(output / "rows.csv") as temporary, temporary.open("w", **encoded) as file:
         writer = csv.DictWriter(file, tidy[0])
         writer.writeheader()
         writer.writerows(tidy)

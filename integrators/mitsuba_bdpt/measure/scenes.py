@@ -24,6 +24,7 @@ from ..files.loading import (
     spectra,
     unless_incompatible,
 )
+from ..files.whole import from_utf8
 from ..host.introspection import media_of
 
 
@@ -198,7 +199,7 @@ def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
             yield f"{len(value)} {key}".encode()
             yield from _bytes_of(held, f"{where}.{key}")
         if isinstance(name := value.get("filename"), str):
-            path = Path(str(mi.file_resolver().resolve(name)))
+            path = from_utf8(str(mi.file_resolver().resolve(name)))
             yield path.read_bytes() if path.is_file() else b""
     elif value is None or isinstance(value, str | bool | int | float):
         yield f"{type(value).__name__} {value!r}".encode()

@@ -244,7 +244,7 @@ def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
     """
     folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
     file = Path(folder.name) / "preset.toml"
-    file.write_text(preset)
+    file.write_text(preset, encoding="utf-8")
     project = Project(Path(root))
     whole = read_preset(file, project)
     subject = next(subject for subject in whole.subjects if subject.name == scene)
@@ -612,7 +612,7 @@ def _read(
     else:
         file = project.preset(preset)
         whole, name = read_preset(file, project, options.scenes), file.stem
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
     return whole, options.output or project.root / "results" / name, text
 
 
