@@ -276,7 +276,7 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
 
     monkeypatch.setattr(making, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
     monkeypatch.setattr(making.mi, "render", rendered)
-    made = making.obtained(job(2, seconds=266.0))
+    made = making.obtained(job(2, seconds=266.0, spp=64))
     assert [spp for _, spp in seen] == [4, 16, *[16] * 14] and clock[0] <= 266
     assert made.provenance["spp"] == 224 and made.means.columns.freedom == 13
     assert "as many as fit into 266 s; to add more: mitsuba-bdpt reference" in capsys.readouterr().out
@@ -293,6 +293,24 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
     assert [spp for _, spp in seen] == [4, 16, *[4] * 8] and path.is_file()
     out = capsys.readouterr().out
     assert "warning: cornell_box: 20 s are too few for its reference, which takes about 62 s" in out
+
+
+def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
+    """Rationale: of 300 s a sweep spent half on a reference 30 times better than needed. Expected: for
+    renders of 64 samples eight of 128, after two that are timed, and two more, until its own error is below a
+    tenth of theirs, raw and trimmed, however much time is left; a better one is made when asked for. Renders
+    have a 32nd of their samples here."""
+    seen, render = [], making.mi.render
+
+    def rendered(scene, *, spp, seed, **more):
+        seen.append(spp)
+        return render(scene, spp=max(spp // 32, 1), seed=seed, **more)
+
+    monkeypatch.setattr(making.mi, "render", rendered)
+    made = making.obtained(job(2, spp=64, by="bdpt"))
+    assert seen == [4, 16, *[128] * 8, *[64] * 3, *[128] * 2] and made.means.columns.freedom == 9
+    assert made.provenance["share"] == making.SUBTRACTED_SHARE
+    assert making.make(job(2, spp=64, by="bdpt"))[0].provenance["spp"] > 4 * made.provenance["spp"]
 
 
 def test_a_better_reference_stays(project, job):
@@ -544,6 +562,7 @@ def test_committed_references_are_of_their_scenes(path):
     name = path.stem.rsplit("_", 2)[0]
     assert kept["scene_sha256"] == REPOSITORY.scene(name).sha256
     assert kept.get("spp_per_render", making.PASS_SPP) == making.PASS_SPP
+    assert kept.get("share", making.REFERENCE_SHARE) == making.REFERENCE_SHARE
 
 
 def test_files_are_replaced_at_once(folder, monkeypatch):

@@ -1,12 +1,13 @@
 """Makes reference images that include an estimate of their own error.
 
 A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
-the samples per pixel that it has to judge, and of `path` in the same time if `path` makes the reference. It
-is the mean of two halves with different seeds, rendered alternately until that is reached or the time is
-over; the halves differ by twice the standard error of their mean. `Recipe` names the integrator: `bdpt` with
-all strategies, with `merging` where nothing else samples some light, or `path` (with media `volpath`) where
-that converges, as an independent integrator. Windows in which few samples find the light have more samples;
-furnaces are known exactly.
+the samples per pixel that it has to judge, and of `path` in the same time if `path` makes the reference; one
+that another command makes on the way, which subtracts its error, 10 %. It is the mean of two halves with
+different seeds, rendered alternately until that is reached or the time is over; the halves differ by twice
+the standard error of their mean. `Recipe` names the integrator: `bdpt` with all strategies, with `merging`
+where nothing else samples some light, or `path` (with media `volpath`) where that converges, as an
+independent integrator. Windows in which few samples find the light have more samples; furnaces are known
+exactly.
 
 Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
 the halves (difference.R ...), and the provenance as JSON in the header, with the data of bias checks. Sums in
@@ -90,6 +91,7 @@ WINDOW_PASSES = 4  # per render of a window
 TRIALS = 3  # renders of bdpt that estimate the error to judge
 TWICE = 2  # samples of `path` in the time of one of `bdpt`, approximately
 REFERENCE_SHARE = 0.01  # largest share of the reference's own error in a measured error
+SUBTRACTED_SHARE = 0.1  # the same where the reference is made on the way
 MARGIN = 0.9  # of that share
 
 
@@ -160,9 +162,10 @@ class Recipe:
 class Job:
     """A reference to be made.
 
-    ``spp``: of the renders to judge; ``seconds``: time limit; ``rounds``: least number of rounds of two
-    renders, which have fewer samples if several would not fit into the limit; ``max_depth``: None for the
-    project's; ``by``: a key of `WAYS` that replaces the recipe's.
+    ``spp``: of the renders to judge; ``share``: the largest of its own error in theirs; ``seconds``: time
+    limit; ``rounds``: least number of rounds of two renders, which have fewer samples if several would not
+    fit into the limit; ``max_depth``: None for the project's; ``by``: a key of `WAYS` that replaces the
+    recipe's.
     """
 
     project: Project
@@ -173,6 +176,7 @@ class Job:
     seconds: float = REFERENCE_SECONDS
     by: str | None = None
     rounds: int = 1
+    share: float = REFERENCE_SHARE
 
     @cached_property
     def scene_sha256(self) -> str:
@@ -182,6 +186,18 @@ class Job:
     @cached_property
     def depth(self) -> int:
         return self.max_depth or self.project.depth(self.scene)
+
+    @property
+    def spp_per_render(self) -> int:
+        """Samples per pixel of a render of the whole image where there is time.
+
+        `PASS_SPP`; for several rounds the power of two at which these have the samples of a render to judge
+        over ``share``, enough if its samples are no better than those of the reference.
+        """
+        if self.rounds == 1:
+            return PASS_SPP
+        enough = self.spp / self.share / (2 * self.rounds)
+        return min(max(2 ** math.ceil(math.log2(enough)), LEAST_SPP), PASS_SPP)
 
     @property
     def path(self) -> Path:
@@ -204,13 +220,13 @@ class Job:
 def obtained(job: Job) -> Reference:
     """Return the stored reference, or make it if it is missing or of another version of the scene.
 
-    A new one has enough renders for a bias check, with as many samples as the time allows, and is reported
-    on standard output.
+    A new one has enough renders for a bias check, with as many samples as the time allows and errors need
+    from which its own is subtracted, and is reported on standard output.
     """
     check(job)
     if job.is_missing:
-        made = replace(job, max_depth=job.depth, rounds=FEWEST_RUNS // 2)
-        print(said(job, *make(made)), flush=True)
+        made = replace(job, max_depth=job.depth, rounds=FEWEST_RUNS // 2, share=SUBTRACTED_SHARE)
+        print(said(made, *make(made)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
@@ -452,8 +468,7 @@ class Aim:
         if reference.means is None:
             return False
         return all(
-            reference.share_of(image, trim)
-            <= MARGIN * REFERENCE_SHARE * rel_mse(image, reference.image, trim)
+            reference.share_of(image, trim) <= MARGIN * self.job.share * rel_mse(image, reference.image, trim)
             for image in self.images
             for trim in (0.0, TRIM)
         )
@@ -530,6 +545,7 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
         first_seed=FIRST_SEED,
         sources=sorted(halves.sources),
         judges_spp=job.spp,
+        share=job.share,
     )
     return halves.reference(provenance), reached
 
@@ -537,8 +553,8 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
 def _fitting(job: Job, scene, integrator, started: float) -> int:
     """Return the samples per pixel of renders of which all of a job's rounds fit into its seconds.
 
-    A power of two, `LEAST_SPP` to `PASS_SPP`, or what the sampler makes of it. Prints a warning where not
-    even the least fit.
+    A power of two, `LEAST_SPP` to ``job.spp_per_render``, or what the sampler makes of it. Prints a warning
+    where not even the least fit.
     """
 
     def seconds(spp: int) -> float:
@@ -557,18 +573,18 @@ def _fitting(job: Job, scene, integrator, started: float) -> int:
             f"{least:.2g} s with the fewest samples ({spent:.2g} s to load and compile)",
             flush=True,
         )
-    found = min(2 ** math.floor(math.log2(max(wanted, LEAST_SPP))), PASS_SPP)
+    found = min(2 ** math.floor(math.log2(max(wanted, LEAST_SPP))), job.spp_per_render)
     return samples_taken(scene, integrator, found)
 
 
 def _refined(job: Job, halves: Halves, aim: Aim, rendered: tuple, spp: int, started: float) -> bool:
     """Add rounds to the ``halves`` until they are good enough or the time is over; return whether they are.
 
-    ``rendered``: scene, integrator and windows; ``spp``: of each render. Renders with less than `PASS_SPP`
-    are those that the time allows, so that it is not measured whether they are good enough.
+    ``rendered``: scene, integrator and windows; ``spp``: of each render. Renders with less than the job's are
+    those that the time allows, so that it is not measured whether they are good enough.
     """
     scene, integrator, windows = rendered
-    is_short, times = spp < PASS_SPP, spp / PASS_SPP
+    is_short, times = spp < job.spp_per_render, spp / PASS_SPP
     # A round that would end too late does not begin, where several had to fit.
     spent, last = 0.0, 0.0
     reached = halves.rounds > 0 and not is_short and aim.reached(halves.reference({}))
@@ -630,7 +646,7 @@ def said(job: Job, made: Reference, reached: bool) -> str:
     if reached:
         return text
     own = job.project, job.project.called(job.scene), job.resolution, job.depth
-    is_short = made.provenance.get("spp_per_render", PASS_SPP) < PASS_SPP
+    is_short = made.provenance.get("spp_per_render", PASS_SPP) < job.spp_per_render
     why = f"as many as fit into {job.seconds:.3g} s" if is_short else f"not good enough for {job.spp} spp"
     how = "to add more" if is_short else "to go on"
     return f"{text}, {why}; {how}: {make_command(*own, '--spp', str(job.spp))}"
