@@ -119,25 +119,6 @@ def test_what_looks_alike_is_one_entry(monkeypatch, plot):
     assert len({*named}) == len(named)
 
 
-def test_a_legend_is_not_taller_than_its_plot(monkeypatch):
-    """Rationale: a legend of seven lines stood under a plot of six. Expected: in a column of a journal the
-    legend of two scenes and three integrators is less high than the plot, within the figure."""
-    found = results(("atelier", "tunnel"))
-    other = {"path multijitter": "bdpt + merging", METHODS[3]: "BDPT (all strategies)"}
-    rows = [
-        row | {"method": other.get(row["method"], row["method"])}
-        for row in found.rows
-        if row["method"] != METHODS[4]
-    ]
-    rows = [row for row in rows if row["seed"] < 3 or row["scene"] == "atelier"]
-    shown = saved(monkeypatch, figures)
-    figures.PLOTS["efficiency"](replace(found, rows=rows), None, 1, found.scenes)
-    figure = shown[0]
-    legend, plot = figure.legends[0].get_window_extent(), figure.axes[0].get_window_extent()
-    assert legend.height < plot.height and len(figure.legends[0].get_texts()) == 7
-    check_texts(figure)
-
-
 @pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (1, 4), (2, 5)])
 def test_images_stand_side_by_side(monkeypatch, columns, count):
     """Expected: of two scenes, one of them wide, a column per image and one of the reference: image, two
@@ -304,21 +285,6 @@ def hidden(axis):
     ]
 
 
-@pytest.mark.parametrize(
-    ("high", "labels"), [(0.09, ["0.01", "0.02", "0.05"]), (90, [r"10^{-2}", r"10^{1}"])]
-)
-def test_short_axes_have_labels(high, labels):
-    """Rationale: an axis of less than a decade had a single label. Expected: 1, 2 and 5 times the powers of
-    ten there, the powers alone elsewhere."""
-    figure, axis = figures.plt.subplots()
-    axis.set(xscale="log", xlim=(0.009, high))
-    figures._ticks(axis.xaxis)
-    figure.draw_without_rendering()
-    found = [label.get_text() for label in axis.get_xticklabels()]
-    figures.plt.close(figure)
-    assert all(any(label in text for text in found) for label in labels)
-
-
 def test_curves_are_raw_and_trimmed(monkeypatch):
     """Expected: of each integrator the means of raw errors, solid with markers, and of trimmed ones, half of
     them, dashed; hollow markers where the error is a lower bound; a line of slope -1."""
@@ -350,16 +316,6 @@ def test_one_budget_has_points(monkeypatch):
     for side in (axis.xaxis, axis.yaxis):
         low, high = sorted(side.get_view_interval())
         assert sum(low <= tick <= high for tick in side.get_majorticklocs()) >= 2
-
-
-def test_the_legend_of_efficiencies_has_the_markers_of_the_data(monkeypatch):
-    """Expected: trimmed and raw with the marker of an integrator that is drawn, the interval, and a marker of
-    size for an integrator with a name of its own."""
-    figure = drawn(monkeypatch, "efficiency", 1, ("b",))
-    handles = {handle.get_label(): handle for handle in figure.legends[0].legend_handles}
-    drawn_ones = {line.get_marker() for line in figure.axes[0].lines}
-    assert {handles[name].get_marker() for name in ("trimmed", "raw")} <= drawn_ones
-    assert "95 % interval" in handles and handles[f"over {METHODS[-1]}"].get_marker() not in (".", ",")
 
 
 ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}
