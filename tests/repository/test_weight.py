@@ -17,7 +17,7 @@ MOST = {
     "media": 1740,
     "geometry": 1504,
     "image": 1497,
-    "files": 1224,
+    "files": 1198,
     "run": 1225,
     "scene sampling": 891,
     "host": 1022,

@@ -376,25 +376,6 @@ def _scenes_near(scene: Path) -> str:
     return f"{found}; {did_you_mean(scene.name, there)}".rstrip("; ")
 
 
-def _files_near(options: Namespace, name: str) -> str:
-    """Describe where Mitsuba searched for a missing file, and suggest others.
-
-    Empty if no object of the scene has the file ``name``; Mitsuba may report its last part only.
-    """
-    try:
-        texts = _filenames(parsed(options.scene, dict(options.defines), strict=False)[1])
-    except RuntimeError:  # of a spectrum or an included file
-        return ""
-    files = [options.scene.parent / text for text in texts if text == name or Path(text).name == name]
-    if not files:
-        return ""
-    folder = files[0].parent
-    if not folder.is_dir():
-        return f"; there is no folder {str(folder)!r}: names of files start at the folder of the scene file"
-    question = did_you_mean(files[0].name, sorted(path.name for path in folder.iterdir()))
-    return f"; it is not in the folder {str(folder)!r}; {question}".rstrip("; ")
-
-
 def _in_words(error: str, options: Namespace) -> str | None:
     """Return a message with a suggestion for Mitsuba's ``error`` about a name.
 
@@ -414,11 +395,6 @@ def _in_words(error: str, options: Namespace) -> str | None:
     missing = _MISSING.search(error)
     if missing:
         return f"{error}; give it a value: -D {missing[1]}=VALUE"
-    missing = re.search(
-        r'"([^"]+)": (I/O error while attempting to open file: No such|file not found)', error
-    )
-    if missing:
-        return f"{error}{_files_near(options, missing[1])}"
     if ours := _of_the_command(error, options):
         return ours
     strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
@@ -431,12 +407,10 @@ def _in_words(error: str, options: Namespace) -> str | None:
     if other and other[1] == options.integrator:
         return _no_integrator(other[1], f"of type {other[2]}")
     missing = re.search(r'Plugin "([^"]*)" not found', error)
-    if not missing:
+    if not missing or missing[1] != options.integrator:
         return None
-    question = did_you_mean(missing[1], plugins())
-    if missing[1] == options.integrator:
-        return f"integrator={missing[1]!r} is not a plugin; {question or 'use for example bdpt'}".rstrip()
-    return f"{error} {question.capitalize()}".rstrip() if question else None
+    question = did_you_mean(missing[1], plugins()) or "use for example bdpt"
+    return f"integrator={missing[1]!r} is not a plugin; {question}".rstrip()
 
 
 def _of_the_command(error: str, options: Namespace) -> str | None:
