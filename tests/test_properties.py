@@ -637,7 +637,7 @@ import mitsuba_bdpt, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 T = mi.ScalarTransform4f
 def lamp(x):
-    place = T().translate([x, 1, 0]).rotate([1, 0, 0], 90)
+    place = T().translate([x, 1, 0]).rotate([1, 0, 0], 90).scale(0.4)
     return {"type": "rectangle", "to_world": place, "emitter": {"type": "area"}}
 for offset, count in ((0, 40), (5, 40)):
     scene = {"type": "scene", "floor": {"type": "sphere"}, "sensor": {"type": "perspective", "film": {

@@ -283,6 +283,44 @@ def test_spots_that_rounding_changes_are_named():
     assert "spot 'lamp 0' has cutoff_angle=0.1 (up to 4% of its light)" in text and "lamp 1" not in text
 
 
+def beside_lamps(*places, kind="rectangle"):
+    """A floor under lamps of side 1 at these places."""
+    turned = mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(0.5)
+    lamp = {"type": kind, "bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": {"type": "area"}}
+    lamps = {
+        f"lamp {i}": lamp | {"to_world": mi.ScalarTransform4f().translate(place) @ turned}
+        for i, place in enumerate(places)
+    }
+    eye = mi.ScalarTransform4f().look_at([0, 0, 0.9], [0, 0, -1], [0, 1, 0])
+    sensor = {"type": "perspective", "to_world": eye, "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -1]).scale(2)}
+    return mi.load_dict({"type": "scene", "sensor": sensor, "floor": floor, **lamps}, optimize=False)
+
+
+def test_lamps_that_overlap_are_named():
+    """Rationale: rays hit one of two lamps in one plane, next-event estimation samples each. Expected: the
+    floor under two is nearly twice as bright, with a warning; of lamps as far apart as the manual says it
+    is, without one, that under lamps farther apart. Tolerance: the noise of 2^12 samples, mostly of points
+    on a lamp as large as its distance, and a thousandth of the distance."""
+    integrator, mean, said = mi.load_dict({"type": "bdpt", "max_depth": 2, "hide_emitters": True}), {}, {}
+    for gap in (0, 2e-5, 1e-3):  # of a scene of size 2
+        with Warned() as warnings:
+            scene = beside_lamps([0, 0, 1], [0, 0, 1 + gap])
+            mean[gap] = np.array(integrator.render(scene, seed=1, spp=64)).mean()
+        said[gap] = len(warnings)
+    assert said == {0: 1, 2e-5: 0, 1e-3: 0}
+    assert 1.8 < mean[0] / mean[1e-3] < 2.1 and mean[2e-5] / mean[1e-3] == pytest.approx(1, rel=0.02)
+
+
+def test_which_lamps_overlap():
+    """Expected: rectangles that share a part of a plane; not neighbours that share an edge, nor discs."""
+    row = [0, 0, 1], [1, 0, 1], [2.5, 0, 1]
+    assert diagnostics.overlapping_lamps(beside_lamps(*row)) == []
+    assert diagnostics.overlapping_lamps(beside_lamps(*row, [2.1, 0.95, 1], kind="disk")) == []
+    (text,) = diagnostics.overlapping_lamps(beside_lamps(*row, [2.1, 0.95, 1]))
+    assert text == "lamps 'lamp 3' and 'lamp 2'"
+
+
 @pytest.mark.parametrize(
     "angle, said",
     [

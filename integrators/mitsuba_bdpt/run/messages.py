@@ -11,7 +11,7 @@ from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
-from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite
+from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite, overlapping_lamps
 
 # Largest number of causes that a message lists.
 NAMED = 5
@@ -40,19 +40,18 @@ def log(statistics: dict):
 def warn_of_parameters(scene, sensor):
     """Warn once about scene parameters that spoil images."""
     bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
-    narrow = narrow_spots(scene)
-    if bright:
-        text = (
-            "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
-            "grows; keep such parameters at 1 or below"
-        )
-        warn_once(scene, sensor, f"bdpt: {listed(bright, NAMED)}: {text}")
-    if narrow:
-        text = (
-            "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
-            "strategies do not agree about it; make it 0.2 degrees or more"
-        )
-        warn_once(scene, sensor, f"bdpt: {listed(narrow, NAMED)}: {text}")
+    overlap = overlapping_lamps(scene)
+    causes = {
+        "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
+        "grows; keep such parameters at 1 or below": bright,
+        "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
+        "strategies do not agree about it; make it 0.2 degrees or more": narrow_spots(scene),
+        "they overlap in one plane, where rays hit one of them but other strategies sample each, so that "
+        "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": overlap,
+    }
+    for text, names in causes.items():
+        if names:
+            warn_once(scene, sensor, f"bdpt: {listed(names, NAMED)}: {text}")
 
 
 def warn_of_light_groups(scene, sensor, groups: LightGroups | None):

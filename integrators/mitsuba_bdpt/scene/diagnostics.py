@@ -1,6 +1,6 @@
 """Diagnostics: scene parameters that spoil images.
 
-Reflectances above 1, spots too narrow for single precision, and non-finite values.
+Reflectances above 1, spots too narrow for single precision, lamps that overlap, and non-finite values.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..geometry.boxes import is_finite
+from ..geometry.rounding import OFFSET_ULPS
 from ..host.introspection import LEAVES, children, named, number, own_parameters
 
 # Suffixes of the names of BSDF textures that scale scattered light.
@@ -114,6 +116,33 @@ def narrow_spots(scene) -> list[str]:
             most = f"{_STEP / opening:.0%}" if opening > _STEP else "all"
             found.append(f"spot {named(emitter)} has cutoff_angle={angle:g} (up to {most} of its light)")
     return found
+
+
+def overlapping_lamps(scene) -> list[str]:
+    """Describe lamps that overlap in one plane along the axes, each with one other; rectangles only."""
+    shapes = [emitter.get_shape() for emitter in scene.emitters()]
+    shapes = [shape for shape in shapes if shape and is_finite(mi.ScalarBoundingBox3f(shape.bbox()))]
+    boxes = [(shape.bbox().min, shape.bbox().max) for shape in shapes]
+    low, high = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
+    # Shadow rays to the farther of two lamps end before the nearer one, see `rounding`.
+    near = OFFSET_ULPS * 2.0**-24 * np.abs([low, high]).max((0, 2), initial=0)
+    found = []
+    for axis, a, b in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        (flat,) = np.nonzero(high[:, axis] - low[:, axis] <= near)
+        flat = flat[np.argsort(low[flat, a])]
+        starts = low[flat, a]
+        for k, i in enumerate(flat):
+            others = flat[k + 1 : np.searchsorted(starts, high[i, a] - near[i])]
+            width = np.minimum(high[others, b], high[i, b]) - np.maximum(low[others, b], low[i, b])
+            overlap = (width > near[i]) & (np.abs(low[others, axis] - low[i, axis]) <= near[i])
+            found += [(shapes[i], shapes[j]) for j in others[overlap][:1]]
+    return [f"lamps {named(a)} and {named(b)}" for a, b in found if _fills_its_box(a) and _fills_its_box(b)]
+
+
+def _fills_its_box(shape) -> bool:
+    """Whether a flat shape has the area of its bounding box."""
+    _, width, height = sorted(shape.bbox().extents())
+    return math.isclose(number(shape.surface_area()), width * height, rel_tol=1e-4)
 
 
 def not_finite(scene) -> list[str]:
