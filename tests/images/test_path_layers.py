@@ -111,28 +111,6 @@ def test_layers_of_bands_and_of_stokes_vectors():
     check_sum(np.broadcast_to(image, (4, 4, 3)), found)
 
 
-def test_layers_of_rough_surfaces_are_those_of_path_lengths():
-    """Rationale: without specular surfaces ``emission`` is what Mitsuba's `path` renders up to depth 1,
-    ``direct`` what depth 2 adds, ``indirect`` the rest. Expected: the same by Welch's t-test of the means of
-    16 renders, ``direct`` within 5 %, and nothing in ``caustic``."""
-    target = scene(rfilter="box", ball={"type": "diffuse"})
-
-    def mitsubas(depth, seed):
-        other = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 100})
-        return np.array(other.render(target, spp=32, seed=seed), dtype=np.float64).mean((0, 1))
-
-    expected, found = [], []
-    for seed in range(16):
-        upto = [mitsubas(depth, 3 * seed + depth) for depth in (1, 2, 5)]
-        expected.append(np.concatenate([upto[0], upto[1] - upto[0], upto[2] - upto[1]]))
-        _, parts = divided(integrator(skip="none"), target, spp=16, seed=seed)
-        assert not parts["caustic"].any()
-        found.append(np.concatenate([parts[name].mean((0, 1)) for name in NAMES[:3]]))
-    expected, found = np.array(expected), np.array(found)
-    welch.assert_agree(welch.welch(found, expected, labels=[f"{n} {c}" for n in NAMES[:3] for c in "RGB"]))
-    assert (np.abs(found.mean(0) / expected.mean(0) - 1)[3:6] < 0.05).all()
-
-
 @pytest.mark.parametrize("light_paths", [0, 1])
 def test_light_of_a_mirror_beside_a_floor(light_paths):
     """Rationale: under an even sky a point of a floor at distance c from an upright mirror of height a and
