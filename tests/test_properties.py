@@ -25,6 +25,7 @@ from mitsuba_bdpt.run import schedule
 from mitsuba_bdpt.run import statistics as statistics_module
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
+from rendered import same
 
 T = mi.ScalarTransform4f
 
@@ -850,7 +851,7 @@ def test_gradients_of_any_scene_do_not_matter(parameters):
         key = next(name for name in names if name.endswith(("radiance.value", "intensity.value")))
         dr.enable_grad(params[key])
         params.update()
-        assert np.array_equal(image(bdpt, scene, spp=16), plain)
+        assert same(image(bdpt, scene, spp=16), plain)
 
 
 def test_gradients_do_not_matter_to_what_is_told():
@@ -1397,7 +1398,7 @@ def test_many_samples_per_pixel_keep_their_precision():
 def test_a_small_lamp_keeps_its_light_however_many_splats_it_has(strategy_images):
     """Rationale: by (1,1) all light subpaths of a pass may fall on the pixel of a small lamp, and 2^21 equal
     numbers added in single precision are off by 0.3 %. Expected: one pass of 2^21 samples gives the same
-    image as 64 of 2^15, whose samples are the same. Tolerance: 1e-5 of each value, for camera samples are
+    image as 64 of 2^15, whose samples are the same. Tolerance: 1e-4 of each value, for camera samples are
     summed in single precision, 512 in a pixel.
     """
     scene = mi.load_dict(
@@ -1414,7 +1415,7 @@ def test_a_small_lamp_keeps_its_light_however_many_splats_it_has(strategy_images
     keys = {"max_depth": 1, "skip": "none", "layers": "strategies" if strategy_images else ""}
     one, many = (image(integrator(spp_per_pass=n, **keys), scene, spp=512) for n in (512, 8))
     assert 0 < (one[..., 0] > 1).sum() < 5
-    np.testing.assert_allclose(one, many, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(one, many, rtol=1e-4, atol=1e-5)
 
 
 def test_negative_radiance_is_that_of_path():

@@ -11,6 +11,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mitsuba_bdpt.host import llvm
 
@@ -316,7 +317,7 @@ def render(steps):
     x = dr.linspace(mi.Float, 0, 1, 64)
     for _ in range(steps):
         x = dr.sin(x) / (1 + x * x)
-    print(x.numpy().tobytes().hex())
+    print(*x.numpy())
 
 mi.set_variant("llvm_ad_rgb")
 if sys.argv[1:] == ["quick"]:
@@ -329,7 +330,8 @@ render(20)
 
 
 def test_quick_compilation(tmp_path):
-    """Expected: other code of the kernel within the block, the usual code of one after it, equal results."""
+    """Expected: other code of the kernel within the block, the usual code of one after it, equal results but
+    for the rounding of some sixty operations."""
     printed, kernels = [], []
     for way in ("usual", "again", "quick"):
         cache = tmp_path / way
@@ -338,7 +340,7 @@ def test_quick_compilation(tmp_path):
         assert done.returncode == 0 and not done.stderr, done.stderr
         printed.append(done.stdout)
         kernels.append({file.name: file.read_bytes() for file in cache.glob("*.bin")})
-    assert printed[0] == printed[2]
+    np.testing.assert_allclose(*(np.array(printed[i].split(), float) for i in (0, 2)), rtol=60 * 2.0**-23)
     assert kernels[0] == kernels[1], "files of kernels are not reproducible: this test shows nothing"
     assert kernels[0].keys() == kernels[2].keys()
     assert sum(kernels[0][name] != kernels[2][name] for name in kernels[0]) == 1

@@ -44,7 +44,7 @@ def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
     alone = bdpt(max_depth=4, skip="none", **parameters)
     for name, lit in OF_GROUPS.items():
         expected, _ = layers(alone, scene(lit, **window))
-        np.testing.assert_allclose(groups[name], expected, rtol=1e-5, atol=2e-6 * image.max())
+        np.testing.assert_allclose(groups[name], expected, rtol=1e-4, atol=2e-5 * image.max())
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_mixed_light_is_that_of_other_lamps():
     mixed = np.array(mix(target.sensors()[0].film().bitmap(), weights))
     lamps = {name: tuple(np.array(LAMPS[name]) * weights.get(name, 1)) for name in LAMPS}
     expected, _ = layers(bdpt(max_depth=4, skip="none"), scene(lamps))
-    np.testing.assert_allclose(mixed, expected, rtol=1e-5, atol=2e-6 * expected.max())
+    np.testing.assert_allclose(mixed, expected, rtol=1e-4, atol=2e-5 * expected.max())
 
 
 def test_a_resumed_and_a_joined_render_keep_the_layers():
@@ -290,7 +290,7 @@ def test_a_pattern_may_match_no_emitter(parameters):
         bdpt(max_depth=4, light_groups="low: globe, b*", spp_per_pass=4, **parameters), target
     )
     for name, layer in expected.items():
-        np.testing.assert_allclose(groups[name], layer, rtol=1e-5, atol=2e-6 * image.max())
+        np.testing.assert_allclose(groups[name], layer, rtol=1e-4, atol=2e-5 * image.max())
     start = stopped(method, target, 1, spp=8, seed=3)
     resumed = np.array(method.render(target, spp=8, seed=3, start=start), dtype=np.float64)
     np.testing.assert_allclose(resumed[..., :3], image, **ROUNDING)

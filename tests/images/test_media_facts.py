@@ -110,7 +110,7 @@ def test_null_surfaces_are_no_edges_for_volpath():
             "sky": {"type": "constant", "radiance": 1.0},
         }
     )
-    assert rendered(scene, "volpath", max_depth=1) == pytest.approx(1, abs=1e-5)
+    assert rendered(scene, "volpath", max_depth=1) == pytest.approx(1, abs=1e-4)
     assert rendered(scene, "path", max_depth=1) == 0
 
 
@@ -143,7 +143,7 @@ def test_a_camera_in_undeclared_fog_is_not_attenuated():
     box = parts.box([-2] * 3, 3.0, interior=parts.fog(1.5, 0.0))
     eye = parts.sensor(origin=(-0.5, -0.5, 0), target=(-0.5, -0.5, 1), fov=0.1)
     scene = {"type": "scene", "sensor": eye, "box": box, "sky": {"type": "constant", "radiance": 1.0}}
-    assert rendered(scene, "volpath", spp=256) == pytest.approx(1, abs=1e-5)
+    assert rendered(scene, "volpath", spp=256) == pytest.approx(1, abs=1e-4)
     inside = {"box": box | {"interior": parts.fog(1.5, 0.0, id="m")}}
     inside["sensor"] = eye | {"medium": {"type": "ref", "id": "m"}}
     ordered = {"type": "scene", "box": inside["box"], "sky": scene["sky"], "sensor": inside["sensor"]}
@@ -171,8 +171,8 @@ def test_grids_do_not_move_with_instances():
         "sensor": parts.sensor(origin=(2, 0, 3), target=(2, 0, 0), fov=1),
         "sky": {"type": "constant", "radiance": 1.0},
     }
-    assert rendered(scene, "volpath", spp=64) == pytest.approx(1, abs=1e-5)
-    assert rendered(scene, "bdpt", spp=64) == pytest.approx(1, abs=1e-5)
+    assert rendered(scene, "volpath", spp=64) == pytest.approx(1, abs=1e-4)
+    assert rendered(scene, "bdpt", spp=64) == pytest.approx(1, abs=1e-4)
 
 
 def test_next_event_estimation_in_a_white_furnace():

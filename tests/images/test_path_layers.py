@@ -88,9 +88,9 @@ def test_layers_change_nothing_else(parameters):
     image, _ = divided(integrator(**parameters), target)
     _, groups = layers(integrator(**parameters), target)
     expected, alone = layers(bdpt(max_depth=5, **parameters), target)
-    np.testing.assert_allclose(image, expected, rtol=1e-5, atol=2e-6 * image.max())
+    np.testing.assert_allclose(image, expected, rtol=1e-4, atol=2e-5 * image.max())
     for name, layer in alone.items():
-        np.testing.assert_allclose(groups[name], layer, rtol=1e-5, atol=2e-6 * image.max())
+        np.testing.assert_allclose(groups[name], layer, rtol=1e-4, atol=2e-5 * image.max())
 
 
 def test_layers_of_bands_and_of_stokes_vectors():
@@ -255,7 +255,7 @@ def test_other_objects_do_not_change_layers():
     )
     assert min(alone["emission"].mean(), alone["direct"].mean()) > 0.05
     for name in NAMES:
-        np.testing.assert_allclose(beside[name], alone[name], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(beside[name], alone[name], rtol=1e-4, atol=1e-5)
 
 
 def test_layers_in_fog():
@@ -278,7 +278,7 @@ def test_merged_light_is_caustic(plate):
     glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
     target = mi.load_dict(under_glass(point(), plate=glass))
     image, found = divided(integrator(max_depth=6, merging=True), target, spp=16)
-    np.testing.assert_allclose(sum(found.values()), image, rtol=2e-6, atol=2e-6 * image.max())
+    np.testing.assert_allclose(sum(found.values()), image, rtol=1e-4, atol=2e-5 * image.max())
     share = {name: layer.mean() / image.mean() for name, layer in found.items()}
     if plate == "dielectric":
         assert share["caustic"] == pytest.approx(1, abs=1e-5)

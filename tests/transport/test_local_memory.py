@@ -30,11 +30,11 @@ def means(edit, parameters):
 def test_sizes_of_local_memory_are_kernels_of_their_own():
     """Rationale: Dr.Jit's kernel cache does not tell sizes of local memory apart; a kernel for few
     vertices must not serve a render with many (it crashed). Expected: small, large and small again run,
-    and the same parameters give the same mean. Tolerance: 1e-5, the order of atomic sums.
+    and the same parameters give the same mean. Tolerance: 1e-4, the order of atomic sums.
     """
     small, large = ({"max_depth": 3}, 2), ({"max_depth": 90}, 90)
     a, b, c, d = means("", [small, large, small, large])
-    assert a == pytest.approx(c, rel=1e-5) and b == pytest.approx(d, rel=1e-5)
+    assert a == pytest.approx(c, rel=1e-4) and b == pytest.approx(d, rel=1e-4)
     assert b > a
 
 
