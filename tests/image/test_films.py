@@ -212,7 +212,7 @@ def test_variance_of_bands():
 
 def test_one_band_without_noise():
     """Rationale: one band's wavelengths are drawn in proportion to its response. Expected: light of
-    radiance 0.7 gives exactly 0.7 times the response's integral (1e-4: sums of a hundred), alpha does not exist."""
+    radiance 0.7 gives exactly 0.7 times the response's integral (1e-4: a hundred additions), and no alpha."""
     mi.set_variant(SPECTRAL)
     sky = {"type": "constant", "radiance": {"type": "uniform", "value": 0.7}}
     film = spectral_film({"only": BANDS["infrared"]}, rfilter="gaussian")
