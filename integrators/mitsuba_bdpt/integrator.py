@@ -151,7 +151,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if start is not None:
             check_resumable(start)
             render.resume(start)
-        messages.warn_of_parameters(scene, render.sensor)
+        messages.warn_of_parameters(render.prepared, render.sensor, self.settings)
         messages.warn_of_media(render.prepared, render.sensor)
         try:
             self._cancelled = False

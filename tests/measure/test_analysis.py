@@ -612,12 +612,6 @@ def test_a_report_of_one_integrator_compares_none(capsys):
     assert "bdpt is the only integrator" in capsys.readouterr().out
 
 
-def test_a_report_has_the_name_of_its_preset(results, tmp_path):
-    """Expected: that of the folder, which is the preset's, and of a single scene its name too."""
-    assert report.title(Results(runs("bdpt", 2), {}, {}), tmp_path / "rooms") == "Rooms: box"
-    assert report.title(results, tmp_path / "rooms") == "Rooms"
-
-
 def test_a_path_tracer_is_known_by_its_type():
     """Rationale: "over the stronger `path`" left out `path` under another name. Expected: both, the stronger
     first among the words; `bdpt` under a name that begins with "path" is none."""
@@ -632,19 +626,6 @@ def test_a_path_tracer_is_known_by_its_type():
     assert results.standard == ["path", "my tracer"] and results.tracer("box") == "path"
     assert results.against_path("box").median == pytest.approx(1.5)
     assert report.stronger(results) == "the strongest of path, my tracer"
-
-
-def test_a_single_seed_has_no_sentence_about_ratios():
-    """Expected: neither plot nor sentence where no efficiency can be computed; an integrator that has the
-    samples of the first one is not said to be at equal time."""
-    found = Results([row(method, match="spp") for method in ("bdpt", "path")], {"box": KNOWN}, {})
-    text = report.page(found, {"box": image_of_two()}, [], {}, "Box", "**Renders are missing**\n\n")
-    assert text.startswith("# Box\n\n**Renders are missing**\n\nMade by")
-    assert "By budget" not in text and "efficiency.png" not in text and not found.has_efficiency(["box"])
-    assert "Not at equal time, but with the samples of the first integrator: `path`." in text
-    several = [row(method, seed) for method in ("bdpt", "path") for seed in (1, 2)]
-    text = report.page(Results(several, {"box": KNOWN}, {}), {"box": image_of_two()}, [], {}, "Box")
-    assert "By budget" in text and "efficiency.png" in text and "Not at equal time" not in text
 
 
 def image_of_two():

@@ -65,17 +65,6 @@ def drawn(monkeypatch, plot, columns, scenes=("a_caustic_with_a_long_name", "b")
     return found[0]
 
 
-@pytest.mark.parametrize("columns", [1, 2])
-@pytest.mark.parametrize("plot", figures.PLOTS)
-def test_no_text_lies_over_another(monkeypatch, plot, columns):
-    """Rationale: "fails the bias check" was printed over names of scenes, and an axis' label over the legend.
-    Expected: the figure is as wide as its columns, all text is inside of it, none smaller than 6 points, and
-    no two texts overlap."""
-    figure = drawn(monkeypatch, plot, columns)
-    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
-    check_texts(figure)
-
-
 def block(count, height=48, width=32, title="a_caustic_with_a_long_name"):
     """Images of a bright, noisy window at the bottom right, the noisier the earlier, and their reference."""
     rng, target = np.random.default_rng(1), np.full((height, width, 3), 0.5)
@@ -117,26 +106,6 @@ def test_what_looks_alike_is_one_entry(monkeypatch, plot):
     ]
     named = [look for look, label in zip(looks, labels, strict=False) if label.startswith(before)]
     assert len({*named}) == len(named)
-
-
-@pytest.mark.parametrize(("columns", "count"), [(1, 2), (1, 3), (1, 4), (2, 5)])
-def test_images_stand_side_by_side(monkeypatch, columns, count):
-    """Expected: of two scenes, one of them wide, a column per image and one of the reference: image, two
-    windows where the errors differ most, errors; all text readable, inside, none over another, and no unit in
-    a line of its own."""
-    found = saved(monkeypatch, crops)
-    crops.draw([block(count), block(count, 16, 64, "b")], None, columns)
-    (figure,) = found
-    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
-    check_texts(figure)
-    texts = [text.get_text() for text in figure.texts]
-    assert not [text for text in texts if re.search(r"\n(s|spp)\b|[≤≥~]\n", text)]
-    images = [axis for axis in figure.axes if axis.images]
-    assert len(images) == 2 * (3 * (count + 1) + count)
-    boxes = [axis.get_position() for axis in figure.axes]
-    for a, b in itertools.combinations(boxes, 2):
-        assert min(a.x1, b.x1) - max(a.x0, b.x0) < 1e-9 or min(a.y1, b.y1) - max(a.y0, b.y0) < 1e-9
-    assert all(a.x0 >= 0 and a.x1 <= 1 + 1e-9 and a.y0 >= -1e-9 and a.y1 <= 1 for a in boxes)
 
 
 def test_windows_lie_where_errors_differ():
@@ -211,52 +180,12 @@ def test_the_range_of_few_seeds_is_no_interval(monkeypatch, seeds, label):
     assert label in [text.get_text() for text in drawn[0].legends[0].get_texts()]
 
 
-@pytest.mark.parametrize("columns", [1, 2])
-@pytest.mark.parametrize("longest", [3, 8])
-def test_pyramids_can_be_read(monkeypatch, columns, longest):
-    """Expected: as wide as its columns, with a title per strategy of 6 points or more, none over another."""
-    found = saved(monkeypatch, pyramid)
-    keys = [(k, s, k + 1 - s) for k in range(2, longest + 1) for s in range(k + 2)]
-    pyramid.draw({key: np.ones((9, 16, 3)) if key[2] else None for key in keys}, None, 0.0, columns)
-    (figure,) = found
-    assert figure.get_size_inches()[0] * 2.54 == pytest.approx({1: 8.5, 2: 17.8}[columns])
-    check_texts(figure)
-    assert sum(bool(axis.get_title()) for axis in figure.axes) == len(keys)
-
-
 def test_rows_of_a_pyramid_without_light_are_not_brightened(monkeypatch):
     """Expected: the factor below k where a strategy of that row brings light, and k alone elsewhere."""
     found = saved(monkeypatch, pyramid)
     images = {(2, 0, 3): None, (2, 1, 2): None, (3, 1, 3): np.ones((9, 16, 3)), (3, 2, 2): None}
     pyramid.draw(images, None, 0.0, 2)
     assert [text.get_text() for text in found[0].texts] == ["$k=2$", "$k=3$\n4x"]
-
-
-def test_a_single_panel_fills_its_columns(monkeypatch):
-    """Rationale: one scene drew its curves into the left quarter of a white page, then in two columns at the
-    width of one. Expected: 17.8 cm, the panel on more than half of it, twice as wide as high, the legend
-    beside it, all text inside."""
-    figure = drawn(monkeypatch, "seconds", 2, ("b",))
-    (axis,), (legend,) = figure.axes, figure.legends
-    assert figure.get_size_inches()[0] * 2.54 == pytest.approx(17.8)
-    panel, beside = axis.get_window_extent(), legend.get_window_extent()
-    assert panel.width > figure.bbox.width / 2 and 1.5 < panel.width / panel.height < 3
-    assert beside.x0 > panel.x1 and beside.y1 < panel.y1
-    check_texts(figure)
-
-
-def test_a_single_budget_has_dashes_and_no_slope(monkeypatch):
-    """Rationale: a trimmed error looked like a short solid line, and the legend had a slope that was not
-    drawn. Expected: two dashes, and no slope there; both lines with two budgets."""
-    kept = results(("b",))
-    for budgets, slopes in (({64}, 0), ({16, 64}, 1)):
-        rows = [row for row in kept.rows if row["budget"] in budgets]
-        monkeypatch.setitem(globals(), "results", lambda scenes, rows=rows: replace(kept, rows=rows))
-        figure = drawn(monkeypatch, "samples", 1, ("b",))
-        assert sum("slope" in text.get_text() for text in figure.legends[0].get_texts()) == slopes
-        dashed = [line for line in figure.axes[0].lines if line.get_marker() is figures.TWO_DASHES]
-        assert len(dashed) == (0 if slopes else len(METHODS))
-    assert len(figures.TWO_DASHES.to_polygons(closed_only=False)) == 2
 
 
 def check_texts(figure):

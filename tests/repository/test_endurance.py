@@ -210,23 +210,6 @@ def test_a_run_ends_with_its_table_on_the_page(tmp_path, monkeypatch):
     assert endurance.text(record) in after[1] and "0 camera samples in 6 renders of 2 scenes" in after[1]
 
 
-def test_the_sources_of_the_samples_are_told():
-    """Rationale: what was seen of another version of the source says less. Expected: the words above the
-    table say how many samples are of which; those of an older record, which does not tell, do not."""
-    record = {"scenes": {}, "samples_by_source": {"0123456789ab": 1_740_000_000, "ba9876543210": 65_536}}
-    assert "source: 1.74 billion of `0123456789ab`, 65,536 of `ba9876543210`." in endurance.text(record)
-    assert "source" not in endurance.text({"scenes": {}})
-
-
-def test_large_numbers_in_words():
-    assert [endurance.in_words(n) for n in (0, 65_536, 999_700_000, 12_345_678_901)] == [
-        "0",
-        "65,536",
-        "1 billion",
-        "12.3 billion",
-    ]
-
-
 @pytest.mark.parametrize("name", ["no_such_scene"])
 def test_unknown_scenes_are_refused(name, capsys):
     with pytest.raises(SystemExit):

@@ -23,6 +23,7 @@ from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party
 from .order import in_order
+from .radiance import BlackEmitters
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
 from .tables import Mask, inverse_table
 
@@ -41,7 +42,7 @@ class Emitters:
       is not at infinity; ``unhittable_connectible``: indices of those that cannot be hit;
       ``finite_hittable``: one can be hit and connected, and is not at infinity.
     * ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: only
-      its own light subpaths reach one.
+      its own light subpaths reach one; ``black``: none of them emits light.
     * ``evaluated``: an emitter in the process, even of another scene, requires evaluated loops and calls.
     * ``left_out``: strategies that single emitters lack, with reasons.
     * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
@@ -89,6 +90,7 @@ class Emitters:
         hittable = [t.is_hittable(e) for e, t in zip(emitters, types, strict=True)]
         self._hittable_types = {t for t, h in zip(types, hittable, strict=True) if h}
         self.count = len(emitters)
+        self.black = all(t is BlackEmitters for t in types)
         self.hittable, self.unhittable = any(hittable), not all(hittable)
         self.direct = any(t.supports_next_event for t in types)
         self.traced = any(t.supports_emission for t in types)

@@ -15,6 +15,9 @@ _FACTORS = ("radiance", "intensity", "irradiance", "texture")
 # Classes of textures whose `mean` is 0 where they are black.
 _KNOWN = ("SRGBReflectanceSpectrum", "UniformSpectrum", "BitmapTexture")
 
+# Values that are read of a picture.
+_QUICKLY_READ = 1 << 16
+
 # Largest array that is copied from a GPU.
 _QUICKLY_COPIED = 1 << 20
 
@@ -48,21 +51,22 @@ def is_black(emitter: mi.Emitter) -> bool:
 
 
 def is_negative(emitter: mi.Emitter) -> bool:
-    """Whether one of Mitsuba's emitters is known to have negative radiance somewhere."""
-    own = own_parameters(emitter)
-    if "scale" in own and number(own["scale"]) < 0:
-        return True
-    if mi.is_spectral:  # data are coefficients of spectra
-        return False
-    held = [value for name, value in children(emitter).items() if name in _FACTORS]
-    data = [own.get("data"), *(_data(texture) for texture in held if isinstance(texture, mi.Texture))]
-    return any((values < 0).any() for values in map(_values, data) if values is not None)
+    """Whether one of Mitsuba's emitters is known to have negative radiance; reads some values of pictures."""
+    found = children(emitter)
+    held = [_data(found[name]) for name in _FACTORS if isinstance(found.get(name), mi.Texture)]
+    if "scale" in found:
+        own = own_parameters(emitter)
+        held += [own["scale"], own.get("data")]
+    # In spectral variants most values are coefficients.
+    known = () if mi.is_spectral else (_values(data) for data in held)
+    some = (values[:: len(values) // _QUICKLY_READ + 1] for values in known if values is not None)
+    return any(bool((values < 0).any()) for values in some)
 
 
 def _is_black(texture: mi.Texture) -> bool:
     if not texture.class_name().startswith(_KNOWN) or number(texture.mean()) != 0:
         return False
-    return mi.is_spectral or not _any_lit(_data(texture))
+    return bool(mi.is_spectral) or not _any_lit(_data(texture))
 
 
 def _data(texture: mi.Texture):
@@ -73,7 +77,7 @@ def _data(texture: mi.Texture):
 
 def _any_lit(data) -> bool:
     values = None if mi.is_spectral else _values(data)
-    return values is None or bool((values != 0).any())
+    return values is None or bool(values[:: len(values) // _QUICKLY_READ + 1].any()) or bool(values.any())
 
 
 def _values(data) -> np.ndarray | None:

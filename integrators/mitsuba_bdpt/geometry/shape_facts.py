@@ -8,8 +8,9 @@ from typing import TypeVar
 
 import mitsuba as mi
 
-from ..host.introspection import all_shapes, registry_index
+from ..host.introspection import all_shapes, named, registry_index
 from ..host.notices import State, cached, notes
+from .flaws import Flaw
 from .hits import HitTables
 from .rounding import ShapeErrors
 from .to_world import check_inverse
@@ -20,9 +21,10 @@ Found = TypeVar("Found")
 class ShapeFacts:
     """The `ShapeErrors` (``errors``) and `HitTables` of a scene, and facts about single shapes.
 
-    ``marks``: fingerprints of the shapes by registry index; ``before``: facts of an earlier state of the
-    scene, of which those about shapes with equal marks are kept. Holds no object of Mitsuba: it may outlive
-    the scene. Raises ``UsageError`` for shapes for which Mitsuba's own calls disagree (`check_inverse`).
+    ``flaws``: names of shapes by their flaw; ``marks``: fingerprints of the shapes by registry index;
+    ``before``: facts of an earlier state of the scene, of which those about shapes with equal marks are kept.
+    Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
+    own calls disagree (`check_inverse`).
     """
 
     def __init__(
@@ -33,8 +35,11 @@ class ShapeFacts:
         if before is not None:
             same = {None, *(index for index, mark in self._marks.items() if before._marks.get(index) == mark)}
             self._found = {key: found for key, found in before._found.items() if same.issuperset(key[1:])}
+        self.flaws: dict[Flaw, list[str]] = {}
         for shape in all_shapes(scene):
             self.about("inverse", partial(check_inverse, shape), shape)
+            if flaw := self.about("flaw", partial(Flaw.of, shape), shape):
+                self.flaws.setdefault(flaw, []).append(f"shape {named(shape)}")
         self.errors, self.hits = ShapeErrors(scene, self.about), HitTables.of(scene, self.about)
 
     @classmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..scene.diagnostics import spoilt
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
@@ -90,6 +91,7 @@ def explain(
     lines += [f"not sampled: {words(unsampled)}" for unsampled in unsampled_paths(prepared, p, settings)]
     if not_sampled:
         lines.append(not_sampled)
+    lines += [f"warning: {text}" for text in spoilt(prepared, settings)]
     if prepared.emitters.evaluated:
         lines.append(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "

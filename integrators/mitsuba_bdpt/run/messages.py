@@ -11,10 +11,8 @@ from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
-from ..scene.diagnostics import narrow_spots, non_conserving_bsdfs, not_finite, overlapping_lamps
-
-# Largest number of causes that a message lists.
-NAMED = 5
+from ..scene import diagnostics
+from ..scene.diagnostics import NAMED
 
 
 def log(statistics: dict):
@@ -37,15 +35,20 @@ def log(statistics: dict):
         )
 
 
-def warn_of_parameters(scene, sensor):
-    """Warn once about scene parameters that spoil images."""
-    bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
-    overlap = overlapping_lamps(scene)
+def warn_of_parameters(prepared, sensor, settings):
+    """Warn once about parameters that spoil images."""
+    scene = prepared.scene
+    for text in diagnostics.spoilt(prepared, settings):
+        warn_once(scene, sensor, f"bdpt: {text}")
+    bright = diagnostics.non_conserving_bsdfs(
+        [shape for shape in all_shapes(scene) if not is_instance(shape)]
+    )
+    overlap = diagnostics.overlapping_lamps(scene)
     causes = {
         "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
         "grows; keep such parameters at 1 or below": bright,
         "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
-        "strategies do not agree about it; make it 0.2 degrees or more": narrow_spots(scene),
+        "strategies do not agree about it; make it 0.2 degrees or more": diagnostics.narrow_spots(scene),
         "they overlap in one plane, where rays hit one of them but other strategies sample each, so that "
         "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": overlap,
     }
@@ -107,7 +110,7 @@ def warn_of_non_finite(statistics: dict, scene):
         lost and in_pilot
     ) + f"{in_pilot} of the pilot, which decided from the rest" * bool(in_pilot)
     parts = [f"invalid samples (NaN or infinite) count as zero: {some}"]
-    named = not_finite(scene)
+    named = diagnostics.not_finite(scene)
     parts.append(
         f"NaN or infinity is in {listed(named, NAMED)}"
         if named

@@ -1,20 +1,34 @@
-"""Diagnostics: scene parameters that spoil images.
+"""Diagnostics: parameters that spoil images.
 
-Reflectances above 1, spots too narrow for single precision, lamps that overlap, and non-finite values.
+Images that are black or lack shapes, negative radiance, reflectances above 1, spots too narrow for single
+precision, lamps that overlap, and non-finite values.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..emitters.radiance import is_negative
+from ..errors import listed
 from ..geometry.boxes import is_finite
 from ..geometry.rounding import OFFSET_ULPS
 from ..host.introspection import LEAVES, children, named, number, own_parameters
+
+if TYPE_CHECKING:
+    from ..settings import Settings
+    from .prepared import PreparedScene
+
+# Most emitters whose radiance is inspected.
+_INSPECTED = 100
+
+# Largest number of causes that a message lists.
+NAMED = 5
 
 # Suffixes of the names of BSDF textures that scale scattered light.
 _SCALES = ("reflectance", "transmittance", "base_color")
@@ -30,6 +44,36 @@ _COARSE = 1e-2
 
 # Most bitmap values that are read, of all bitmaps together.
 _QUICKLY_READ = 1 << 17
+
+
+def spoilt(prepared: PreparedScene, settings: Settings) -> list[str]:
+    """Describe what makes images black, incomplete or negative: causes, effects and remedies."""
+    emitters, found = prepared.emitters, []
+    if not emitters.count:
+        found.append("the scene has no emitter; the image is black; add one, for example of type constant")
+    elif emitters.black:
+        found.append(
+            "no emitter of the scene emits light: their radiance is 0; the image is black; raise their "
+            "radiance, intensity, irradiance or scale"
+        )
+    if settings.max_depth == 0 and not settings.aovs:
+        found.append(
+            "max_depth=0 leaves no path between an emitter and the sensor; the image is black; set 1 to see "
+            "emitters alone, 2 for direct light, -1 for all light"
+        )
+    if settings.max_depth == 1 and settings.hide_emitters and not settings.aovs:
+        found.append(
+            "max_depth=1 leaves visible emitters alone, which hide_emitters hides; the image is black; set "
+            "max_depth to 2 or more, or hide_emitters to false"
+        )
+    first = emitters.objects[:_INSPECTED]
+    negative = [f"emitter {named(e.get_shape() or e)}" for e in first if is_negative(e)]
+    if negative:
+        found.append(
+            f"{listed(negative, NAMED)} has negative radiance; pixels that it lights are too dark or "
+            "negative; make its radiance, intensity, irradiance and scale 0 or more"
+        )
+    return found + [f"{listed(names, NAMED)} {flaw.value}" for flaw, names in prepared.flaws.items()]
 
 
 def non_conserving_bsdfs(owners) -> list[str]:

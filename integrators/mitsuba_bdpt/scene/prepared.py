@@ -34,8 +34,9 @@ _LOBES = 1024
 class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
-    ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``smooth``, ``delta``, ``refracts``:
-    some BSDF has such a lobe; ``specular``: some BSDF, as of glass or mirrors, has delta lobes alone;
+    ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``flaws``: see `ShapeFacts`;
+    ``smooth``, ``delta``, ``refracts``: some BSDF has such a lobe; ``specular``: some BSDF, as of glass or
+    mirrors, has delta lobes alone;
     ``near_specular``: BSDFs of shapes with lobes that are not delta, but nearly so, and ``narrowest``, the
     largest density of these: see `near_specular`; ``traits``: see `bsdf.Traits`; ``space`` between vertices
     and ``light_media``, in which light subpaths start, are None in scenes without media.
@@ -47,6 +48,7 @@ class PreparedScene:
         self.surfaces = bool(scene.shapes())
         facts = ShapeFacts.of(scene, sensor)
         self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.hits)
+        self.flaws = facts.flaws
         check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
