@@ -273,13 +273,14 @@ def test_features_are_no_layers(tmp_path):
         mix(tmp_path / "b.exr", {})
 
 
+@pytest.mark.parametrize("depth", ["", "Z"])
 @pytest.mark.parametrize(
-    ("own", "colours"), [("Y", "RGB"), ("XYZ", "RGB"), (("low", "high"), ("low", "high"))]
+    ("own", "colours"), [("RGB", "RGB"), ("Y", "RGB"), ("XYZ", "RGB"), (("low", "high"), ("low", "high"))]
 )
-def test_layers_have_the_colours_of_the_film(own, colours):
+def test_layers_have_the_colours_of_the_film(own, colours, depth):
     """Expected: layers of films of luminance or XYZ are RGB, and so is their mix; those of a ``specfilm``
-    have its bands."""
-    names = [*own, "A", *(f"path.direct.{c}" for c in colours)]
+    have its bands; depth that is called Z is none."""
+    names = [*dict.fromkeys([*own, *depth]), "A", *(f"path.direct.{c}" for c in colours)]
     pixels = np.full((2, 2, len(names)), 2.0, dtype=np.float32)
     mixed = mix(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names), {"direct": 3})
     assert [channel.name for channel in mixed.struct_()] == [*colours, "A"]

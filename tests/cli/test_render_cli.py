@@ -152,8 +152,19 @@ def test_a_width_changes_the_height_in_proportion(scene):
 
 
 def test_film_component_format_is_kept(scene):
-    assert main(["render", str(scene), "-Dformat=float16", "-o", "half.exr"]) == 0
+    """Expected: but for features that are no colours: half floats are exact up to 2,048. Depth that is called
+    Z, or a layer's Z, has that name, which compositors look for."""
+    aovs = "aovs=Z:depth,far.Z:depth,d:depth,p:position,al:albedo"
+    assert (
+        main(["render", str(scene), "-Dformat=float16", "-Dintegrator=bdpt", "-P", aovs, "-o", "half.exr"])
+        == 0
+    )
     assert read("half.exr")[0].dtype == np.float16
+    channels = OpenEXR.File("half.exr", separate_channels=True).channels()
+    single = {name for name, channel in channels.items() if channel.pixels.dtype == np.float32}
+    assert single == {"Z", "far.Z", "d.T", "p.X", "p.Y", "p.Z"}
+    assert {"R", "al.R"} <= channels.keys() - single
+    np.testing.assert_array_equal(channels["Z"].pixels, channels["d.T"].pixels)
 
 
 def test_aovs_are_kept_beside_the_image(scene):

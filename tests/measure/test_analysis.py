@@ -589,20 +589,6 @@ def test_other_programs_are_noticed(wall, processor, is_busy):
         assert page.index(text) < page.index("Efficiency is")
 
 
-def test_renders_of_different_runs_are_said():
-    """Rationale: an integrator that was added to a folder was compared with renders of three minutes before,
-    as one that followed them. Expected: the report names it first, and not those that did follow."""
-    rows = runs("bdpt", 2, started="2026-11-28T15:23:37+00:00")
-    rows += runs("path", 2, started="2026-11-28T15:23:40+00:00")
-    rows += runs("bdpt merged", 2, started="2026-11-28T15:26:10+00:00")
-    found = Results(rows, {"box": KNOWN}, {})
-    text = report.apart_text(found)
-    assert "bdpt merged in `box`" in text and "path" not in text and "(`-o`)" in text
-    page = report.page(found, {"box": image_of_two()}, [], {}, "Box")
-    assert page.index(text) < page.index("Efficiency is")
-    assert not report.apart_text(replace(found, rows=rows[:4]))
-
-
 def test_a_report_of_one_integrator_compares_none(capsys):
     """Expected: a sentence in place of a table without columns; the sweep says so too."""
     found = Results(runs("bdpt", 2), {"box": KNOWN}, {})

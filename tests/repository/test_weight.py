@@ -17,9 +17,9 @@ MOST = {
     "media": 1740,
     "geometry": 1598,
     "image": 1497,
-    "files": 1198,
+    "files": 1219,
     "run": 1228,
-    "scene sampling": 785,
+    "scene sampling": 764,
     "host": 1022,
     "sensors": 934,
     "": 1536,  # top files

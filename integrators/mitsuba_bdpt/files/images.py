@@ -77,15 +77,40 @@ def _header(path: Path) -> dict[str, Any]:
 def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
     """Write the film as an EXR with header `attributes`, and as a PNG beside it."""
     bitmap = film.bitmap()
-    names = [channel.name for channel in bitmap.struct_()]
-    # Mitsuba's own conversion loses the names of channels beyond the image's.
     component = re.search(r"component_format = (float16|float32|uint32)", str(film))
-    pixels = np.array(bitmap).astype(component[1] if component else np.float32)
-    image = mi.Bitmap(pixels, bitmap.pixel_format(), names)
-    for key, value in attributes.items():
-        image.metadata()[key] = value
-    write_whole(image, output, mi.Bitmap.FileFormat.OpenEXR)
+    dtype = np.dtype(component[1] if component else np.float32)
+    pixels = np.array(bitmap).reshape(bitmap.height(), bitmap.width(), -1)
+    names = [channel.name for channel in bitmap.struct_()]
+    planes = zip(names, np.moveaxis(pixels, -1, 0), strict=True)
+    channels = {_file_name(name, names): _stored(plane, name, dtype) for name, plane in planes}
+    _write_exr(output, channels, dict(attributes))
     write_png(film, bitmap, output.with_suffix(".png"), exposure)
+
+
+def _file_name(name: str, names: list[str]) -> str:
+    """Return the name of a channel in a file: depth named ``Z`` has that name, for compositors."""
+    feature, _, part = name.rpartition(".")
+    is_depth = part == "T" and feature.rpartition(".")[2] == "Z"
+    return feature if is_depth and feature not in names else name
+
+
+def _stored(pixels: np.ndarray, name: str, dtype: np.dtype) -> np.ndarray:
+    """Convert a channel to ``dtype``; features that are no colours have 32 bits at least."""
+    is_coarse = dtype == np.float16 and re.search(r"\.[TIUVXYZ]$", name)
+    return np.ascontiguousarray(pixels, dtype=np.float32 if is_coarse else dtype)
+
+
+def _write_exr(path: Path, channels: Mapping[str, np.ndarray], header: dict[str, Any]) -> None:
+    """Write an EXR of channels (height, width), by `replacing`, and check that all of it was written."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
+    with replacing(path) as temporary, OpenEXR.File(header, dict(channels)) as file:
+        temporary.touch()  # OpenEXR does not report the cause
+        file.write(utf8(temporary))
+        try:
+            _read_exr(temporary)
+        except CommandError as error:  # OpenEXR does not report a full disk
+            why = "could not be written whole; is the disk full?"
+            raise OSError(errno.ENOSPC, why, str(path)) from error
 
 
 def write_png(film: mi.Film, bitmap: mi.Bitmap, path: Path, exposure: float) -> None:
@@ -167,16 +192,8 @@ def write_layers(
         for layer, pixels in layers.items()
         for i, c in enumerate("RGB")
     }
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
     path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, OpenEXR.File(header, channels) as file:
-        temporary.touch()  # OpenEXR does not report the cause
-        file.write(utf8(temporary))
-        try:
-            read_layers(temporary, *layers)
-        except CommandError as error:  # OpenEXR does not report a full disk
-            why = "could not be written whole; is the disk full?"
-            raise OSError(errno.ENOSPC, why, str(path)) from error
+    _write_exr(path, channels, header)
 
 
 def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, Any]]:
@@ -184,21 +201,22 @@ def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, A
 
     ``layers``: prefixes as in `write_layers`. Raises ``CommandError`` for other files.
     """
+    channels, header = _read_exr(path)
+    missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
+    if missing:
+        raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
+    images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
+    return [image.astype(np.float64) for image in images], header
+
+
+def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the channels and the header of an EXR; raises ``CommandError`` for other files."""
     with path.open("rb") as file:  # OpenEXR does not report the cause
         start = file.read(4)
     if start != MAGIC[".exr"]:
         raise CommandError(f"{str(path)!r} is not an EXR")
     try:
-        opened = OpenEXR.File(utf8(path), separate_channels=True)
-    except (RuntimeError, ValueError) as error:
+        with OpenEXR.File(utf8(path), separate_channels=True) as opened:
+            return dict(opened.channels()), dict(opened.header())
+    except (RuntimeError, ValueError) as error:  # ValueError of a truncated file
         raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
-    with opened as file:
-        try:
-            channels, header = file.channels(), dict(file.header())
-        except ValueError as error:  # a truncated file
-            raise CommandError(f"{str(path)!r} is damaged ({error}); delete it, to make it anew") from error
-        missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
-        if missing:
-            raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
-        images = [np.stack([channels[f"{layer}{c}"].pixels for c in "RGB"], axis=-1) for layer in layers]
-    return [image.astype(np.float64) for image in images], header

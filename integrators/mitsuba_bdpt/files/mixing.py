@@ -120,7 +120,8 @@ def _read(image: mi.Bitmap | Path | str, channels: Mapping[str, np.ndarray]) -> 
 def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str, _Layers]:
     """Return the layers of each partition of an image, by prefix: those with the image's colours."""
     image = {channel for channel in channels if "." not in channel} - {"A"}
-    colours = set("RGB") if image in ({"Y"}, set("XYZ")) else image
+    depth = {"Z"}  # no colour, but where bands or layers have that name
+    colours = set("RGB") if image - depth == {"Y"} or image == set("XYZ") else image
     found: dict[str, _Layers] = {}
     for channel, values in channels.items():
         for prefix in _KINDS:
@@ -128,7 +129,9 @@ def _partitions(image_name: str, channels: Mapping[str, np.ndarray]) -> dict[str
                 layer, _, colour = channel.removeprefix(prefix).rpartition(".")
                 found.setdefault(prefix, {}).setdefault(layer, {})[colour] = values
     for prefix, layers in found.items():
-        found[prefix] = {name: layer for name, layer in layers.items() if name and set(layer) == colours}
+        found[prefix] = {
+            name: layer for name, layer in layers.items() if name and colours - depth <= set(layer) <= colours
+        }
     found = {prefix: layers for prefix, layers in found.items() if layers}
     if not found and all(re.fullmatch(r"ch\d+", channel) for channel in channels):
         raise CommandError(
