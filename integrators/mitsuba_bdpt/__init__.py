@@ -11,6 +11,7 @@ from pathlib import Path as _Path
 from ._version import __version__
 from .errors import CommandError, FailureError, UnsupportedError, UsageError, UsageTypeError
 from .host import llvm as _llvm
+from .host import signals as _signals
 from .host.llvm import LLVMNotFoundError
 from .progress import Bar, Display, Lines
 
@@ -46,6 +47,8 @@ def _runs_own_command(arguments: list[str]) -> bool:
     return module or any(_Path(argument).stem == "mitsuba-bdpt" for argument in arguments[:2])
 
 
+if _runs_own_command(_sys.orig_argv):
+    _signals.end_at_once()
 try:
     llvm_choice = _llvm.prepare()
     from .files.mixing import mix

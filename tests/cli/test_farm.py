@@ -461,6 +461,36 @@ def test_a_preview_is_rewritten(monkeypatch):
     assert np.abs(np.array(mi.Bitmap("last.png")).astype(int) - last).max() <= 2
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_load_at_once(number):
+    """Rationale: Mitsuba's loader leaves no time to handlers of Python. Expected: the command ends within the
+    load of a mesh whose file is a pipe that nobody writes, in one line, with the status of the signal."""
+    os.mkfifo("mesh.ply")
+    mesh = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
+    Path("scene.xml").write_text(f'<scene version="3.0.0">{mesh}</scene>')
+    command = [sys.executable, "-m", "mitsuba_bdpt", "render", "scene.xml"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    with open("mesh.ply", "w"):  # opens when it is opened for reading
+        process.send_signal(number)
+        assert process.communicate(timeout=600)[1] == "interrupted; no image written\n"
+    assert process.returncode == 128 + number
+
+
+@pytest.mark.parametrize("command", ["render", "explain"])
+def test_a_signal_while_an_import_loads_is_answered_after_it(monkeypatch, capsys, command):
+    """Rationale: an exception of a handler within an import of Mitsuba became a ``SystemError``."""
+
+    def load(options):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except BaseException as error:
+            raise SystemError("returned a result with an exception set") from error
+
+    monkeypatch.setattr(render, "load", load)
+    assert main([command, str(SCENE)]) == TERMINATED
+    assert capsys.readouterr().err == "interrupted; no image written\n"
+
+
 def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
     """Rationale: farms send a signal, and another one some seconds later, whatever is being done.
 

@@ -13,16 +13,16 @@ MOST = {
     "transport merging guided_emission": 7036,
     "planning": 2896,
     "emitters": 2678,
-    "cli": 1785,
+    "cli": 1798,
     "media": 1740,
     "geometry": 1598,
     "image": 1497,
     "files": 1219,
     "run": 1228,
-    "scene sampling": 764,
-    "host": 1022,
+    "scene sampling": 688,
+    "host": 1082,
     "sensors": 934,
-    "": 1536,  # top files
+    "": 1539,  # top files
 }
 OUTSIDE = {"scripts": 6220, "tests": 45565}
 MOST_WORDS = 70636

@@ -21,6 +21,7 @@ import mitsuba_bdpt
 
 from .. import removed
 from ..errors import did_you_mean
+from ..host import signals
 from ..progress import KINDS
 from ..settings import PARAMETERS
 from . import measuring, mistakes
@@ -36,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
             stream.reconfigure(errors="backslashreplace")
     parser = build_parser()
     options = parser.parse_args(arguments)
+    if options.command not in ("render", "explain"):  # those load a scene first
+        signals.end_later()
     if options.command == "doctor":
         from . import doctor
 

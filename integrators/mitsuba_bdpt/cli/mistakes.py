@@ -29,6 +29,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from ..errors import FailureError, UnsupportedError, UsageError, behind, chain, message
+from ..host import signals
 
 FAILURE = 1
 """The exit status after a failure."""
@@ -36,11 +37,9 @@ FAILURE = 1
 USAGE = 2
 """The exit status after a usage error, as argparse's."""
 
-INTERRUPTED = 130
-"""The exit status of a process that SIGINT has ended."""
+INTERRUPTED = signals.STATUSES[signal.SIGINT]
 
-TERMINATED = 143
-"""The exit status of a process that SIGTERM has ended."""
+TERMINATED = signals.STATUSES[signal.SIGTERM]
 
 STATUSES = (
     f"Exit status: 0 done; {FAILURE} failed, which may not happen again (a full disk, a lost cluster, "
@@ -154,9 +153,6 @@ def is_mistake(error: BaseException) -> bool:
     return not traceback or bool(IN_WORDS.match(rest.strip().splitlines()[-1]))
 
 
-SIGNALS = {signal.SIGINT: INTERRUPTED, signal.SIGTERM: TERMINATED}
-
-
 @dataclass
 class Ending:
     """State of a command that a signal ends.
@@ -173,7 +169,7 @@ class Ending:
         """Handle a signal: the first raises ``KeyboardInterrupt``; later ones are ignored."""
         if self.signalled:
             return
-        self.signalled, self.status = True, SIGNALS[signal.Signals(number)]
+        self.signalled, self.status = True, signals.STATUSES[signal.Signals(number)]
         if not self.patient:
             raise KeyboardInterrupt
 
@@ -188,7 +184,7 @@ def terminable() -> Iterator[Ending]:
     if threading.current_thread() is not threading.main_thread():
         yield ending
         return
-    before = {number: signal.signal(number, ending) for number in SIGNALS}
+    before = {number: signal.signal(number, ending) for number in signals.STATUSES}
     try:
         yield ending
     finally:

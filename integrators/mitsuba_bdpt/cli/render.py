@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError, FailureError, behind
+from ..errors import CommandError, FailureError
 from ..files.images import (
     STATISTICS,
     check_channels,
@@ -29,7 +29,7 @@ from ..files.images import (
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
-from ..host import memory
+from ..host import memory, signals
 from ..host.introspection import versions
 from ..progress import Report, display, readable
 from ..run.rendering import PassReport
@@ -62,8 +62,13 @@ class Outcome:
 
 def run(options: Namespace) -> int | None:
     """Render as the command-line `options` request; returns the exit status."""
+    return _ended(lambda ending: _run(options, ending))
+
+
+def _ended(command: Callable[[Ending], int]) -> int | None:
+    """Return the exit status of a ``command`` that signals end."""
     with terminable() as ending:
-        status = answered(lambda: _run(options, ending), "interrupted; no image written")
+        status = answered(lambda: command(ending), signals.NOTHING_WRITTEN)
     return ending.status if status == INTERRUPTED else status
 
 
@@ -77,7 +82,7 @@ def _run(options: Namespace, ending: Ending) -> int:
             job.statistics.parent.mkdir(parents=True, exist_ok=True)
             check_writable(job.statistics)
         check_options(job)
-    scene, integrator, used = loaded(options)
+    scene, integrator, used = loaded(options, ending)
     check_integrator(options, integrator)
     for job in jobs:
         film = choose_sensor(scene, job.sensor).film()
@@ -116,16 +121,25 @@ def jobs_of(options: Namespace) -> list[Namespace]:
     return [of_frame(number) for number in dict.fromkeys(options.frames)]
 
 
-def loaded(options: Namespace) -> Loaded:
-    """Like `load`; also sets the memory limit and number of threads of the process."""
+def loaded(options: Namespace, ending: Ending) -> Loaded:
+    """Like `load`; also sets the memory limit and number of threads of the process.
+
+    A signal ends the process at once (see `signals`), or the command when all is loaded.
+    """
     memory.set_limit(options.memory and options.memory * 2**30)
+    ending.patient = True  # an exception would break imports
     try:
         found = load(options)
     except RuntimeError as error:
         of_plugin = "Traceback (most" in str(error)
-        if behind(error, KeyboardInterrupt) or is_mistake(error) or of_plugin:
+        if is_mistake(error) or of_plugin:
             raise
         raise CommandError(in_words(error)) from error
+    finally:
+        signals.end_later()
+        ending.patient = False
+    if ending.signalled:
+        raise KeyboardInterrupt
     if options.threads is not None:
         dr.set_thread_count(options.threads)
     return found
@@ -210,13 +224,13 @@ def say(line: str) -> None:
 def explain(options: Namespace) -> int | None:
     """Print what such a render would do; returns the exit status."""
 
-    def explained() -> int:
-        scene, integrator, _ = loaded(options)
+    def explained(ending: Ending) -> int:
+        scene, integrator, _ = loaded(options, ending)
         sensor = choose_sensor(scene, options.sensor)
         say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
         return 0
 
-    return answered(explained)
+    return _ended(explained)
 
 
 def check_options(options: Namespace) -> None:
