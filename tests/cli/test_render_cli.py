@@ -292,20 +292,6 @@ def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
     assert re.search(words, capsys.readouterr().err)
 
 
-def test_what_is_around_bdpt_is_not_advised(around, capsys):
-    """Rationale: a file with `moment` around `bdpt` was answered with ``--integrator scene``, which was
-    refused in turn. Expected: the remedy that works alone; around others both.
-    """
-    moment = around.read_text().replace('type="aov" name="in"', 'type="moment" name="in"')
-    own = moment.replace("$integrator", "bdpt").replace('<default name="integrator" value="path"/>', "")
-    for text, advised in ((moment, True), (own, False)):
-        around.write_text(text)
-        assert main(["render", str(around)]) == 2
-        error = capsys.readouterr().err
-        assert ("--integrator scene" in error) == advised
-        assert "write the inner integrator alone" in error
-
-
 def test_bdpt_in_place_of_stokes_has_its_layers(around):
     """Expected: in a polarized variant the parameter ``stokes`` and the other layers, named as in Mitsuba; in
     others words."""
@@ -525,30 +511,6 @@ def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
 def test_no_time_at_all_is_one_pass(scene, capsys):
     assert main(["render", str(scene), "--integrator", "bdpt", "--time", "0", "-o", "a.exr"]) == 0
     assert " 1 spp (24 samples); stopped by --time 0 after 1 spp" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("time", "target_error", "compiling", "words"),
-    [
-        (3.0, None, 55.0, "stopped by --time 3 after 1 of 1000000000 spp, compiling took 55 s"),
-        (3.0, None, 0.2, "stopped by --time 3 after 1 of 1000000000 spp"),
-        (None, 0.25, 55.0, "stopped by --target-error 0.25 after 1 of 1000000000 spp"),
-        (None, None, 0.2, "stopped by timeout=7 after 1 of 1000000000 spp"),
-    ],
-)
-def test_the_closing_line_says_what_stopped_a_render(time, target_error, compiling, words):
-    """Expected: the option or parameter, the samples there are and those there were to be, and the time of
-    compilation where it took much of the limit; nothing for a whole or interrupted render."""
-    job = SimpleNamespace(spp=10**9, time=time, target_error=target_error)
-    settings = SimpleNamespace(timeout=7.0 if time is None else time, target_error=target_error or 0.0)
-    integrator = SimpleNamespace(assemble=None, settings=settings)
-    statistics = {"seconds": {"compile": compiling}, "error": 0.2 if target_error else float("inf")}
-    outcome = render.Outcome(58.0, 1, statistics=statistics)
-    assert render.stopped_by(job, integrator, outcome, 10**9) == words
-    text = render.summary(Path("a.exr"), outcome, (6, 4), target_error or 0.0, words)
-    assert f"1 spp (24 samples); {words}; relMSE" in text
-    assert not render.stopped_by(job, integrator, render.Outcome(1.0, 10**9), 10**9)
-    assert not render.stopped_by(job, integrator, render.Outcome(1.0, 1, interrupted=True), 10**9)
 
 
 @pytest.mark.parametrize("kind", ["prb", "prbvolpath"])

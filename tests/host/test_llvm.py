@@ -5,7 +5,6 @@ count. Tests of the real thing, what ``import mitsuba_bdpt`` does to a process, 
 """
 
 import os
-import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -237,26 +236,6 @@ def test_import_after_drjit_with_an_old_llvm_fails():
     done = run(FAKE_DRJIT + "import mitsuba_bdpt")
     assert done.returncode == 1
     assert "LLVMNotFoundError: drjit was imported first and loaded LLVM 15.0.7" in done.stderr
-
-
-def test_remedies_of_an_import_after_drjit_help():
-    """Expected: of the error's two remedies each is what it says: with the variable set as it tells the same
-    lines go, and import sorters leave the README's two lines as they stand, but for the comment."""
-    done = run(FAKE_DRJIT + "import mitsuba_bdpt")
-    path = re.search(rf"set {llvm.VARIABLE}=(\S+) before Python starts", done.stderr)[1]
-    lines = "import mitsuba, drjit\nimport mitsuba_bdpt\nprint(drjit.detail.llvm_version()[0])"
-    done = run(lines, **{llvm.VARIABLE: path})
-    assert done.stdout == f"{llvm.major_version(Path(path))}\n", done.stderr
-
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    code = re.search(r"```python\n(import mitsuba_bdpt.*?)```", readme, re.DOTALL)[1]
-    assert code.index("mitsuba_bdpt") < code.index("import mitsuba as mi")
-    ruff = [sys.executable, "-m", "ruff", "check", "--isolated", "--select", "I", "-"]
-    sort = [
-        subprocess.run(ruff, input=text, text=True, capture_output=True)
-        for text in (code, code.replace("# isort: skip", "#"))
-    ]
-    assert [done.returncode for done in sort] == [0, 1]
 
 
 def test_a_machine_with_cuda_needs_no_llvm(library):
