@@ -273,7 +273,7 @@ def library_directories(prefix: Path) -> list[Path]:
     patterns = ["usr/lib/llvm*/lib", "usr/lib64/llvm*/lib*", "usr/lib/llvm/*/lib*"]
     patterns += ["opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib"]
     globbed = [path for pattern in patterns for path in sorted(Path("/").glob(pattern))]
-    return fixed + globbed + _linker_directories()
+    return fixed + globbed
 
 
 def remedy(machine: Machine) -> str:
@@ -287,18 +287,6 @@ def remedy(machine: Machine) -> str:
     else:
         return f"Install LLVM 19 and set {VARIABLE} to the path of its shared library."
     return f"Mend it with: {command}"
-
-
-def _linker_directories() -> list[Path]:
-    """Directories of the LLVM libraries that ``ldconfig`` lists; none without it."""
-    for program in ("ldconfig", "/sbin/ldconfig"):
-        try:
-            done = subprocess.run([program, "-p"], capture_output=True, text=True, timeout=10)
-        except (OSError, subprocess.TimeoutExpired):
-            continue
-        paths = re.findall(r"libLLVM\S* .*=> (\S+)", done.stdout)
-        return [Path(path).parent for path in dict.fromkeys(paths)]
-    return []
 
 
 def _existing(paths: Iterable[Path]) -> list[Path]:
