@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -190,24 +189,6 @@ def test_what_pilots_lose_is_judged():
     record = {"scenes": {"a": found}}
     assert found["non_finite_in_pilot"] == 3 and not endurance.is_clean(record)
     assert "3 values of pilots" in endurance.text(record)
-
-
-def test_a_run_ends_with_its_table_on_the_page(tmp_path, monkeypatch):
-    """Expected: a run that adds to the project's record writes its table, with the sum in words, between the
-    markers of the page, and nothing else of it; one with another record leaves the page as it is."""
-    page, marker = tmp_path / "endurance.md", "<!-- report: endurance -->\n"
-    shutil.copy(endurance.PAGE, page)
-    assert page.read_text().count(marker) == 1
-    monkeypatch.setattr(endurance, "PAGE", page)
-    monkeypatch.setattr(repository, "load_scene", no_scene)
-    before = page.read_text().split(marker)
-    run(tmp_path / "other.json", "--samples", 1000)
-    assert page.read_text().split(marker) == before
-    monkeypatch.setattr(endurance, "RECORD", tmp_path / "record.json")
-    record, _ = run(tmp_path / "record.json", "--samples", 1000)
-    after = page.read_text().split(marker)
-    assert after[0] == before[0] and after[1].endswith("<!-- end -->" + before[1].split("<!-- end -->")[1])
-    assert endurance.text(record) in after[1] and "0 camera samples in 6 renders of 2 scenes" in after[1]
 
 
 @pytest.mark.parametrize("name", ["no_such_scene"])

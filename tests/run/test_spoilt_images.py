@@ -98,6 +98,17 @@ def test_panes_thinner_than_the_ray_offset(x, share):
     ] * (share < 1)
 
 
+def test_panes_that_are_turned_or_merged():
+    """Expected: a warning too; Mitsuba merges meshes of one material, and names the mesh itself."""
+    thickness = 16 * 2**-24 * 4096
+    assert "'thing' lets light" in rendered(pane(4096, thickness, turn=30), x=4096)[1][0]
+    panes = {
+        name: pane(x, thickness, {"type": "ref", "id": "glass"})["thing"]
+        for name, x in (("a", 4096), ("b", 4099))
+    }
+    assert "thinner than the ray offset" in rendered({"glass": GLASS} | SKY | panes, x=4096)[1][0]
+
+
 def test_a_flat_mesh_that_is_rounded_is_not_thin():
     """Expected: no warning of a floor of glass, far from the origin, whose points are off by an ulp."""
     mesh = mi.Mesh("floor", 4, 2)
