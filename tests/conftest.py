@@ -1,6 +1,7 @@
 """What every test needs: the package imported first, then Mitsuba with a variant."""
 
 import mitsuba_bdpt.workers  # noqa: I001 (it chooses the LLVM library; it must precede mitsuba)
+import os
 import mitsuba as mi
 import leftovers
 import pytest
@@ -15,6 +16,10 @@ from costs import (  # noqa: F401  (hooks of pytest)
     pytest_sessionfinish,
 )
 from mitsuba_bdpt.host.jit import registered_emitters
+
+# What rich and argparse read of the terminal in which the tests run.
+os.environ |= {"COLUMNS": "80", "TERM": "xterm"}
+os.environ.pop("FORCE_COLOR", None)
 
 VARIANT = variants.of("rgb")
 mi.set_variant(VARIANT)
