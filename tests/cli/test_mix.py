@@ -247,6 +247,7 @@ def test_images_that_cannot_be_mixed(tmp_path, capsys):
     assert main(["mix", str(tmp_path / "c.exr"), "key=1"]) == 2
     assert "there is no image" in capsys.readouterr().err
     rendered(tmp_path / "a.exr")
+    assert main(["mix", str(tmp_path / "a.exr"), "-m", "none"]) == 2
     assert main(["mix", str(tmp_path / "a.exr"), "key=1", "key=2"]) == 2
     assert "key has two weights; give it one" in capsys.readouterr().err
     assert main(["mix", str(tmp_path / "a.exr"), "key=1", "-o", str(tmp_path / "b.jpg")]) == 2

@@ -703,6 +703,15 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
             "-P foo, -P bar: no parameter of the integrator path; leave",
         ),
         ((), ["-m", "LLVM_AD_RGB"], "; did you mean llvm_ad_rgb?"),
+        ((), ["-P", "layers=stokes", "--integrator", "bdpt"])
+        + ("error: -P layers=stokes needs a .* for example -m llvm_ad_spectral_polarized\n",),
+        ((), ["-m", "scalar_rgb", "--integrator", "bdpt"])
+        + ("error: the variant scalar_rgb is scalar; .* for example -m llvm_ad_rgb\n",),
+        (
+            ("<boolean", '<string name="layers" value="stokes"/><boolean'),
+            ["--integrator", "scene", "-D", "integrator=bdpt"],
+            "layers=stokes needs a .* for example -m llvm_ad_spectral_polarized",
+        ),
         ((), ["-o", "/proc/none/a.exr"], "output='/proc/none/a.exr' cannot be written (No such file"),
         ((), ["-o", "plain.xml/a.exr"], "name another with -o"),
         (

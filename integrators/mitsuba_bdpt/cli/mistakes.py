@@ -38,7 +38,6 @@ USAGE = 2
 """The exit status after a usage error, as argparse's."""
 
 INTERRUPTED = signals.STATUSES[signal.SIGINT]
-
 TERMINATED = signals.STATUSES[signal.SIGTERM]
 
 STATUSES = (

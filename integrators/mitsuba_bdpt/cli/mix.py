@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import CommandError
 from ..files.images import check_output, developed, grey, has_channels, write_whole
+from ..files.loading import set_variant
 from ..files.mixing import described, mix
 from ..image.layers import DENOISED
 from .mistakes import answered
@@ -35,7 +36,7 @@ def _check_not_replaced(image: Path, output: Path) -> None:
 
 
 def _run(options: Namespace) -> int:
-    mi.set_variant(options.variant)
+    set_variant(options.variant)
     if not options.weights:
         print(described(options.image))
         return 0

@@ -102,7 +102,8 @@ def named_files(state: mi.parser.ParserState) -> list[Path]:
 
     Those of spectra are left out, see `spectra`. Has to be called within `searching`.
     """
-    names = (from_utf8(str(mi.file_resolver().resolve(name))) for name in _filenames(state))
+    named = (name for node in state.nodes if isinstance(name := node.props.get("filename"), str))
+    names = (from_utf8(str(mi.file_resolver().resolve(name))) for name in named)
     files = [from_utf8(str(file)) for file in state.files]
     return list(dict.fromkeys((*files, *filter(Path.is_file, names))))
 
@@ -112,11 +113,6 @@ def spectra(state: mi.parser.ParserState) -> list[str]:
     held = ((node.props, name, value) for node in state.nodes for name, value in node.props.items())
     tables = (value for props, name, value in held if props.type(name) == mi.Properties.Type.Spectrum)
     return [repr((list(table.wavelengths), list(table.values))) for table in tables]
-
-
-def _filenames(state: mi.parser.ParserState) -> list[str]:
-    found = (node.props.get("filename") for node in state.nodes)
-    return [name for name in found if isinstance(name, str)]
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:
@@ -157,33 +153,37 @@ def load(options: Namespace) -> Loaded:
     """Load the scene and the integrator to render it with."""
     if options.integrator == "":
         raise CommandError("integrator='' names no integrator; use for example bdpt, or leave it out.")
-    if options.variant not in mi.variants():
-        known = ", ".join(mi.variants())
-        question = did_you_mean(options.variant, mi.variants())
-        raise CommandError(
-            f"variant={options.variant!r} is not one of Mitsuba's: {known}; {question}".rstrip("; ")
-        )
     check_file(options.scene)
     for folder in options.append:
         if not folder.is_dir():
             raise CommandError(
                 f"append={str(folder)!r} is no folder; give one that holds files of the scene."
             )
-    try:
-        mi.set_variant(options.variant)
-    except ImportError as error:
-        raise CommandError(
-            f"variant={options.variant!r} cannot be used on this machine ({str(error).rstrip('.')}); "
-            "use an LLVM variant, for example llvm_ad_rgb."
-        ) from error
+    set_variant(options.variant)
     with searching(options.scene, options.append):
         try:
             return unless_incompatible(lambda merges: _load(options, merges))
         except RuntimeError as error:
-            better = _in_words(str(error), options)
-            if better is None:
+            better = _in_words(str(error), options) or str(error)
+            better = re.sub(r"mi\.set_variant\('(\w+)'\)", r"-m \1", better)
+            if better == str(error):
                 raise
             raise CommandError(better) from error
+
+
+def set_variant(name: str) -> None:
+    """Set Mitsuba's variant; raises ``CommandError`` if there is none of this ``name``, or not here."""
+    if name not in mi.variants():
+        question = did_you_mean(name, mi.variants())
+        known = ", ".join(mi.variants())
+        raise CommandError(f"variant={name!r} is not one of Mitsuba's: {known}; {question}".rstrip("; "))
+    try:
+        mi.set_variant(name)
+    except ImportError as error:
+        raise CommandError(
+            f"variant={name!r} cannot be used on this machine ({str(error).rstrip('.')}); use an LLVM "
+            "variant, for example llvm_ad_rgb."
+        ) from error
 
 
 def unless_incompatible(made: Callable[[bool], _Made]) -> _Made:
@@ -414,11 +414,13 @@ def _in_words(error: str, options: Namespace) -> str | None:
 
 
 def _of_the_command(error: str, options: Namespace) -> str | None:
-    """Return `bdpt`'s ``error`` about a property of the command line, without its place in the scene file.
+    """Return `bdpt`'s ``error`` about an option of the command line, without its place in the scene file.
 
     None for other errors.
     """
     found = re.search(r'integrator plugin of type "bdpt": .*\b\w+Error: bdpt: ((\w+)\b.*)', error, re.DOTALL)
+    if found and found[1].startswith("the variant "):
+        return found[1]
     return f"-P {found[1]}" if found and found[2] in dict(options.properties) else None
 
 

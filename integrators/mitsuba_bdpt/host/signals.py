@@ -22,8 +22,7 @@ _ends: list[Callable[[], None]] = []
 
 def end_at_once() -> None:
     """Until `end_later`, SIGINT and SIGTERM end the process with `NOTHING_WRITTEN`."""
-    before = {number: signal.getsignal(number) for number in STATUSES}
-    before = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
+    before = {n: handler for n in STATUSES if (handler := signal.getsignal(n)) != signal.SIG_IGN}
     for number in before:
         signal.signal(number, _noted)
     reader, writer = socket.socketpair()
