@@ -164,6 +164,9 @@ def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
     ):
         monkeypatch.setattr(dr, "thread_count", lambda threads=threads: threads)
         assert reduce_mode(numbers, samples) == mode
+    monkeypatch.setattr(dr, "thread_count", lambda: 32)
+    modes = [reduce_mode(1 << 20, 1, additions, dr.ReduceMode.Direct) for additions in (1023, 1024)]
+    assert modes == [dr.ReduceMode.Direct, dr.ReduceMode.Expand]
 
 
 def test_each_emitter_has_its_own_group():

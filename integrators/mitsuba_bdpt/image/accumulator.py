@@ -25,7 +25,7 @@ from . import denoising
 from .colour import POLARIZED
 from .layers import film_layers, image_count, partitions, strategies, strategy_count, strategy_index
 from .replicates import Replicates, Spread
-from .taps import Taps
+from .taps import Taps, is_wide
 
 
 class Block:
@@ -71,9 +71,9 @@ class Block:
     def splat(self, position, values, active, u, row=0):
         """Like `put` in expectation over ``u``, with fewer additions, see `taps`.
 
-        ``u``: uniform in [0, 1)^2, unused by the box filter.
+        ``u``: uniform in [0, 1)^2, unused by the box filter and wide ones.
         """
-        if self._rfilter.is_box_filter():
+        if self._rfilter.is_box_filter() or is_wide(self._rfilter):
             self.put(position, values, active, row)
             return
         taps = Taps(self._rfilter, self._in_centres(position), u)
@@ -129,16 +129,16 @@ PACKET = 8
 COPIES_MEMORY = 1 << 30
 
 
-def reduce_mode(numbers: int, samples: int):
-    """Return how samples of many channels are added to ``numbers`` sums.
+def reduce_mode(numbers: int, samples: int, additions: int = 16, otherwise=dr.ReduceMode.Local):
+    """Return how samples of many ``additions`` are added to sums of ``numbers`` in single precision.
 
-    A copy of the sums for each of T threads needs no atomic additions: less work from about T^2 / 16
-    ``samples`` per pixel and launch on (with 16 additions per sample).
+    A copy of the sums for each of T threads needs no atomic additions: less work from about T^2 / additions
+    ``samples`` per pixel and launch on. ``otherwise``: the mode without copies.
     """
     threads = dr.thread_count()
-    copied = threads * numbers * 4 <= COPIES_MEMORY and threads**2 <= 16 * samples
+    copied = threads * numbers * 4 <= COPIES_MEMORY and threads**2 <= additions * samples
     on_cpu = (mi.variant() or "").startswith("llvm")
-    return dr.ReduceMode.Expand if copied and on_cpu else dr.ReduceMode.Local
+    return dr.ReduceMode.Expand if copied and on_cpu else otherwise
 
 
 @dataclass(frozen=True)
@@ -246,6 +246,7 @@ class Accumulator:
         )
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
+        self._samples = parts.samples
         self._strips, self._down = parts.strips, dr.opaque(mi.UInt32, self._stride)
         rows = self.size[1] if parts.strips == 1 else parts.strips * self._stride
         mode, channels = dr.ReduceMode.Local, self._channels.camera
@@ -263,6 +264,9 @@ class Accumulator:
 
     def _block(self, channels: int, mode, packet, height: int | None = None):
         size = [self.size[0], height or self.size[1]]
+        if is_wide(self.rfilter):
+            numbers = channels * size[0] * size[1] * (2 if packet == mi.ArrayXd else 1)
+            mode = reduce_mode(numbers, self._samples, ceil(2 * self.rfilter.radius()) ** 2, mode)
         return Block(size, self.offset, channels, self.rfilter, mode, packet)
 
     @property

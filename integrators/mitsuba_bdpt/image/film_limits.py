@@ -9,6 +9,7 @@ from ..errors import UsageError
 from ..host import memory
 from .accumulator import COPIES_MEMORY, Channels
 from .layers import image_count
+from .taps import is_wide
 
 # Of one array.
 MOST_NUMBERS = 1 << 32
@@ -38,8 +39,11 @@ def check_film(film, channels: Channels, variance: bool):
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
-    if channels.partitions:
+    wide = is_wide(film.rfilter())
+    if channels.partitions or wide:
         needed += min(width * height * channels.camera * SINGLE * dr.thread_count(), COPIES_MEMORY)
+    if wide:
+        needed += min(width * height * light * DOUBLE * dr.thread_count(), COPIES_MEMORY)
     # The memory of a GPU is not known here.
     on_gpu = (mi.variant() or "").startswith("cuda")
     if needed > there.bytes and not on_gpu:

@@ -2,10 +2,11 @@
 
 A splat at a film position adds its value times f(x) f(y) to every pixel of the filter's support: 16 pixels
 for a radius of 2, 36 for 3, each an atomic addition per channel. Most of the weight is on few pixels. Here
-the inner pixels, a square of half the support's side, receive their value. One corner of the square, the
-farthest from the position, and all outer pixels form a set of which a pixel is drawn, in proportion to
-|f(x) f(y)|; it receives the set's sum of |f(x) f(y)| with the sign of its own weight. The expectation is that
-of adding to every pixel. See experiments, "Reconstruction filters".
+the inner pixels, a square of two by two, receive their value. One corner of the square, the farthest from the
+position, and all outer pixels form a set of which a pixel is drawn, in proportion to |f(x) f(y)|; it receives
+the set's sum of |f(x) f(y)| with the sign of its own weight. The expectation is that of adding to every
+pixel. Filters wider than `MOST_RADIUS` spread the weight over so many pixels that drawing would add noise:
+they add to all. See experiments, "Reconstruction filters".
 """
 
 from __future__ import annotations
@@ -19,6 +20,16 @@ import mitsuba as mi
 # Of the lattice of draws.
 _GOLDEN = (5**0.5 - 1) / 2
 
+# Largest radius, in pixels, of filters whose splats are added to a part of their pixels.
+MOST_RADIUS = 3
+
+SIDE = 2  # of the square of inner pixels
+
+
+def is_wide(rfilter) -> bool:
+    """Return whether splats are added to all pixels of a filter's support."""
+    return rfilter.radius() > MOST_RADIUS
+
 
 class Taps:
     """Pixels and weights of a splat.
@@ -30,23 +41,21 @@ class Taps:
     def __init__(self, rfilter, at: mi.Point2f, u: mi.Point2f):
         self._rfilter, self._at = rfilter, at
         self._radius = ceil(rfilter.radius())
-        near = max(1, self._radius // 2)
-        self._side = 2 * near
         below = mi.Point2i(dr.floor(at))
         # Pixels of an axis are counted from the inner end that is nearer to the position.
         forward = at - mi.Point2f(below) < 0.5
         self._step = dr.select(forward, mi.Point2i(1), mi.Point2i(-1))
-        self._start = dr.select(forward, below + (1 - near), below + near)
+        self._start = dr.select(forward, below, below + 1)
         self._drawn = self._draw(u)
-        self.count = self._side**2 - 1 + len(self._drawn)
+        self.count = SIDE**2 - 1 + len(self._drawn)
 
     def tap(self, number: mi.Int32) -> tuple[mi.Point2i, mi.Float]:
         """Return pixel ``number`` and the weight that it receives."""
-        inner = mi.Point2i(number % self._side, number // self._side)
+        inner = mi.Point2i(number % SIDE, number // SIDE)
         pixel = self._start + self._step * inner
         distance = mi.Point2f(pixel) - self._at
         weight = self._rfilter.eval(distance.x) * self._rfilter.eval(distance.y)
-        for k, (other, received) in enumerate(self._drawn, self._side**2 - 1):
+        for k, (other, received) in enumerate(self._drawn, SIDE**2 - 1):
             pixel = dr.select(number == k, other, pixel)
             weight = dr.select(number == k, received, weight)
         return pixel, weight
@@ -57,14 +66,14 @@ class Taps:
         A column first, then a row of those that the column has in the set. With the outer rows first, then
         the corner's, then the others, these are the first ones.
         """
-        outside, side = self._radius - self._side // 2, self._side
-        order = [*range(-outside, 0), *range(side, side + outside), side - 1, *range(side - 1)]
+        outside = self._radius - 1
+        order = [*range(-outside, 0), *range(SIDE, SIDE + outside), 1, 0]
         columns, rows = (
             [self._rfilter.eval(mi.Float(start + step * k) - at) for k in order]
             for start, step, at in zip(self._start, self._step, self._at, strict=True)
         )
         rows_below = list(accumulate((dr.abs(w) for w in rows), initial=mi.Float(0)))
-        in_set = [2 * self._radius] * (2 * outside) + [2 * outside + 1] + [2 * outside] * (side - 1)
+        in_set = [2 * self._radius] * (2 * outside) + [2 * outside + 1] + [2 * outside]
         ends = [rows_below[n] for n in in_set]
         below = list(accumulate(dr.abs(w) * end for w, end in zip(columns, ends, strict=True)))
         found, draws = [], max(1, outside**2)
