@@ -9,14 +9,14 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7748,
+    "measure": 7735,
     "transport merging guided_emission": 7036,
     "planning": 2896,
     "emitters": 2677,
     "cli": 1798,
     "media": 1740,
     "geometry": 1598,
-    "image": 1497,
+    "image": 1510,
     "files": 1221,
     "run": 1227,
     "scene sampling": 754,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1539,  # top files
 }
-OUTSIDE = {"scripts": 6220, "tests": 45565}
+OUTSIDE = {"scripts": 6205, "tests": 45580}
 MOST_WORDS = 70636
 
 

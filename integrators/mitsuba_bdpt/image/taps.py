@@ -2,11 +2,10 @@
 
 A splat at a film position adds its value times f(x) f(y) to every pixel of the filter's support: 16 pixels
 for a radius of 2, 36 for 3, each an atomic addition per channel. Most of the weight is on few pixels. Here
-the inner pixels, a square of two by two, receive their value. One corner of the square, the farthest from the
-position, and all outer pixels form a set of which a pixel is drawn, in proportion to |f(x) f(y)|; it receives
-the set's sum of |f(x) f(y)| with the sign of its own weight. The expectation is that of adding to every
-pixel. Filters wider than `MOST_RADIUS` spread the weight over so many pixels that drawing would add noise:
-they add to all. See experiments, "Reconstruction filters".
+the inner two by two pixels receive their value. Of them the farthest from the position and all outer pixels
+form a set of which a pixel is drawn, in proportion to |f(x) f(y)|; it receives the set's sum of |f(x) f(y)|
+with the sign of its own weight. The expectation is that of adding to every pixel. Wide filters add to all.
+See experiments, "Reconstruction filters".
 """
 
 from __future__ import annotations
@@ -20,15 +19,12 @@ import mitsuba as mi
 # Of the lattice of draws.
 _GOLDEN = (5**0.5 - 1) / 2
 
-# Largest radius, in pixels, of filters whose splats are added to a part of their pixels.
-MOST_RADIUS = 3
-
 SIDE = 2  # of the square of inner pixels
 
 
 def is_wide(rfilter) -> bool:
-    """Return whether splats are added to all pixels of a filter's support."""
-    return rfilter.radius() > MOST_RADIUS
+    """Return whether splats are added to all pixels: of so many that drawing would add noise."""
+    return rfilter.radius() > 3
 
 
 class Taps:

@@ -156,17 +156,12 @@ def means_of(kept: Any) -> Means | None:
     """Return the `Means` in a provenance; freedom is infinite for exact images."""
     if kept is None:
         return None
-    return Means(
-        **{
-            name: Sample(
-                np.array(sample["mean"]),
-                np.array(sample["error"]),
-                np.inf if sample["freedom"] is None else sample["freedom"],
-                np.array(sample["nonzero"]),
-            )
-            for name, sample in kept.items()
-        }
-    )
+
+    def sample(of: dict[str, Any]) -> Sample:
+        mean, error, nonzero = (np.array(of[key]) for key in ("mean", "error", "nonzero"))
+        return Sample(mean, error, np.inf if of["freedom"] is None else of["freedom"], nonzero)
+
+    return Means(**{name: sample(of) for name, of in kept.items()})
 
 
 def kept_of(means: Means | None) -> dict[str, Any] | None:

@@ -524,18 +524,6 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     return found
 
 
-def equal_elsewhere(cells: Cells, table: list[Row]) -> list[str]:
-    """Return messages about integrators whose equal time was measured below the largest budget."""
-    name, first = cells.subject.name, cells.methods[0].name
-    at = {row["method"]: row.get("equal_time_spp") for row in analysis.select(table, scene=name)}
-    return [
-        f"{name}: times of {method} and {first} were made equal at {spp} spp, the largest that time "
-        "allowed; to measure it at a larger budget, sweep into another folder (-o) with more --seconds"
-        for method, spp in at.items()
-        if spp is not None and spp < max(cells.subject.spp)
-    ]
-
-
 def short_of_target(table: list[Row]) -> list[str]:
     """Return messages about integrators that ended before the preset's target error."""
     renders = {}
@@ -642,8 +630,6 @@ def _tell(sweep: Sweep, table: list[Row]) -> None:
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
-    for text in [text for cells in sweep.scenes for text in equal_elsewhere(cells, table)]:
-        print(text)
     if len({row["method"] for row in table}) == 1:
         print(
             f"{table[0]['method']} is the only integrator, and compared with none; tables [[integrator]] of "
