@@ -30,14 +30,14 @@ def environment(**changes: str | None) -> dict[str, str]:
     return {name: value for name, value in found.items() if value is not None}
 
 
-def python(code: str, *arguments: str, limit: float = 120, **keywords) -> subprocess.CompletedProcess:
+def python(code: str, *arguments: str, limit: float = 1000, **keywords) -> subprocess.CompletedProcess:
     """Run Python code after `PRELUDE`; ``keywords`` go to ``subprocess.run``."""
     keywords = {"env": environment()} | keywords
     command = [sys.executable, "-c", PRELUDE + code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=limit, check=False, **keywords)
 
 
-def command(*arguments, limit: float = 120, **keywords) -> subprocess.CompletedProcess:
+def command(*arguments, limit: float = 1000, **keywords) -> subprocess.CompletedProcess:
     """Run ``python -m mitsuba_bdpt`` with these ``arguments``."""
     keywords = {"env": environment()} | keywords
     line = [sys.executable, "-m", "mitsuba_bdpt", *map(str, arguments)]

@@ -21,7 +21,7 @@ from .counting import counted, short
 from .mutations import mutate
 
 
-def attempts(paths: list[Path], integrator: str, limit: float = 60) -> list[dict]:
+def attempts(paths: list[Path], integrator: str, limit: float = 600) -> list[dict]:
     """What `attempt.attempt` says of each file.
 
     Of one where the process dies or takes longer than ``limit`` seconds: a ``stage`` ``dies`` or ``hangs``.
