@@ -304,6 +304,7 @@ def test_goals_stand_beside_what_is_measured(results):
     text = report.goals_table(results, goals)
     assert cells(text, "box") == ["1.4x", "2x", "0.8x (0.8–0.8)", "**no**"]
     near = "0.800x, interval 0.800–0.800, 16 pairs"
+    assert report._near(analysis.summary([0.8] * 4)) == "0.800x, range 0.800–0.800, 4 pairs"
     assert cells(text, "worst") == ["0.97x", "–", f"`box` of 2 scenes: {near}", "**no**"]
     assert cells(text, "near") == [
         "0.96x",

@@ -45,7 +45,7 @@ from .analysis import (
     geometric_mean,
     summary,
 )
-from .estimates import RelativeError
+from .estimates import FEWEST_WITH_INTERVAL, RelativeError
 from .metrics import rel_mse_epsilon
 from .project import Project
 from .record import Error, Row
@@ -435,7 +435,8 @@ MANY, NARROW = 20, 0.04
 def _near(found: Summary) -> str:
     wide = found.count >= MANY and found.high - found.low > NARROW
     middle = f"{found.bound} {found.median:.3f}x".lstrip()
-    text = f"{middle}, interval {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
+    what = "interval" if found.count >= FEWEST_WITH_INTERVAL else "range"
+    text = f"{middle}, {what} {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
     return text + (f" (not narrower than {NARROW})" if wide else "")
 
 

@@ -38,7 +38,7 @@ from ..files.images import check_output
 from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from . import analysis, probes
-from .estimates import seed_errors
+from .estimates import FEWEST_WITH_INTERVAL, seed_errors
 from .limited import Pending
 from .making import Job, check, obtained
 from .options import REFERENCE_SECONDS, VARIANT
@@ -472,7 +472,8 @@ class Sweep:
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
-        if max(widths.values()) < more.width or seeds == more.at_most:
+        is_narrow = seeds >= FEWEST_WITH_INTERVAL and max(widths.values()) < more.width
+        if is_narrow or seeds == more.at_most:
             return []
         missing = [c for c in cells.further(seeds) if not self._is_there(c)]
         if not self._tried.isdisjoint(keys := {c.key for c in missing}):
