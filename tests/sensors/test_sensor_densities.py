@@ -156,7 +156,8 @@ def test_an_arrival_is_a_start_in_reverse(name):
     Expected: light that comes along a camera ray arrives at its film position (a meter: anywhere on its
     pixel), and importance times cosine over both densities is the camera subpath's weight; the
     densities are those of the start, which also states cos / (both densities), and of the join, which states
-    cos / (squared distance, density of z_0). Tolerance: 5e-3.
+    cos / (squared distance, density of z_0). Tolerance: 1e-2, twice what offsets from a meter's shape (2e-4)
+    are of a cosine of 0.05.
     """
     scene, _, camera, u = prepared(name)
     start = start_of(camera, u)
@@ -177,12 +178,12 @@ def test_an_arrival_is_a_start_in_reverse(name):
     assert active.mean() > (0.999 if lens else 0.4)  # before a meter lies the scene
     cos, both = cos[keep], (column(arrival.pdf_a) * column(arrival.pdf_w))[keep]
     weight = column(arrival.importance)[keep] * cos / both
-    np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=5e-3)
-    np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=5e-3)
-    np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=5e-3)
+    np.testing.assert_allclose(weight, column(start.weight)[keep], rtol=1e-2)
+    np.testing.assert_allclose(column(arrival.pdf_w)[keep], column(start.pdf_w)[keep], rtol=1e-2)
+    np.testing.assert_allclose(cos / both, column(start.arrival)[keep], rtol=1e-2)
     join = camera.connect(p, mi.Point2f(u[2], u[3]), camera.region.to_uv(start.position))
     ratio = column(join.arrival * join.dist2)[keep]
-    np.testing.assert_allclose(ratio, cos / column(arrival.pdf_a)[keep], rtol=5e-3)
+    np.testing.assert_allclose(ratio, cos / column(arrival.pdf_a)[keep], rtol=1e-2)
     if lens:
         for axis in "xy":
             found, known = (column(getattr(r.position, axis))[keep] for r in (arrival, start))
