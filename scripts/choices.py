@@ -94,7 +94,8 @@ def named(way: Configuration) -> str:
     way = CANDIDATES[way.number]
     if not way.light_paths:
         return f"0, {way.kappa_direct:g}"
-    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}"
+    lane = f", {way.joined} per lane" if way.joined > 1 else ""
+    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}{lane}"
 
 
 def piloted(scene, settings, seed: int | None = None) -> list[Prediction]:
@@ -107,12 +108,10 @@ def piloted(scene, settings, seed: int | None = None) -> list[Prediction]:
 
 def by_hand(scene, depth: int, row: Prediction, best: Configuration, mean: float):
     """An integrator that does what ``row`` predicts, with what the ``best`` has beside its candidate."""
-    alike = row.candidate.number == best.number
     way = replace(
         row.candidate,
         emission=best.emission if row.candidate.light_paths else None,
         guided=best.guided,
-        joined=best.joined if alike else 1,
     )
     made = json.dumps([Decision.of(way, 0, cost=row.cost, variance=row.variance, mean=mean).record()])
     integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})

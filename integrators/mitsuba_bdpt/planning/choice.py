@@ -1,7 +1,9 @@
 """Chooses the most efficient configuration from a pilot's statistics.
 
-Minimises cost^(1 + `CAUTION`) times variance, the stratification gain included. Costs are counted, not timed
-(see `COSTS`): equal seeds give equal decisions on all machines.
+Minimises cost times error. The error is the larger of two, relative to path tracing alone: of the mean render
+and of a typical one (`moments.Moments.variance`, `typical`), since light subpaths that only remove outliers
+which hardly a render has make most renders slower. Costs are counted, not timed (see `COSTS`): equal seeds
+give equal decisions on all machines.
 """
 
 from __future__ import annotations
@@ -61,9 +63,9 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     return total / camera
 
 
-# A candidate whose sample costs c times as much has to gain c^CAUTION, since predictions are inexact; see
-# experiments, "Choice of strategies".
-CAUTION = 0.15
+# Factor by which light subpaths have to shorten the time, since predictions are inexact; see experiments,
+# "Choice of strategies".
+REQUIRED_GAIN = 1.15
 
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
@@ -106,26 +108,27 @@ class Alternatives:
 class Prediction:
     """The predicted efficiency of a candidate.
 
-    ``cost`` of a sample (path tracing alone: 1); ``variance``: relMSE per sample including the stratification
-    gain, without SDS paths where s = 0 can be guided; ``gain``: see `guided_gain`; ``without_tables``: the
-    figures do not include guided emission.
+    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample including the
+    stratification gain, without SDS paths where s = 0 can be guided; ``gain``: see `guided_gain`;
+    ``without_tables``: the figures do not include guided emission.
     """
 
     candidate: Configuration
     cost: float
+    error: float
     variance: float
     gain: float = 1.0
     without_tables: bool = False
 
     @property
     def time(self) -> float:
-        """Time to a given error, in arbitrary units."""
-        return self.cost * self.variance
+        """Time to a given error (path tracing alone: 1)."""
+        return self.cost * self.error
 
     @property
     def score(self) -> float:
-        """The quantity that the choice minimises: `time` times cost^`CAUTION`."""
-        return self.time * self.cost**CAUTION
+        """The quantity that the choice minimises: `time`, with light subpaths times `REQUIRED_GAIN`."""
+        return self.time * (REQUIRED_GAIN if self.candidate.light_paths else 1)
 
     def with_emission(self, tables: EmissionTables, without_tables: bool) -> Prediction:
         """The same with emission guided by ``tables``, if it has light subpaths."""
@@ -180,11 +183,17 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first."""
-    candidates = alternatives.candidates
-    variances = _by_group(moments, candidates, alternatives.stratified).mean(axis=0)
+    candidates, stratified = alternatives.candidates, alternatives.stratified
+    means = np.maximum(_by_group(moments, candidates, stratified).mean(axis=0), LEAST_VARIANCE)
+    typical = moments.typical(stratified)[:, [candidate.number for candidate in candidates]]
+    typical = np.maximum(np.maximum(typical, 0).mean(axis=0), LEAST_VARIANCE)
+    alone = [not c.light_paths and math.isfinite(v) for c, v in zip(candidates, means, strict=True)]
+    errors = np.maximum(
+        *(values / values[alone if any(alone) else slice(None)].min() for values in (means, typical))
+    )
     table = [
-        Prediction(c, cost(c, moments.rays, alternatives.samples), max(v, LEAST_VARIANCE))
-        for c, v in zip(candidates, variances.tolist(), strict=True)
+        Prediction(c, cost(c, moments.rays, alternatives.samples), error, v)
+        for c, v, error in zip(candidates, means.tolist(), errors.tolist(), strict=True)
         if math.isfinite(v)
     ]
     return sorted(table, key=lambda row: row.score)
@@ -223,9 +232,7 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
         return ""
     if chosen.candidate.guided and not row.candidate.guided:
         return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
-    more = row.cost / chosen.cost
-    needed = f"{more**CAUTION:.2f}x"
-    return f"a sample of it costs {more:.2f} times as much: it has to gain {needed}, and gains {gain:.2f}x"
+    return f"light subpaths have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
 
 
 def left_out(

@@ -7,6 +7,7 @@ predictions; it has a JSON form.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeGuard
 
@@ -37,18 +38,23 @@ class Configuration:
     @property
     def weights(self) -> dict[str, float]:
         """Coefficient kappa times number of samples of each of `mis.CLASSES`; 0: not in use."""
-        inner = float(self.connections != "none")
         return {
             "hit": 1.0,
             "direct": self.kappa_direct,
             "light": self.kappa_light * self.light_paths,
-            "inner": inner,
+            # As in `inputs._coefficients`.
+            "inner": math.sqrt(self.joined) if self.connections != "none" else 0.0,
         }
+
+    @property
+    def counts(self) -> dict[str, float]:
+        """Number of independent samples per camera subpath, by class."""
+        return {"hit": 1.0, "direct": 1.0, "light": self.light_paths, "inner": self.joined}
 
     @property
     def number(self) -> int:
         """Index of the candidate that this is, whatever was decided beside it."""
-        return CANDIDATES.index(replace(self, guided=0, emission=None, joined=1))
+        return CANDIDATES.index(replace(self, guided=0, emission=None))
 
     @property
     def camera_paths_per_light_path(self) -> int:
@@ -78,15 +84,17 @@ class Configuration:
 # Configurations of which a pilot estimates variances. Each class of strategies, once in use, stays in use; in
 # the last one strategies have the pilot's own weights. See experiments, "Choice of strategies".
 CANDIDATES = tuple(
-    Configuration(*row)
+    Configuration(*row[:4], joined=row[4] if row[4:] else 1)
     for row in (
-        # light subpaths per camera subpath, connections, kappa of t <= 1 over its count, kappa of s = 1
+        # light subpaths per camera subpath, connections, kappa of t <= 1 over its count, kappa of s = 1, and
+        # light subpaths per lane
         (0.0, "none", 1.0, 1 / 2),
         (0.0, "none", 1.0, 1.0),
         (1 / 2, "none", 1 / 8, 1.0),
         (1 / 2, "none", 1 / 2, 1.0),
         (1.0, "none", 1 / 4, 1.0),
         (1 / 16, "one", 1 / 4, 1.0),
+        (1 / 16, "one", 1 / 4, 1.0, JOINED[-1]),
         (1 / 4, "one", 1 / 16, 1.0),
         (1 / 2, "one", 1 / 32, 1.0),
         (1.0, "one", 1 / 16, 1.0),

@@ -56,14 +56,16 @@ _USERS = {kind: sum(c.weights[kind] > 0 for c in CANDIDATES) for kind in mis.CLA
 
 # Per camera sample, for each candidate: estimate, and second moments of contributions without t<=1, less
 # their squares; for each candidate with t<=1 the second moments due to t<=1; for each candidate with inner
-# connections the variance of drawing one. Then the number of connected vertices; the tile; in scenes with
-# media the number of evaluated pairs, else 0.
+# connections the variance of drawing one; sums of the fourth powers, of all classes, of the candidate's
+# contributions. Then the number of connected vertices; the tile; in scenes with media the number of evaluated
+# pairs, else 0.
 SAMPLE = Layout(
     {
         "estimate": len(CANDIDATES),
         "moment": len(CANDIDATES),
         "light": _USERS["light"],
         "draw": _USERS["inner"],
+        "peak": len(CANDIDATES),
         "connected": 1,
         "tile": 1,
         "evaluated": 1,
@@ -71,16 +73,17 @@ SAMPLE = Layout(
 )
 
 # Parts of `SAMPLE` that are sums over contributions.
-SUMS = ("estimate", "moment", "light", "draw")
+SUMS = ("estimate", "moment", "light", "draw", "peak")
 
-# Size of splats, their second moments without t <= 1, the rare part of these (see `pilot.SELDOM`), and their
-# second moments due to t <= 1.
+# Size of splats, their second moments without t <= 1, the rare part of these (see `pilot.SELDOM`), their
+# second moments due to t <= 1, and fourth powers.
 SPLAT = Layout(
     {
         "size": 1,
         "moment": len(CANDIDATES),
         "rare": len(CANDIDATES),
         "light": _USERS["light"],
+        "peak": len(CANDIDATES),
     }
 )
 
@@ -101,12 +104,16 @@ LEAST_GAIN = 1e-3
 PER_PIXEL = 2
 
 
+# Share of the pixels of a render whose errors the trimmed error leaves out. Contributions that fewer pixels
+# receive are not in the variance of a typical render, but their light is missing from it.
+TRIMMED = 1e-3
+
 # Candidates of a larger relative variance are ruled out, see `pilot.LOST`.
 RULED_OUT = 1e15
 
 # Fields of `Moments` with a row per group.
-_OF_GROUPS = ("base", "rare", "light", "draw", "sds")
-_ARRAYS = (*_OF_GROUPS, "gain", "emission")
+_OF_GROUPS = ("base", "rare", "light", "draw", "hidden", "sds")
+_ARRAYS = (*_OF_GROUPS, "missing", "gain", "emission")
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,8 @@ class Moments:
 
     * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, candidates). ``rare``: the part of ``base`` on
       paths too rare for stratification; ``light``: of splats; ``draw``: by drawing one inner connection.
+    * ``hidden``, like ``base``: their part in contributions that fewer than `TRIMMED` of the pixels receive;
+      ``missing`` by candidate: the squared error of a render without them, per sample.
     * ``gain`` by candidate: the factor that the points of a net leave of ``base`` - ``rare``.
     * ``sds``, shape (`GROUPS`, 2): variance of SDS paths on which s = 0 can be guided, excluded from all
       others: unguided and guided (no columns: not measured).
@@ -131,6 +140,8 @@ class Moments:
     rare: np.ndarray
     light: np.ndarray
     draw: np.ndarray
+    hidden: np.ndarray
+    missing: np.ndarray
     sds: np.ndarray
     gain: np.ndarray
     mean: float
@@ -139,12 +150,20 @@ class Moments:
     emission: np.ndarray = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
     def variance(self, stratified: bool = False) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, candidates); with the stratification gain or not."""
-        base = self.base
-        if stratified:
-            # Not of splats, which land in pixels by chance; see experiments, "Choice of strategies".
-            base = self.rare + self._left_by_points() * (base - self.rare)
-        return base + self.draw + self.light
+        """Relative variance per sample, shape (`GROUPS`, candidates); with the stratification gain or not.
+
+        It is the mean of the squared errors of many renders.
+        """
+        # Not of splats, which land in pixels by chance; see experiments, "Choice of strategies".
+        gain = self._left_by_points() if stratified else 1.0
+        return self.rare + gain * (self.base - self.rare) + self.draw + self.light
+
+    def typical(self, stratified: bool = False) -> np.ndarray:
+        """Like `variance`, of a typical render: trimmed, in which rare contributions are missing."""
+        gain = self._left_by_points() if stratified else 1.0
+        rare = np.maximum(self.rare - self.hidden, 0)
+        base = np.maximum(self.base - self.hidden, 0)
+        return rare + gain * np.maximum(base - rare, 0) + self.draw + self.light + self.missing
 
     def _left_by_points(self) -> float:
         """Stratification gain of the points of a pixel.
@@ -180,7 +199,8 @@ class Samples:
     """Camera samples of a pilot, one row each.
 
     ``estimate`` by candidate; sums of second moments (``moment`` without t <= 1, less the squares that are in
-    the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; fine ``tile``. Each
+    the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; ``peak``: fourth
+    powers; fine ``tile``. Each
     `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
     """
 
@@ -188,6 +208,7 @@ class Samples:
     moment: np.ndarray
     light: np.ndarray
     draw: np.ndarray
+    peak: np.ndarray
     tile: np.ndarray
 
     @staticmethod
@@ -248,10 +269,11 @@ def moments(
     nets: Samples | None,
     splats: Splats,
     rays: dict[str, float],
+    spp: float,
     sds: SDSLight | None = None,
     emission: np.ndarray | None = None,
 ) -> Moments:
-    """The moments of a pilot of independent ``samples`` and ``nets``.
+    """The moments of a pilot of independent ``samples`` and ``nets`` for a render of ``spp`` per pixel.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
     ``sds`` light is in no sample; ``emission``: see `guided_emission.EmissionStatistics`.
@@ -273,19 +295,22 @@ def moments(
         if values is not None:
             of_samples = _by_group(values * of_sample) * (GROUPS / count)
             total = of_samples + (total if total.shape[1] else 0)
-        return np.pad(total, ((0, 0), (width - total.shape[1], 0)))
+        return _padded(total, width)
 
     of_sds = np.zeros((GROUPS, 2))
     if sds is not None:
         of_sds = np.matmul(of_group, sds.sums[:, :, 1:])[:, 0] * (GROUPS / sds.lanes)
     estimate = samples.estimate
     base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
+    hidden, missing = _hidden(samples, splats, inverse, spp)
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
         rare=summed(None, "rare"),
         light=summed(samples.light, "light"),
         draw=summed(samples.draw),
+        hidden=hidden,
+        missing=missing,
         sds=of_sds,
         emission=_of_tiles(emission, samples, sizes.sum(axis=0)),
         gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
@@ -293,6 +318,48 @@ def moments(
         rays=rays,
         lanes=count + (len(nets.tile) if nets else 0),
     )
+
+
+def _hidden(
+    samples: Samples, splats: Splats, inverse: np.ndarray, spp: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """`Moments.hidden` and `Moments.missing`.
+
+    Camera samples and cells of splats count as contributions of one size each: of second moment m and fourth
+    p they have the squared size p / m and the rate m^2 / p. Those of the largest squared error, up to a rate
+    of `TRIMMED` per pixel, are hidden.
+    """
+    count, width = samples.estimate.shape
+    groups = group(np.arange(count))
+    of_sample = inverse[groups % 2, samples.tile][:, None]
+    of_cell = np.repeat(inverse[np.arange(GROUPS) % 2].reshape(-1, 1), width, axis=1)
+    cells = splats.sums.reshape(GROUPS * FINE**2, -1)
+    seconds = (
+        (samples.estimate**2 + samples.moment + _padded(samples.light, width)) * of_sample / count,
+        (SPLAT.of(cells, "moment") + _padded(SPLAT.of(cells, "light"), width)) * of_cell / splats.lanes,
+    )
+    fourths = (
+        samples.peak * of_sample**2 / count,
+        SPLAT.of(cells, "peak") * of_cell**2 / splats.lanes,
+    )
+    second, fourth = np.concatenate(seconds), np.concatenate(fourths)
+    tile = np.concatenate((samples.tile, np.tile(np.arange(FINE**2), GROUPS)))
+    part = np.concatenate((groups, np.repeat(np.arange(GROUPS), FINE**2)))
+    hidden, missing = np.zeros((GROUPS, width)), np.zeros(width)
+    for c in range(width):
+        real = (second[:, c] > 0) & (fourth[:, c] > 0) & np.isfinite(fourth[:, c])
+        m, p = second[real, c], fourth[real, c]
+        order = np.argsort(-p / m)
+        rare = order[np.cumsum((m**2 / p)[order]) * spp < TRIMMED]
+        hidden[:, c] = np.bincount(part[real][rare], m[rare], GROUPS) * GROUPS
+        light = np.bincount(tile[real][rare], m[rare] * np.sqrt(m[rare] / p[rare]), FINE**2) * FINE**2
+        missing[c] = spp * np.mean(light**2)
+    return hidden, missing
+
+
+def _padded(values: np.ndarray, width: int) -> np.ndarray:
+    """``values`` of the last candidates with zeros of those before."""
+    return np.pad(values, ((0, 0), (width - values.shape[-1], 0)))
 
 
 def _of_tiles(emission: np.ndarray | None, samples: Samples, splats: np.ndarray) -> np.ndarray:

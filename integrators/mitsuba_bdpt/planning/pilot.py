@@ -86,6 +86,8 @@ PACKET = 16
 # lowers the light's second moment by this factor; see experiments, "Photon-guided BSDF sampling".
 LEAST_REDUCTION = 8.0
 
+_WITH_INNER = tuple(candidate for candidate in CANDIDATES if candidate.connections != "none")
+
 # `Counters` of light subpaths only.
 _OF_LIGHT = ("light", "shadow_t1")
 
@@ -152,15 +154,17 @@ class Pilot:
 
         names = ("unshadowed", "visible") if kernel.space is None else ("unshadowed", "visible", "drawn")
         found = {name: _none(SAMPLE.parts["draw"]) for name in names}
-        found |= {name: total[name] for name in ("moment", "light")}
+        found |= {name: total[name] for name in ("moment", "light", "peak")}
         found, counted = connections.connect_all(kernel, z, lane.path, stream, found, add)
         unshadowed, seen = found.pop("unshadowed"), found.pop("visible")
         # A connection drawn in proportion to its unshadowed size represents all: its second moment is the sum
         # of all sizes times that of seen^2 / size, without media the sum of the visible ones; that of all
         # connections is the square of what is seen.
         drawn = found.pop("drawn", seen)
-        rows = zip(total["draw"], unshadowed, drawn, seen, strict=True)
-        draw = [d + b * q - a * a for d, b, q, a in rows]
+        rows = zip(_WITH_INNER, total["draw"], unshadowed, drawn, seen, strict=True)
+        draw = [d + (b * q - a * a) / candidate.joined for candidate, d, b, q, a in rows]
+        # Connections of a vertex with different light subpaths are independent.
+        found["moment"] = _minus_shared(found["moment"], seen)
         rays = counted.shadow_inner
         connected = total["connected"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
         # In the order of `begin`, as the state of a loop requires.
@@ -202,8 +206,8 @@ class Pilot:
         """Evaluate the recorded kernel together with ``counts``."""
         dr.eval(self._samples, self._splats, counts)
 
-    def moments(self, counts: dict[str, int], sds: SDSLight | None = None) -> Moments:
-        """The pilot's moments.
+    def moments(self, counts: dict[str, int], spp: float, sds: SDSLight | None = None) -> Moments:
+        """The pilot's moments for a render of ``spp`` samples per pixel.
 
         ``counts`` of the lanes' counters; ``sds`` light is in no sample.
         """
@@ -220,37 +224,40 @@ class Pilot:
         rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
         rays["guidable"] = sds.vertices if sds else 0.0
         emission = self._emission.evaluated() if self._emission is not None else None
-        return moments.moments(independent, nets if len(nets.tile) else None, splats, rays, sds, emission)
+        nets = nets if len(nets.tile) else None
+        return moments.moments(independent, nets, splats, rays, spp, sds, emission)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
 
-        Estimates of the candidates that use its class, and a dictionary of what it adds to ``moment`` and
-        ``light``, see `moments.SAMPLE`.
+        Estimates of the candidates that use its class, and a dictionary of what it adds to ``moment``,
+        ``light`` and ``peak``, see `moments.SAMPLE`.
         """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
-        own, squares, lights = [], [], []
+        own, squares, lights, peaks = [], [], [], []
         for candidate in CANDIDATES:
-            weights = candidate.weights
-            total = _dot(weights, shares, 1)
+            weights, counts = candidate.weights, candidate.counts
+            second = {kind: w and w**2 / counts[kind] for kind, w in weights.items()}
+            fourth = {kind: w and w**4 / counts[kind] ** 3 for kind, w in weights.items()}
+            total = _dot(weights, shares)
             # With inner connections all classes are in use; others may be unable to sample the path.
             possible = mi.Bool(True) if weights["inner"] else total > 0
             # Rate of the path relative to the pilot: see `RAREST`.
-            seldom = dr.maximum(1, self._least / _dot(weights, shares, 0))
+            seldom = dr.maximum(1, self._least / _rate(weights, shares))
             scale = size / (total * seldom)
             square = dr.square(scale) * seldom
-            moment = dr.select(possible, square * _dot(weights, shares | {"light": 0}, 2), lost)
+            moment = dr.select(possible, square * _dot(second, shares | {"light": 0}), lost)
             if weight := weights[c.kind]:
                 estimate = scale if weight == 1 else weight * scale
                 own.append(estimate)
                 if c.kind != "light":
-                    moment -= dr.square(estimate)
+                    moment -= dr.square(estimate) / counts[c.kind]
             squares.append(moment)
-            if light := weights["light"]:
-                each = light**2 / candidate.light_paths
-                lights.append(dr.select(possible, square * (each * shares["light"]), 0))
-        return own, {"moment": squares, "light": lights}
+            peaks.append(dr.select(possible, square * dr.square(scale) * _dot(fourth, shares), 0))
+            if light := second["light"]:
+                lights.append(dr.select(possible, square * (light * shares["light"]), 0))
+        return own, {"moment": squares, "light": lights, "peak": peaks}
 
     def _rare(self, size: mi.Float64, c: Contribution, squares: Row) -> Row:
         """The part of ``squares`` of a splat that does not gain from stratification.
@@ -261,7 +268,7 @@ class Pilot:
         shares = _shares(size, c) | {"light": 0}
         often = (c.s == 2) & (shares["direct"] > 0)
         return [
-            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _dot(candidate.weights, shares, 0))))
+            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _rate(candidate.weights, shares))))
             for candidate, square in zip(CANDIDATES, squares, strict=True)
         ]
 
@@ -331,7 +338,7 @@ def measure(
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
-    found = pilot.moments(counted, found)
+    found = pilot.moments(counted, stands_for * batch.size / pixels, found)
     if everything.guidable and not guiding:
         found = replace(found, sds=found.sds[:, :0])
     known = {"kinds": float(prepared.traits.asked.kinds)}
@@ -381,12 +388,28 @@ def _sums(total: Row, more: Row) -> Row:
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
 
 
-def _dot(weights: Mapping[str, float], shares: Mapping[str, mi.Float | int], power: int):
-    """sum_i weight_i^power share_i over the classes in use."""
-    terms = [(weights[kind] and weights[kind] ** power, share) for kind, share in shares.items()]
+def _minus_shared(moment: Row, seen: Row) -> Row:
+    """Subtract the products of connections of a vertex that are independent with M light subpaths per lane.
+
+    ``seen``: sums of the visible connections with one light subpath.
+    """
+    first = len(moment) - len(seen)
+    pairs = zip(_WITH_INNER, moment[first:], seen, strict=True)
+    less = [m if c.joined == 1 else m - (1 - 1 / c.joined) * dr.square(a) for c, m, a in pairs]
+    return moment[:first] + less
+
+
+def _dot(factors: Mapping[str, float], shares: Mapping[str, mi.Float | int]):
+    """sum_i factor_i share_i over the classes in use."""
+    terms = [(factors[kind], share) for kind, share in shares.items()]
     used = [
         share if factor == 1 else factor * share
         for factor, share in terms
         if factor and not mis.is_absent(share)
     ]
-    return sum(used[1:], used[0])
+    return sum(used[1:], used[0]) if used else mi.Float64(0)
+
+
+def _rate(weights: Mapping[str, float], shares: Mapping[str, mi.Float | int]):
+    """Share of the classes in use in the sum of all densities."""
+    return _dot({kind: float(weight > 0) for kind, weight in weights.items()}, shares)

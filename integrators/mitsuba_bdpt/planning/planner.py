@@ -15,7 +15,7 @@ from ..errors import UsageError
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
-from ..settings import LIGHT_PATHS, Settings
+from ..settings import Settings
 from ..transport.plan import JOINED, EmissionTables, Plan
 from . import budget, choice, pilot
 from .candidates import LEFT_OUT, candidates, without_pilot
@@ -174,7 +174,6 @@ class Planner:
             table = []
         if table:
             table, learnt = self._with_guided_emission(table, moments, samples)
-            table[0] = self._with_more_light_paths(table[0], samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
             unguided = table[0].candidate.emission is None
@@ -209,14 +208,6 @@ class Planner:
                 return table, learnt
             self._with_tables, table = found, guided
         return [row.with_emission(tables, is_lit) for row in table], learnt
-
-    def _with_more_light_paths(self, row: choice.Prediction, samples: int) -> choice.Prediction:
-        """``row`` with several light subpaths per lane where that pays (`JOINED_SAMPLES`)."""
-        candidate = row.candidate
-        fewest = candidate.connections == "one" and candidate.light_paths == min(n for n in LIGHT_PATHS if n)
-        if not fewest or not self._is_worth_joining(samples):
-            return row
-        return replace(row, candidate=replace(candidate, joined=JOINED[-1]))
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
@@ -343,7 +334,9 @@ class Planner:
 
     def _alternatives(self, samples: int) -> choice.Alternatives:
         """The alternatives for ``samples`` samples still to come."""
+        joins = self._is_worth_joining(samples)
         possible = candidates(self._prepared, self.full, self._settings)
+        possible = [candidate for candidate in possible if candidate.joined == 1 or joins]
         near_specular = bool(self._prepared.near_specular)
         stratified = self._settings.points == "sobol"
         return choice.Alternatives(possible, stratified, samples, self.full.guidable, near_specular)
