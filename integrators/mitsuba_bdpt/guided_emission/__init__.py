@@ -4,7 +4,7 @@ A pilot accumulates `EmissionStatistics` in the `Cells` of tables, `learn` fits 
 a render samples the directions (from infinity: the points) of emission by these tables.
 """
 
-from .learning import EmissionStatistics, Learnt, learn, left_by, left_out
+from .learning import EmissionStatistics, Learnt, learn, left_out
 from .tables import Cells, EmissionTables, side_of, why_not
 
 __all__ = [
@@ -13,7 +13,6 @@ __all__ = [
     "EmissionTables",
     "Learnt",
     "learn",
-    "left_by",
     "left_out",
     "side_of",
     "why_not",

@@ -156,14 +156,6 @@ def left_out(learnt: Learnt) -> list[dict[str, str]]:
     return [{"class": "guided emission", "level": "not worth its cost here", "why": why}]
 
 
-def left_by(tables: EmissionTables, statistics: np.ndarray) -> float:
-    """Second moment of the light-side strategies that ``tables`` leave of ``statistics``."""
-    whole = statistics.reshape(HALVES, -1, tables.side, tables.side, COLUMNS).sum(axis=0)
-    densities = tables.densities()
-    guided = (densities != 1).any(axis=(1, 2))
-    return float(np.sqrt(_left(whole, densities, guided)[0].prod()))
-
-
 def _fitted(statistics: np.ndarray, times: int) -> np.ndarray:
     """The best densities for ``statistics`` blurred ``times`` times.
 

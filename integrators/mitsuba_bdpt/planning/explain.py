@@ -126,7 +126,8 @@ def _named(candidate: Configuration) -> str:
         return f"light_paths=0, coefficient of s=1: {candidate.kappa_direct:g}"
     guided = f", guided={candidate.guided}" if candidate.guided else ""
     light = f"light_paths={fraction(candidate.light_paths)}, connections={candidate.connections}"
-    return f"{light}{guided}, coefficient of t<=1: {candidate.kappa_light:g}"
+    lane = f", {candidate.joined} light subpaths per lane" if candidate.joined > 1 else ""
+    return f"{light}{guided}{lane}, coefficient of t<=1: {candidate.kappa_light:g}"
 
 
 def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
@@ -134,15 +135,15 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
     if not table:
         return []
     head = (
-        "pilot: predictions, the chosen configuration first (time to the same error; cost relative to path "
+        "pilot: predictions, the chosen configuration first (time to the same error; cost and error relative "
     )
     lines = [
-        head + "tracing; error: relMSE of one sample per pixel, including the stratification gain)",
+        head + "to path tracing alone; error: the larger of that of the mean render and of a typical one)",
         "  relative time  cost per sample     error  configuration",
     ]
     for row in table:
         why = why_not(row, table[0])
-        figures = f"{row.time / table[0].time:15.2f}  {row.cost:15.2f}  {row.variance:8.3g}"
+        figures = f"{row.time / table[0].time:15.2f}  {row.cost:15.2f}  {row.error:8.3g}"
         lines.append(f"{figures}  {_named(row.candidate)}" + (f"; not chosen: {why}" if why else ""))
     if table[0].candidate.guided:
         lines.append(
@@ -151,10 +152,6 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         )
     if table[0].without_tables:
         lines.append("  guided emission is in none of these figures")
-    if (joined := table[0].candidate.joined) > 1:
-        lines.append(
-            f"  these figures are of connections with one light subpath; the render connects with {joined}"
-        )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
     lines.append(

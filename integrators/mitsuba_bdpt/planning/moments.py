@@ -113,7 +113,6 @@ RULED_OUT = 1e15
 
 # Fields of `Moments` with a row per group.
 _OF_GROUPS = ("base", "rare", "light", "draw", "hidden", "sds")
-_ARRAYS = (*_OF_GROUPS, "missing", "gain", "emission")
 
 
 @dataclass(frozen=True)
@@ -178,20 +177,6 @@ class Moments:
     def of(self, groups: np.ndarray) -> Moments:
         """The moments of the groups with these indices."""
         return replace(self, **{n: getattr(self, n)[groups] for n in _OF_GROUPS})
-
-    def combined(self, other: Moments) -> Moments:
-        """This pilot and another combined, weighted by ``lanes``."""
-        share = self.lanes / (self.lanes + other.lanes)
-
-        def mean(a: Any, b: Any) -> Any:
-            return share * a + (1 - share) * b
-
-        rays = {n: mean(self.rays[n], other.rays[n]) for n in self.rays}
-        means = {n: mean(getattr(self, n), getattr(other, n)) for n in (*_ARRAYS, "mean") if n != "sds"}
-        means["sds"] = self.sds if self.sds.size else other.sds
-        if self.sds.size and other.sds.size:
-            means["sds"] = mean(self.sds, other.sds)
-        return Moments(**means, rays=rays, lanes=self.lanes + other.lanes)
 
 
 @dataclass(frozen=True)
@@ -380,7 +365,6 @@ def _of_tiles(emission: np.ndarray | None, samples: Samples, splats: np.ndarray)
     brightness += over_tiles(splats) * EMISSION_TILES**2
     norms = brightness**2 + 0.01 * brightness.mean() ** 2
     found = np.einsum("htck,t->hck", emission, 1 / np.where(norms > 0, norms, np.inf)) / len(last)
-    # A non-finite value would spoil all pilots that are combined with this one.
     return found if np.isfinite(found).all() else np.zeros_like(found)
 
 

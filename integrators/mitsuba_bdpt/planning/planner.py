@@ -28,12 +28,6 @@ from .possible import plan, unsampled_paths, why_not_joined
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
 
-# Samples per pixel after which a second pilot runs, then after four times as many, and so on.
-FIRST_REPEAT = 32
-
-# Share of a render after which no pilot runs: the rest has to pay for it.
-LATEST_REPEAT = 1 / 4
-
 # Where path tracing alone is best without tables, a second pilot runs with them if they are predicted to make
 # light subpaths better than it by this factor.
 EMISSION_GAIN = 1.15
@@ -43,9 +37,6 @@ EMISSION_GAIN = 1.15
 # with transmissive BSDFs, which the approximation does not cover, and only with LLVM: lanes need four times
 # the local memory. See experiments, "Several light subpaths per lane".
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
-
-# Tables of a later pilot replace earlier ones if they leave this part of their second moments.
-BETTER_TABLES = 0.95
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
 UNMEASURED = (
@@ -62,14 +53,10 @@ NOT_FINITE = "the pilot found only invalid samples (NaN or infinite)"
 
 
 class Pilots(NamedTuple):
-    """Number of pilots that were requested, and when the next one is due.
-
-    ``cached``: those with cached results; ``repeat``: samples per pixel after which the next one is due.
-    """
+    """Number of pilots that were requested; ``cached``: those with cached results."""
 
     requested: int = 0
     cached: int = 0
-    repeat: int = FIRST_REPEAT
 
 
 @dataclass(frozen=True)
@@ -77,7 +64,7 @@ class Decided:
     """Decisions of a render so far; part of its progress.
 
     ``left_out``: what the last of ``decisions`` leaves out, as in ``statistics["skipped"]``; ``no_pilot``:
-    why the first pilot did not run or did not decide; ``moments`` of all pilots.
+    why no pilot ran or decided; ``moments`` of the pilot.
     """
 
     decisions: tuple[Decision, ...] = ()
@@ -135,38 +122,23 @@ class Planner:
             self.adopt(decision, LEFT_OUT)
         return not settled
 
-    def is_repeat_due(self, passes: tuple[int, ...]) -> bool:
-        """Whether another pilot is due, early in a long render; true once for each."""
-        pilots, done = self.decided.pilots, sum(passes)
-        if not passes or done < pilots.repeat or self._settings.variance or self._settings.decisions:
-            return False
-        repeat = pilots.repeat
-        while repeat <= done:
-            repeat *= 4
-        self.decided = replace(self.decided, pilots=pilots._replace(repeat=repeat))
-        return done <= LATEST_REPEAT * self._spp
-
     def run_pilot(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
-        if self.decided.pilots.requested:
-            result = self._result(samples)
-        else:  # the first pilot of all renders of the scene
-            key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
-            result, is_known = self._findings.find("results", key, lambda: self._result(samples))
-            if is_known:
-                pilots = self.decided.pilots._replace(requested=result.requested, cached=result.requested)
-                self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
-                self._with_tables = result.with_tables
+        key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
+        result, is_known = self._findings.find("results", key, lambda: self._result(samples))
+        if is_known:
+            pilots = Pilots(result.requested, cached=result.requested)
+            self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
+            self._with_tables = result.with_tables
         if result.table:
             self.adopt(result.table[0].decided(len(passes), result.moments.mean), result.left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
         return list(result.table)
 
     def _result(self, samples: int) -> _Result:
-        """Result of a pilot combined with the earlier ones of this render."""
-        found, before = self._measured(samples), self.decided.moments
-        moments = found if before is None else before.combined(found)
+        """Result of a pilot."""
+        moments = self._measured(samples)
         self.decided = replace(self.decided, moments=moments)
         alternatives, left_out = self._alternatives(samples), ()
         table = choice.choose(moments, alternatives)
@@ -196,11 +168,7 @@ class Planner:
         is_lit = table[0].candidate.light_paths > 0
         if learnt.tables is None or (not is_lit and lit * learnt.whole * EMISSION_GAIN > table[0].time):
             return table, learnt
-        tables, before = learnt.tables, self.plan.emission
-        if before is not None:
-            left_by = components.guided_emission.left_by
-            left = left_by(before, moments.emission)
-            tables = tables if left_by(tables, moments.emission) < BETTER_TABLES * left else before
+        tables = learnt.tables
         if not is_lit:
             found = self._measured(samples, tables)
             guided = choice.choose(found, self._alternatives(samples))
@@ -224,14 +192,12 @@ class Planner:
         return why_not_joined(self._prepared, self.full.merging)
 
     def _fitted_emission(self, moments: Moments, samples: int) -> Learnt:
-        """Fit tables of emission; the first pilot's are cached (20 ms under a sky)."""
+        """Fit tables of emission, cached (20 ms under a sky)."""
         counts, component = self._prepared.emitters.tables, components.guided_emission
 
         def learn() -> Learnt:
             return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
-        if self.decided.pilots.requested > 1:
-            return learn()
         return self._findings.find("emission", (self._settings, self.pilot_seed, samples), learn)[0]
 
     def _measured(self, samples: int, tables: EmissionTables | None = None) -> Moments:

@@ -146,7 +146,7 @@ class Render:
             for number, step in enumerate(self._steps()):
                 if not number and self._is_exact_enough():  # the snapshot is exact enough already
                     break
-                self._decide_again()
+                self.replay()
                 if not number:
                     messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
                     missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
@@ -198,13 +198,6 @@ class Render:
         """Apply the decision for the next pass that the parameters give, if any."""
         self.planner.replay(self.passes)
         self._use_plan()
-
-    def _decide_again(self):
-        """Replay the decision for the next pass, or run another pilot early in a render."""
-        if self.settings.decisions:
-            self.replay()
-        elif self.planner.is_repeat_due(self.passes):
-            self.decide()
 
     def _use_plan(self):
         if self.kernel.plan is not self.plan:

@@ -108,7 +108,7 @@ def _arrays(arrays: dict, name: str) -> dict:
 
 
 # Version of the stored format; increase with every change.
-FORMAT = 7
+FORMAT = 8
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
