@@ -745,10 +745,10 @@ MUTANTS = (
         ("tests/transport/test_oracle.py::test_recursion_extreme_densities[n1c1-balance]",),
     ),
     Mutant(
-        "pilots: connections of a vertex are with one light subpath",
-        "planning/pilot.py",
-        "m - (1 - 1 / c.joined) * dr.square(a)",
-        "m - 0 * dr.square(a)",
+        "pilots: all connections are with one light subpath",
+        "planning/moments.py",
+        "(1 - 1 / count) * own",
+        "0 * own",
         ("tests/planning/test_pilot.py::test_predicted_variance[cornell-four per lane]",),
     ),
     Mutant(
@@ -855,13 +855,6 @@ MUTANTS = (
         "or bool(prepared.near_specular) or",
         "or",
         ("tests/run/test_first_image.py::test_light_subpaths_without_a_decision",),
-    ),
-    Mutant(
-        "pilot: what looks better has no reason beside it",
-        "planning/choice.py",
-        "    if gain <= 1:\n",
-        "    if gain <= 1 or chosen.candidate.light_paths:\n",
-        ("tests/planning/test_pilot.py::test_what_looks_better_says_why_it_is_not_chosen",),
     ),
     Mutant(
         "rounding: rays start on the surface",

@@ -313,7 +313,7 @@ def test_a_gain_has_to_pay_in_most_of_a_pilot(guided, groups, chosen):
     none, sds = np.zeros((GROUPS, len(CANDIDATES))), np.zeros((GROUPS, 2))
     sds[:groups] = [9.0, guided]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
-    rays |= {"guidable": 0.05, "kinds": 1}
+    rays |= {"guidable": 0.05}
     others = dict.fromkeys(("rare", "light", "draw", "hidden"), none) | {"missing": none[0]}
     ones = np.ones(len(CANDIDATES))
     moments = Moments(base=none + 1, **others, sds=sds, gain=ones, mean=1.0, rays=rays, lanes=4096)

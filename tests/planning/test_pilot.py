@@ -195,7 +195,8 @@ def test_predicted_variance(make, name):
     edges (lamps and sky are hidden from the camera: the pilot leaves directly seen emitters out). Expected:
     predicted and measured variance agree within 15 % (in fog a draw by sizes that fog does not change would
     have 25 % more); path tracing alone in the caustic: renders miss most of
-    its variance (a few paths in a million carry it), so the prediction may be up to 20 times what they show.
+    its variance (a few paths in a million carry it), so the prediction may be up to 20 times what they show;
+    four light subpaths per lane, which count as two, up to 30 % more than what they show.
     """
     way = PREDICTED.get(name, FOUR)
     target, found = foretold(make)
@@ -210,6 +211,8 @@ def test_predicted_variance(make, name):
     measured = 8 * relative_variance(images.astype(float), images.mean(axis=0))
     if make is lit_caustic and not way.light_paths:
         assert 0.5 * measured < predicted < 20 * measured
+    elif way.joined > 1:
+        assert 0.85 * measured < predicted < 1.3 * measured
     else:
         assert predicted == pytest.approx(measured, rel=0.15)
 
@@ -483,7 +486,7 @@ def test_splats_in_shadows_count_by_what_is_there():
     dark[9:12, 17:20] = True
     estimate = np.where(dark.ravel()[tile], 0.0, 1.0)[:, None]
     nothing = np.zeros_like(estimate)
-    samples = moments.Samples(estimate, nothing, nothing, nothing, nothing, tile)
+    samples = moments.Samples(estimate, *[nothing] * 5, tile)
     half = np.arange(len(tile)) // 2 % 2
     for norm in moments._norms(samples, half, np.zeros((2, fine**2))).reshape(2, fine, fine):
         assert norm[10, 18] < 0.011 and norm[0, 0] == pytest.approx(1.01, rel=0.02)
@@ -586,8 +589,7 @@ def test_light_subpaths_have_to_gain(connections):
     """Rationale: predictions are off by some 10 %, and a render slower than path tracing is not forgiven.
     Expected: light subpaths are chosen if they shorten the time by more than `REQUIRED_GAIN`, and if they
     gain less that is said."""
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated"), 1.0)
-    rays["kinds"] = 1
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
     light = {"none": SPLATS, "one": CONNECTED}[connections]
     cost, needed = choice.cost(light, rays), choice.REQUIRED_GAIN
     for gain, chosen in ((0.99 * needed, False), (1.01 * needed, True)):
@@ -604,8 +606,7 @@ def test_both_errors_have_to_fall():
     """Rationale: light subpaths that only remove outliers which hardly a render has made most renders slower.
     Expected: with a tenth of the mean squared error they are not chosen where all that they remove is in
     contributions that a typical render does not receive, and chosen where the light of these is missed."""
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated"), 1.0)
-    rays["kinds"] = 1
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, ALONE.number] = 10
     alone = np.arange(len(CANDIDATES)) == ALONE.number
@@ -626,7 +627,7 @@ def test_rare_contributions_are_hidden():
     tile = np.repeat(np.arange(moments.FINE**2), count // moments.FINE**2)
     moment, peak = none.copy(), even.copy()
     moment[0], peak[0] = rate * size**2, rate * size**4
-    samples = moments.Samples(even, moment, none[:, :0], none[:, :0], peak, tile)
+    samples = moments.Samples(even, moment, none[:, :0], none[:, :0], peak, none[:, :0], tile)
     width = dict.fromkeys(moments.SPLAT.parts, 1) | {"light": 0}
     splats = moments.Splats(np.zeros((moments.GROUPS, moments.FINE**2, sum(width.values()))), count)
     with mock.patch.object(moments, "SPLAT", moments.Layout(width)):
@@ -645,42 +646,13 @@ def test_no_group_has_less_than_no_variance():
     """Rationale: an estimate of a group's variance may be negative (a product of two samples is subtracted),
     and one such outlier made a candidate of twice the variance the best, in one of 16 pilots of a scene.
     Expected: it counts as 0."""
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected", "evaluated"), 1.0)
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
     base[:, SPLATS.number] = 2
     base[3, SPLATS.number] = -40
-    table = choice.choose(made_of(base, rays | {"kinds": 1}), Alternatives([ALONE, SPLATS], True))
+    table = choice.choose(made_of(base, rays), Alternatives([ALONE, SPLATS], True))
     assert table[0].candidate == ALONE
     assert table[1].variance == pytest.approx(2 * 15 / 16)
-
-
-def test_what_looks_better_says_why_it_is_not_chosen():
-    """Rationale: `explain` listed candidates that take 0.61 of the time of the chosen one, and did not say
-    why they are not chosen.
-
-    Expected: of 200 tables of a pilot's statistics, drawn by chance, each row that takes less time than the
-    first names the gain that it would need, and does not have it, or that it lacks guided s = 0; no other row
-    has a reason. Each kind of reason is met.
-    """
-    needed = re.compile(r"to gain (.*)x over .*, and gain (.*)x")
-    random, met = np.random.default_rng(1), set()
-    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "connected"), 1.0)
-    rays |= {"kinds": 1, "evaluated": 0.0, "guidable": 0.01}
-    even = [1 / choice.cost(c, rays) for c in CANDIDATES]
-    for number in range(200):
-        base = even * np.exp(random.normal(0, random.uniform(0, 0.2), len(CANDIDATES)))
-        found = made_of(np.tile(base, (moments.GROUPS, 1)), rays, light=np.exp(random.uniform(-8, 0)))
-        if number % 4 == 0:
-            found.sds[:, 0] = 100.0
-        some = [c for c in CANDIDATES if c.light_paths or number % 2]
-        table = choice.choose(found, Alternatives(some, True, guidable=True))
-        for row in table:
-            why = choice.why_not(row, table[0])
-            assert bool(why) == (row.time < table[0].time)
-            if numbers := needed.search(why):
-                assert float(numbers[2]) <= float(numbers[1])
-            met.add(why.split(" ")[0])
-    assert met == {"", "light", "without"}
 
 
 def test_explained_tables_say_why(monkeypatch):
@@ -952,18 +924,18 @@ def test_weights_by_class():
 
 def test_recording_counts_in_short_renders():
     """Rationale: in previews most of the time is that of recording the kernel, twice as long with light
-    subpaths. Expected: with 0.6 of the variance for a third more per sample light subpaths are taken for a
+    subpaths. Expected: with half of the variance for a half more per sample light subpaths are taken for a
     million samples, and not for 2^16, whose cost is that of the samples and of what is fixed."""
     possible = [ALONE, FEW]
     rays = {"camera": 3.0, "shadow_s1": 1.0, "light": 8.0, "shadow_t1": 4.0}
-    rays |= {"connected": 0.0, "evaluated": 0.0, "kinds": 1}
+    rays |= {"evaluated": 0.0}
     base = np.ones((moments.GROUPS, len(CANDIDATES)))
-    base[:, FEW.number] = 0.6
+    base[:, FEW.number] = 0.5
     for samples, lit in ((1 << 20, True), (1 << 16, False)):
         table = choice.choose(made_of(base, rays), Alternatives(possible, True, samples))
         assert bool(table[0].candidate.light_paths) == lit
     fixed = choice.FIXED
-    extra = (choice.COSTS["light_path"] + 12 * choice.COSTS["light"]) / 16 + choice.COSTS["inner"]
+    extra = 12 * choice.COSTS["light"] / 16 + choice.COSTS["inner"]
     more = extra + fixed["light"] / 2**16
     assert choice.cost(FEW, rays, 1 << 16) == pytest.approx(1 + more / (4 + fixed["start"] / 2**16))
     assert choice.cost(ALONE, rays, 1 << 16) == 1 == choice.cost(ALONE, rays)
@@ -1086,17 +1058,16 @@ def test_rays_of_light_subpaths_are_counted_for_each():
 
 
 def test_rare_paths_count_in_short_renders_too():
-    """Rationale: behind glass, in a cloud and under a lens, rare paths hold most of the error, at 16 samples
-    per pixel as at 64. Expected: inner connections in `glass_slab` and `cloudy_ball` (without them a render
-    takes 7 and 1.6 times as long for the same trimmed error), light subpaths in `thin_lens`.
+    """Rationale: behind glass and in a cloud rare paths hold most of the error, at 16 samples per pixel as at
+    64. Expected: inner connections in `glass_slab` and `cloudy_ball` (without them a render takes 7 and 1.6
+    times as long for the same trimmed error).
     """
     chosen = {}
-    for name, depth in (("glass_slab", 48), ("cloudy_ball", 48), ("thin_lens", 8)):
+    for name, depth in (("glass_slab", 48), ("cloudy_ball", 48)):
         scene = mi.load_file(str(SCENES / f"{name}.xml"), resolution=128, parallel=False, optimize=False)
         (decision,) = mi.load_dict({"type": "bdpt", "max_depth": depth}).decide(scene, spp=16)
         chosen[name] = decision["light_paths"] > 0, decision["connections"]
     assert chosen["glass_slab"] == chosen["cloudy_ball"] == (True, "one")
-    assert chosen["thin_lens"][0]
 
 
 def test_pilots_that_do_not_measure_guided_hits():

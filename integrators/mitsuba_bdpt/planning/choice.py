@@ -19,26 +19,20 @@ from .configuration import Configuration, Decision
 from .moments import GROUPS, Moments
 
 # Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
-# experiments, "Choice of strategies".
+# experiments, "Costs".
 COSTS = {
-    "light_path": 1.7,  # starting a light subpath
-    "light": 0.76,  # a ray of a light subpath
-    "light_in_media": 1.2,  # a ray of a light subpath in a scene with media
-    "inner": 0.55,  # looking for connections, per sample
-    "connected": 0.65,  # a drawn and tested connection
-    # With media: an evaluated pair of the lane of a packet with most pairs, for which the others wait.
-    "packets": 0.18,
+    "light": 1.25,  # a ray of a light subpath
+    "inner": 0.9,  # inner connections, per sample
+    "evaluated": 0.33,  # an evaluated pair of vertices
+    # With media instead: an evaluated pair of the lane of a packet with most, for which the others wait.
+    "packets": 0.16,
+    "several": 0.7,  # inner connections with several light subpaths, per sample
     "guided": 31.0,  # a vertex with photon-guided BSDF sampling, its samples included
-    "diverging": 0.5,  # an evaluated pair of BSDFs, if the lanes of a packet have different BSDFs
 }
 
 # Cost of a render besides its samples, mainly recording of its kernel, in the same unit: path tracing alone,
 # plus light subpaths, plus guiding. See experiments, "Choice of strategies".
 FIXED = {"start": 180e3, "light": 250e3, "guided": 600e3}
-
-# Numbers of kinds of BSDFs between which the lanes of a packet increasingly take turns in evaluating their
-# BSDFs. BSDFs of one kind share their functions.
-FEW_KINDS, MANY_KINDS = 2, 16
 
 
 def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = math.inf) -> float:
@@ -49,14 +43,11 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
     if candidate.light_paths:
         total += FIXED["light"] / samples
-        each = COSTS["light_in_media" if rays.get("media") else "light"]
-        light = COSTS["light_path"] + each * (rays["light"] + rays["shadow_t1"])
-        total += light * candidate.light_paths
+        total += COSTS["light"] * (rays["light"] + rays["shadow_t1"]) * candidate.light_paths
     if candidate.connections != "none":
-        total += COSTS["inner"] + COSTS["connected"] * rays["connected"]
-        total += COSTS["packets"] * rays.get("packets", 0)
-        part = (rays["kinds"] - FEW_KINDS) / (MANY_KINDS - FEW_KINDS)
-        total += COSTS["diverging"] * min(max(part, 0), 1) * rays["evaluated"]
+        kind = "packets" if "packets" in rays else "evaluated"
+        total += COSTS["inner"] + COSTS[kind] * rays[kind]
+        total += COSTS["several"] * (candidate.joined > 1)
     if candidate.guided:
         total += FIXED["guided"] / samples
         total += COSTS["guided"] * rays["guidable"]
@@ -65,7 +56,7 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
 
 # Factor by which light subpaths have to shorten the time, since predictions are inexact; see experiments,
 # "Choice of strategies".
-REQUIRED_GAIN = 1.15
+REQUIRED_GAIN = 1.1
 
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15

@@ -43,13 +43,16 @@ class Configuration:
             "direct": self.kappa_direct,
             "light": self.kappa_light * self.light_paths,
             # As in `inputs._coefficients`.
-            "inner": math.sqrt(self.joined) if self.connections != "none" else 0.0,
+            "inner": self.counts["inner"] if self.connections != "none" else 0.0,
         }
 
     @property
     def counts(self) -> dict[str, float]:
-        """Number of independent samples per camera subpath, by class."""
-        return {"hit": 1.0, "direct": 1.0, "light": self.light_paths, "inner": self.joined}
+        """Number of independent samples per camera subpath, by class.
+
+        A connection drawn by an approximation from M light subpaths is worth about sqrt(M) of them.
+        """
+        return {"hit": 1.0, "direct": 1.0, "light": self.light_paths, "inner": math.sqrt(self.joined)}
 
     @property
     def number(self) -> int:

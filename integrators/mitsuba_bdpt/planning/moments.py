@@ -54,11 +54,14 @@ class Layout:
 # Number of candidates that use a class of strategies: the last ones.
 _USERS = {kind: sum(c.weights[kind] > 0 for c in CANDIDATES) for kind in mis.CLASSES}
 
+# Candidates with several light subpaths per lane.
+_SEVERAL = [number for number, candidate in enumerate(CANDIDATES) if candidate.joined > 1]
+
 # Per camera sample, for each candidate: estimate, and second moments of contributions without t<=1, less
 # their squares; for each candidate with t<=1 the second moments due to t<=1; for each candidate with inner
 # connections the variance of drawing one; sums of the fourth powers, of all classes, of the candidate's
-# contributions. Then the number of connected vertices; the tile; in scenes with media the number of evaluated
-# pairs, else 0.
+# contributions; for each of `_SEVERAL` the sum of the inner connections. Then the tile; in scenes with media
+# the number of evaluated pairs, else 0.
 SAMPLE = Layout(
     {
         "estimate": len(CANDIDATES),
@@ -66,14 +69,14 @@ SAMPLE = Layout(
         "light": _USERS["light"],
         "draw": _USERS["inner"],
         "peak": len(CANDIDATES),
-        "connected": 1,
+        "several": len(_SEVERAL),
         "tile": 1,
         "evaluated": 1,
     }
 )
 
 # Parts of `SAMPLE` that are sums over contributions.
-SUMS = ("estimate", "moment", "light", "draw", "peak")
+SUMS = ("estimate", "moment", "light", "draw", "peak", "several")
 
 # Size of splats, their second moments without t <= 1, the rare part of these (see `pilot.SELDOM`), their
 # second moments due to t <= 1, and fourth powers.
@@ -130,8 +133,7 @@ class Moments:
       others: unguided and guided (no columns: not measured).
     * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
-    * ``rays``: rays and connections per camera sample by kind, with one light subpath each, and the
-      number of ``kinds`` of BSDFs.
+    * ``rays``: rays and connections per camera sample by kind, with one light subpath each.
     * ``lanes``: number of camera samples.
     """
 
@@ -185,7 +187,7 @@ class Samples:
 
     ``estimate`` by candidate; sums of second moments (``moment`` without t <= 1, less the squares that are in
     the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; ``peak``: fourth
-    powers; fine ``tile``. Each
+    powers; ``several``: inner connections of `_SEVERAL`; fine ``tile``. Each
     `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
     """
 
@@ -194,6 +196,7 @@ class Samples:
     light: np.ndarray
     draw: np.ndarray
     peak: np.ndarray
+    several: np.ndarray
     tile: np.ndarray
 
     @staticmethod
@@ -286,7 +289,12 @@ def moments(
     if sds is not None:
         of_sds = np.matmul(of_group, sds.sums[:, :, 1:])[:, 0] * (GROUPS / sds.lanes)
     estimate = samples.estimate
-    base = summed(estimate**2 + samples.moment - estimate * _other(estimate), "moment")
+    squares = estimate**2 + samples.moment - estimate * _other(estimate)
+    for i, candidate in enumerate(_SEVERAL):
+        # Connections with different light subpaths are independent.
+        own, count = samples.several[:, i : i + 1], CANDIDATES[candidate].counts["inner"]
+        squares[:, [candidate]] -= (1 - 1 / count) * own * (own - _other(own))
+    base = summed(squares, "moment")
     hidden, missing = _hidden(samples, splats, inverse, spp)
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(

@@ -23,7 +23,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import connections, mis
 from ..transport.batch import NET, NETS, Batch
-from ..transport.contribution import COUNTERS, Counters, one
+from ..transport.contribution import COUNTERS, Counters
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.photons.guided_hits import Unguided
@@ -121,8 +121,8 @@ class Pilot:
 
     def begin(self) -> Total:
         """Zero totals."""
-        counted = ("connected", "evaluated") if self._media else ("connected",)
-        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | {name: mi.UInt32(0) for name in counted}
+        sums = {name: _none(SAMPLE.parts[name]) for name in SUMS}
+        return sums | {"evaluated": mi.UInt32(0)} if self._media else sums
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Accumulate a contribution with t >= 2."""
@@ -162,13 +162,11 @@ class Pilot:
         # connections is the square of what is seen.
         drawn = found.pop("drawn", seen)
         rows = zip(_WITH_INNER, total["draw"], unshadowed, drawn, seen, strict=True)
-        draw = [d + (b * q - a * a) / candidate.joined for candidate, d, b, q, a in rows]
-        # Connections of a vertex with different light subpaths are independent.
-        found["moment"] = _minus_shared(found["moment"], seen)
-        rays = counted.shadow_inner
-        connected = total["connected"] + one(rays > 0)  # pyright: ignore[reportOptionalOperand]
+        draw = [d + (b * q - a * a) / candidate.counts["inner"] for candidate, d, b, q, a in rows]
+        several = [a for candidate, a in zip(_WITH_INNER, seen, strict=True) if candidate.joined > 1]
         # In the order of `begin`, as the state of a loop requires.
-        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw, "connected": connected}
+        found |= {"estimate": _sums(total["estimate"], seen), "draw": draw}
+        found["several"] = _sums(total["several"], several)
         if self._media:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
@@ -186,7 +184,7 @@ class Pilot:
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
         """Accumulate a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
-        others = {"connected": total["connected"], "tile": tile_of(self._region, sample.start.position)}
+        others = {"tile": tile_of(self._region, sample.start.position)}
         others["evaluated"] = total["evaluated"] if self._media else 0
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
@@ -219,9 +217,9 @@ class Pilot:
         rays = {
             name: count / (self._lanes if name in _OF_LIGHT else len(rows)) for name, count in counts.items()
         }
-        rays["connected"] = SAMPLE.of(rows, "connected").mean()
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
-        rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean()) if len(evaluated) else 0.0
+        if self._media and len(evaluated):
+            rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean())
         rays["guidable"] = sds.vertices if sds else 0.0
         emission = self._emission.evaluated() if self._emission is not None else None
         nets = nets if len(nets.tile) else None
@@ -341,9 +339,7 @@ def measure(
     found = pilot.moments(counted, stands_for * batch.size / pixels, found)
     if everything.guidable and not guiding:
         found = replace(found, sds=found.sds[:, :0])
-    known = {"kinds": float(prepared.traits.asked.kinds)}
-    known["media"] = float(prepared.space is not None)
-    return replace(found, rays=found.rays | known)
+    return found
 
 
 def _add(target: mi.Float64, layout: Layout, found: Mapping[str, Row], row: mi.UInt32, active: mi.Bool):
@@ -386,17 +382,6 @@ def _sums(total: Row, more: Row) -> Row:
     """
     first = len(total) - len(more)
     return total[:first] + [a + b for a, b in zip(total[first:], more, strict=True)]
-
-
-def _minus_shared(moment: Row, seen: Row) -> Row:
-    """Subtract the products of connections of a vertex that are independent with M light subpaths per lane.
-
-    ``seen``: sums of the visible connections with one light subpath.
-    """
-    first = len(moment) - len(seen)
-    pairs = zip(_WITH_INNER, moment[first:], seen, strict=True)
-    less = [m if c.joined == 1 else m - (1 - 1 / c.joined) * dr.square(a) for c, m, a in pairs]
-    return moment[:first] + less
 
 
 def _dot(factors: Mapping[str, float], shares: Mapping[str, mi.Float | int]):

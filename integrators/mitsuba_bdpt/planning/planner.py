@@ -28,10 +28,6 @@ from .possible import plan, unsampled_paths, why_not_joined
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
 
-# Where path tracing alone is best without tables, a second pilot runs with them if they are predicted to make
-# light subpaths better than it by this factor.
-EMISSION_GAIN = 1.15
-
 # Where the fewest light subpaths and one connection are used, camera subpaths connect with several light
 # subpaths, drawn by an approximation (`connections`), in renders of at least so many samples and pixels. Not
 # with transmissive BSDFs, which the approximation does not cover, and only with LLVM: lanes need four times
@@ -164,9 +160,9 @@ class Planner:
         if not moments.emission.size:
             return table, None
         learnt = self._fitted_emission(moments, samples)
-        lit = min((row.time for row in table if row.candidate.light_paths), default=math.inf)
+        lit = min((row.score for row in table if row.candidate.light_paths), default=math.inf)
         is_lit = table[0].candidate.light_paths > 0
-        if learnt.tables is None or (not is_lit and lit * learnt.whole * EMISSION_GAIN > table[0].time):
+        if learnt.tables is None or (not is_lit and lit * learnt.whole > table[0].score):
             return table, learnt
         tables = learnt.tables
         if not is_lit:

@@ -114,8 +114,7 @@ class Traits:
 
 # From this number of BSDFs on virtual calls are small. One call of everything that a vertex needs passes the
 # interaction once (6 % faster in a Cornell box), but each call site compiles its own functions, one per BSDF;
-# equal small calls are compiled once. Divergence of lanes is another matter, see
-# `planning.choice.MANY_KINDS`.
+# equal small calls are compiled once.
 MANY = 10
 
 # Largest number of the scene's BSDFs that no ray hits, relative to the others, up to which Mitsuba's virtual
