@@ -189,15 +189,6 @@ MUTANTS = (
         ("tests/image/test_aovs.py::test_features_are_those_of_aov[plain]",),
     ),
     Mutant(
-        "unsampled light: one and a half hundredths are not said",
-        "planning/unsampled_light.py",
-        "if all_of_it < WORTH_A_WORD:",
-        "if all_of_it < 1.5 * WORTH_A_WORD:",
-        (
-            "tests/planning/test_unsampled_light.py::test_a_share_of_a_hundredth_is_said_before_the_first_pass",
-        ),
-    ),
-    Mutant(
         "near-specular lobes: a nested BSDF has none",
         "transport/near_specular.py",
         "    while found != before:",
@@ -747,7 +738,7 @@ MUTANTS = (
     Mutant(
         "pilots: all connections are with one light subpath",
         "planning/moments.py",
-        "(1 - 1 / count) * own",
+        "(1 - 1 / several) * own",
         "0 * own",
         ("tests/planning/test_pilot.py::test_predicted_variance[cornell-four per lane]",),
     ),

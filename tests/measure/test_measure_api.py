@@ -60,7 +60,7 @@ def test_a_dictionary_is_loaded_as_a_file_of_it_is(here):
     images = [np.array(mi.render(scene.load(32, "stratified"), spp=4, seed=3)) for scene in scenes]
     assert images[0].shape == (16, 32, 3)
     np.testing.assert_allclose(*images, rtol=1e-4)
-    for name in ("max_depth", "has_media", "tells_depth"):
+    for name in ("max_depth", "has_media"):
         assert getattr(scenes[0], name) == getattr(scenes[1], name), name
     assert scenes[0].size(8) == scenes[1].size(8) == (8, 4)
     assert given["camera"]["film"]["width"] == 16 and "sampler" not in given["camera"]

@@ -6,7 +6,6 @@ import ablation
 import gpu
 import mitsuba as mi
 import pytest
-import repository
 
 TINY = [
     "--ablation",
@@ -20,14 +19,6 @@ TINY = [
     "--beside",
     "1",
 ]
-
-
-def test_the_most_informative_rows_come_first():
-    """Expected: names of ways are unique, `path` leads, each way comes in all scenes before the next."""
-    names = [way.name for way in ablation.WAYS]
-    assert len(set(names)) == len(names) and names[0] == "path" and set(ablation.PROFILED) <= set(names)
-    jobs = ablation.jobs_of(["a", "b"])
-    assert jobs[:3] == [("a", 0), ("b", 0), ("a", 1)] and len(jobs) == 2 * len(names)
 
 
 def test_a_run_that_is_cut_off_says_what_it_has(tmp_path, monkeypatch, capsys):
@@ -60,14 +51,6 @@ def row(way, kernels_ns, **more):
     return {"scene": "s", "way": way, "measured": True, "kernels": [kernel]} | times | more
 
 
-def test_tables_compare_with_path():
-    """Expected: nanoseconds by the clock and of kernels, the latter over `path`'s; what failed says why."""
-    failed = {"scene": "s", "way": "b", "measured": False, "kernels": [], "failed": "out of memory"}
-    text = ablation.page({"rows": [row("path", 2.0), row("a", 5.0), failed]})
-    assert "| path | 4, 2 (1.00x) |" in text and "| a | 10, 5 (2.50x) |" in text
-    assert "| b | out of memory |" in text and "10 lines, 64 bytes, 96 registers, first 3 s" in text
-
-
 @pytest.mark.parametrize("target", ["sm_70", "sm_90"])
 def test_kernels_are_assembled_for_their_own_target(target, tmp_path, monkeypatch):
     """Expected: the ptxas on the PATH gets the architecture of the PTX, and its figures are in the row; those
@@ -85,21 +68,6 @@ def test_kernels_are_assembled_for_their_own_target(target, tmp_path, monkeypatc
     assert ablation.assembled(code) == {"registers": 96, "stack_bytes": 8, "spilled_bytes": 4}
     assert ablation.assembled(code + "call (x), _optix_trace_32, (y);") == {}
     assert ablation.assembled("; LLVM") == {}
-
-
-def test_a_file_has_one_row_per_line():
-    """Expected: JSON of the same content, each row on a line of its own; so is the recorded one, without
-    what ptxas said of it."""
-    found = {
-        "size": 16,
-        "software": {"a": "1"},
-        "rows": [{"way": "a", "kernels": [{"hash": "h"}]}, {"way": "b"}],
-    }
-    text = ablation.one_row_per_line(found)
-    assert json.loads(text) == found
-    assert text.count('\n  {"way"') == 2
-    recorded = (repository.ROOT / "docs" / "reports" / "cuda_ablation.json").read_text()
-    assert ablation.one_row_per_line(json.loads(recorded)) == recorded and "ptxas" not in recorded
 
 
 def test_code_of_kernels_is_counted():

@@ -50,17 +50,6 @@ def test_runs_add_up(tmp_path, capsys):
     assert f"{endurance.samples_of(second):,} camera samples in " in capsys.readouterr().out
 
 
-def test_settings_are_varied():
-    """Expected: over 24 renders every size with both kinds of skip, every heuristic with both, and every size
-    with every heuristic at least once."""
-    seen = [endurance.settings(number) for number in range(24)]
-    assert {(p["skip"], width) for p, width in seen} >= {
-        (s, w) for s in ("auto", "none") for w in endurance.SIZES
-    }
-    assert len({(p["skip"], p["heuristic"]) for p, _ in seen}) == 4
-    assert len({(p["heuristic"], width) for p, width in seen}) == 2 * len(endurance.SIZES)
-
-
 INTERRUPTED = """
 import os, signal, sys
 from pathlib import Path

@@ -99,12 +99,6 @@ class MeasuredScene(ABC):
         return depth_of(self._look.integrator)
 
     @cached_property
-    def tells_depth(self) -> bool:
-        """Whether the scene's integrator has a ``max_depth``."""
-        made = self._look.integrator
-        return hasattr(made, "max_depth") or "max_depth" in str(made)
-
-    @cached_property
     def has_media(self) -> bool:
         """Whether rays can be in a medium, see `has_media`."""
         return self._look.has_media

@@ -1,9 +1,8 @@
 """Chooses the most efficient configuration from a pilot's statistics.
 
-Minimises cost times error. The error is the larger of two, relative to path tracing alone: of the mean render
-and of a typical one (`moments.Moments.variance`, `typical`), since light subpaths that only remove outliers
-which hardly a render has make most renders slower. Costs are counted, not timed (see `COSTS`): equal seeds
-give equal decisions on all machines.
+Minimises cost times error. The error is the larger of two, relative to path tracing alone: that of the mean
+render and of a typical one (`Moments.variance`, `Moments.typical`): most renders lack the rarest outliers.
+Costs are counted, not timed (see `COSTS`): equal seeds give equal decisions on all machines.
 """
 
 from __future__ import annotations

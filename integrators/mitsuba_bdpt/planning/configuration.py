@@ -86,24 +86,19 @@ class Configuration:
 
 # Configurations of which a pilot estimates variances. Each class of strategies, once in use, stays in use; in
 # the last one strategies have the pilot's own weights. See experiments, "Choice of strategies".
-CANDIDATES = tuple(
-    Configuration(*row[:4], joined=row[4] if row[4:] else 1)
-    for row in (
-        # light subpaths per camera subpath, connections, kappa of t <= 1 over its count, kappa of s = 1, and
-        # light subpaths per lane
-        (0.0, "none", 1.0, 1 / 2),
-        (0.0, "none", 1.0, 1.0),
-        (1 / 2, "none", 1 / 8, 1.0),
-        (1 / 2, "none", 1 / 2, 1.0),
-        (1.0, "none", 1 / 4, 1.0),
-        (1 / 16, "one", 1 / 4, 1.0),
-        (1 / 16, "one", 1 / 4, 1.0, JOINED[-1]),
-        (1 / 4, "one", 1 / 16, 1.0),
-        (1 / 2, "one", 1 / 32, 1.0),
-        (1.0, "one", 1 / 16, 1.0),
-        (1 / 2, "one", 1 / 2, 1.0),
-        (1.0, "one", 1.0, 1.0),
-    )
+CANDIDATES = (
+    Configuration(0.0, "none", 1.0, 1 / 2),
+    Configuration(0.0, "none", 1.0, 1.0),
+    Configuration(1 / 2, "none", 1 / 8, 1.0),
+    Configuration(1 / 2, "none", 1 / 2, 1.0),
+    Configuration(1.0, "none", 1 / 4, 1.0),
+    Configuration(1 / 16, "one", 1 / 4, 1.0),
+    Configuration(1 / 16, "one", 1 / 4, 1.0, joined=JOINED[-1]),
+    Configuration(1 / 4, "one", 1 / 16, 1.0),
+    Configuration(1 / 2, "one", 1 / 32, 1.0),
+    Configuration(1.0, "one", 1 / 16, 1.0),
+    Configuration(1 / 2, "one", 1 / 2, 1.0),
+    Configuration(1.0, "one", 1.0, 1.0),
 )
 
 # Contributions below a share of the image's mean play roulette before their shadow ray is traced: the smaller

@@ -292,8 +292,8 @@ def moments(
     squares = estimate**2 + samples.moment - estimate * _other(estimate)
     for i, candidate in enumerate(_SEVERAL):
         # Connections with different light subpaths are independent.
-        own, count = samples.several[:, i : i + 1], CANDIDATES[candidate].counts["inner"]
-        squares[:, [candidate]] -= (1 - 1 / count) * own * (own - _other(own))
+        own, several = samples.several[:, i : i + 1], CANDIDATES[candidate].counts["inner"]
+        squares[:, [candidate]] -= (1 - 1 / several) * own * (own - _other(own))
     base = summed(squares, "moment")
     hidden, missing = _hidden(samples, splats, inverse, spp)
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)

@@ -121,8 +121,8 @@ class Pilot:
 
     def begin(self) -> Total:
         """Zero totals."""
-        sums = {name: _none(SAMPLE.parts[name]) for name in SUMS}
-        return sums | {"evaluated": mi.UInt32(0)} if self._media else sums
+        evaluated: Total = {"evaluated": mi.UInt32(0)} if self._media else {}
+        return {name: _none(SAMPLE.parts[name]) for name in SUMS} | evaluated
 
     def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
         """Accumulate a contribution with t >= 2."""
