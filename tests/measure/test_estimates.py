@@ -226,7 +226,7 @@ def test_one_and_two_renders():
     assert two.total.low < two.total.value < two.total.high < math.inf
     assert two.total.value == pytest.approx(two.variance.value + two.squared_bias.value)
     assert tables.positive(two.variance, 2).endswith("(too few renders for an interval)")
-    assert tables.signed(two.squared_bias, 2).endswith("(too few renders for an interval)")
+    assert tables.squared(two.squared_bias, 2).endswith("(too few renders for an interval)")
 
 
 @pytest.mark.parametrize("count", [1, 2])

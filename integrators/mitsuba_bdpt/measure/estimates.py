@@ -45,8 +45,7 @@ OWN: dict[Error, Literal["reference_rel_mse", "reference_rel_mse_trimmed"]] = {
 # mostly noise.
 SUBTRACTED = 0.9
 
-# Fewest renders for which a 95 % interval is given: of three the interval of the squared bias can lie below
-# zero, and that of a slope holds it in 86 % of cases. A range of fewer has their number beside it.
+# Fewest renders for which a 95 % interval is given; a range of fewer has their number beside it.
 FEWEST_WITH_INTERVAL = 5
 
 # Fewest renders of a test for a differing mean; below `FEWEST_RUNS` the squared bias must be this share of
@@ -172,8 +171,7 @@ def _variance_without(rows: Sequence[Errors]) -> np.ndarray | None:
 def squared_bias(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate | None:
     """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
 
-    None for a single render; infinite interval for two. Without bias, its expectation is 0 and it may be
-    negative; the interval ends at 0 or above.
+    None for a single render; infinite interval for two. Value and interval may be negative.
     """
     n = len(rows)
     if n < 2 or not _has_variance(rows):
@@ -184,7 +182,7 @@ def squared_bias(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Esti
         return Estimate(value, -math.inf, math.inf)
     without = (total.sum() - total) / (n - 1) - variances
     half = _student(n - 1, confidence) * _jackknife(without)
-    return Estimate(value, value - half, max(value + half, 0.0))
+    return Estimate(value, value - half, value + half)
 
 
 def _jackknife(without: np.ndarray) -> float:

@@ -191,8 +191,7 @@ class Job:
     def spp_per_render(self) -> int:
         """Samples per pixel of a render of the whole image where there is time.
 
-        `PASS_SPP`; for several rounds the power of two at which these have the samples of a render to judge
-        over ``share``, enough if its samples are no better than those of the reference.
+        `PASS_SPP`; for several ``rounds`` the smallest power of two for which they reach the ``share``.
         """
         if self.rounds == 1:
             return PASS_SPP
@@ -220,8 +219,8 @@ class Job:
 def obtained(job: Job) -> Reference:
     """Return the stored reference, or make it if it is missing or of another version of the scene.
 
-    A new one has enough renders for a bias check, with as many samples as the time allows and errors need
-    from which its own is subtracted, and is reported on standard output.
+    A new one has enough renders for a bias check and is reported on standard output. It ends when its own
+    error is a tenth of the renders', or at the time limit.
     """
     check(job)
     if job.is_missing:

@@ -2,8 +2,7 @@
 
 Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
 two halves of its samples (difference.R ...), a sample of its own error, and the provenance as JSON in the
-header, with the data of bias checks. `making` makes them. Beside one may lie that of an earlier version of
-the scene, see `put_aside`.
+header, with the data of bias checks. `making` makes them; `put_aside` keeps those of earlier scenes.
 """
 
 from __future__ import annotations
@@ -116,9 +115,11 @@ def is_outdated(path: Path, scene_sha256: str) -> bool:
 
 
 def put_aside(path: Path) -> Path:
-    """Rename an outdated reference, in place of an earlier one; returns where it is."""
-    earlier = path.with_name(f"{path.stem}_earlier{path.suffix}")
-    os.replace(path, earlier)
+    """Rename an outdated reference after its version of the scene; keeps a better one of that name."""
+    kept = header_of(path)
+    earlier = path.with_name(f"{path.stem}_earlier_{kept['scene_sha256'][:8]}{path.suffix}")
+    if header_of(earlier).get("spp", 0) <= kept.get("spp", 0):
+        os.replace(path, earlier)
     return earlier
 
 

@@ -60,8 +60,8 @@ from .tables import (
     relative,
     replace_part,
     said,
-    signed,
     spanned,
+    squared,
     table,
 )
 
@@ -128,7 +128,7 @@ def _parts(raw: RelativeError) -> tuple[str, str]:
     if raw.variance is None or raw.squared_bias is None:
         why = "one render" if raw.count == 1 else "images are missing, or samples differ"
         return why, why
-    return positive(raw.variance, raw.count), signed(raw.squared_bias, raw.count)
+    return positive(raw.variance, raw.count), squared(raw.squared_bias, raw.count)
 
 
 def _energy(results: Results, scene: str, method: str) -> str:

@@ -218,16 +218,10 @@ def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[
 def lost(table: list[Row], output: Path) -> list[str]:
     """Return messages about stored rows whose render is not among those of the ``table``.
 
-    A row of another version of its scene has one of its own.
+    An edited scene has its own message.
     """
-    file = output / "rows.parquet"
-    if not table or not file.exists():
-        return []
+    before = _before(output) if table else []
     keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
-    try:
-        before = _stored(file)
-    except pyarrow.ArrowInvalid:  # damaged: it is written anew
-        return []
     kept = {tuple(row[key] for key in keys) for row in table}
     versions = {row["scene"]: row["scene_sha256"] for row in table}
     edited = Counter(row["scene"] for row in before if _is_of_another(row, versions))
@@ -246,6 +240,14 @@ def lost(table: list[Row], output: Path) -> list[str]:
         "renders are kept: sweep the earlier preset again to have its rows, and name another folder by -o"
     )
     return [*told, text]
+
+
+def _before(output: Path) -> list[Row]:
+    """Return the stored rows; none if they are missing or damaged, and so written anew."""
+    try:
+        return _stored(output / "rows.parquet")
+    except (FileNotFoundError, pyarrow.ArrowInvalid):
+        return []
 
 
 def _is_of_another(row: Row, versions: Mapping[str, str]) -> bool:
@@ -324,7 +326,7 @@ def named_image(row: Row) -> str:
 def _name_images(table: list[Row], output: Path) -> list[str]:
     """Link the images of the rows under their names; returns these, empty where there is no image.
 
-    Names of other rows are removed.
+    Names of the rows before are removed.
     """
     names: list[str] = []
     for row in table:
@@ -336,9 +338,8 @@ def _name_images(table: list[Row], output: Path) -> list[str]:
                     os.link(stored, temporary)
                 except OSError:  # no links on this file system
                     shutil.copyfile(stored, temporary)
-    for file in (output / "images").glob("*.exr"):
-        if file.name not in names:
-            file.unlink()
+    for name in {named_image(row) for row in _before(output)}.difference(names):
+        (output / "images" / name).unlink(missing_ok=True)
     return names
 
 

@@ -73,11 +73,12 @@ def has_interval(found: Estimate, count: int) -> bool:
     return count >= FEWEST_WITH_INTERVAL and found.high <= WIDE * found.low
 
 
-def signed(found: Estimate, count: int) -> str:
-    """Format an error of ``count`` renders that may be negative (its interval), or why there is none."""
+def squared(found: Estimate, count: int) -> str:
+    """Format a squared bias of ``count`` renders (its interval, from 0 on), or why there is none."""
     if count < FEWEST_WITH_INTERVAL:
         return f"{found.value:.2e} ({_no_interval(count)})"
-    return f"{found.value:.2e} ({found.low:.2e} to {found.high:.2e})"
+    low, high = (f"{end:.2e}" if end > 0 else "0" for end in (found.low, found.high))
+    return f"{found.value:.2e} ({low} to {high})" if high != "0" else f"{found.value:.2e} (0)"
 
 
 def _no_interval(count: int) -> str:
