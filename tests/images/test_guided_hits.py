@@ -314,7 +314,8 @@ def test_a_gain_has_to_pay_in_most_of_a_pilot(guided, groups, chosen):
     sds[:groups] = [9.0, guided]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
     rays |= {"guidable": 0.05}
-    others = dict.fromkeys(("rare", "light", "draw", "hidden"), none) | {"missing": none[0]}
+    others = dict.fromkeys(("rare", "light", "draw"), none) | {"missing": none[0]}
+    others["hidden"] = np.zeros((GROUPS, 3, len(CANDIDATES)))
     ones = np.ones(len(CANDIDATES))
     moments = Moments(base=none + 1, **others, sds=sds, gain=ones, mean=1.0, rays=rays, lanes=4096)
     possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]

@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
-from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
@@ -128,7 +127,7 @@ def made_of(base, rays, light=0.0, hidden=0.0, missing=0.0):
         rare=none,
         light=none + light,
         draw=none,
-        hidden=none + hidden,
+        hidden=np.stack((none + hidden, none, none), axis=1),
         missing=np.zeros(width) + missing,
         sds=np.zeros((len(base), 2)),
         gain=np.ones(width),
@@ -623,23 +622,61 @@ def test_rare_contributions_are_hidden():
     receive it, fewer than `TRIMMED`: its second moment is hidden, and its light, 2.4e-4 of the image, all of
     it in one fine tile, is missing; at 640 it is not hidden."""
     count, rate, size = 4096, 0.01, 100.0
-    even, none = np.ones((count, 1)), np.zeros((count, 1))
+    none = np.zeros((count, len(CANDIDATES)))
     tile = np.repeat(np.arange(moments.FINE**2), count // moments.FINE**2)
-    moment, peak = none.copy(), even.copy()
+    moment, peak = none.copy(), none.copy()
     moment[0], peak[0] = rate * size**2, rate * size**4
-    samples = moments.Samples(even, moment, none[:, :0], none[:, :0], peak, none[:, :0], tile)
-    width = dict.fromkeys(moments.SPLAT.parts, 1) | {"light": 0}
-    splats = moments.Splats(np.zeros((moments.GROUPS, moments.FINE**2, sum(width.values()))), count)
-    with mock.patch.object(moments, "SPLAT", moments.Layout(width)):
-        few, many = (
-            moments._hidden(samples, splats, np.ones((2, moments.FINE**2)), spp) for spp in (64, 640)
-        )
-    square = rate * size**2 + 1  # with the sample's other contribution
-    assert few[0].mean() == pytest.approx(square / count)
-    light = square**1.5 / peak[0, 0] ** 0.5 / count
-    assert few[1] == pytest.approx(64 * light**2 * moments.FINE**2)
+    samples = moments.Samples(none + 1, moment, none[:, :0], none[:, :0], peak, none[:, :1], tile)
+    splats = moments.Splats(np.zeros((moments.GROUPS, moments.FINE**2, moments.SPLAT.width)), count)
+    found = [
+        moments._hidden(samples, moments._second(samples), splats, np.ones((2, moments.FINE**2)), spp)
+        for spp in (64, 640)
+    ]
+    (hidden, missing), many = found
+    square, fourth = 1 + moment[0, 0], 1 + peak[0, 0]  # with the sample's other contribution
+    np.testing.assert_allclose(hidden[:, 0].mean(axis=0), square / count)
+    assert not hidden[:, 1:].any()
+    light = square**1.5 / fourth**0.5 / count
+    np.testing.assert_allclose(missing, 64 * light**2 * moments.FINE**2)
     assert light == pytest.approx(rate * size / count, rel=0.02)
     assert not many[0].any() and not many[1].any()
+
+
+def test_what_is_hidden_is_of_its_kind():
+    """Expected: of a base of 1 and splats of 10, of which 9 are hidden, a typical render has 2; so it has of
+    a base of 10 and no splats where 9 of the base are hidden, less the half that points take off the rest."""
+    one = np.ones((moments.GROUPS, len(CANDIDATES)))
+    found = made_of(one, {}, light=10.0)
+    found.hidden[:, 2] = 9
+    np.testing.assert_allclose(found.typical(), 2)
+    found = replace(made_of(10 * one, {}, hidden=9.0), rare=one / 2)
+    np.testing.assert_allclose(found.typical(), 1)
+
+
+def test_errors_of_light_subpaths():
+    """Rationale: where path tracing alone has a thousand times the error, ratios to it hide which light
+    subpaths have outliers; and its two coefficients of s = 1 are no third one with the least of both errors.
+    Expected: by hand."""
+    light, costs = np.array([False, True, True]), np.ones(3)
+    found = choice._errors(np.array([[1000.0, 50.0, 0.55], [1.0, 0.5, 0.55]]), costs, light)
+    np.testing.assert_allclose(found, [1, 0.55 / 1.1 * 50 / 0.55, 0.55])
+    found = choice._errors(
+        np.array([[2.0, 1.2, 1.0], [0.5, 1.2, 1.0]]), costs, np.array([False, False, True])
+    )
+    np.testing.assert_allclose(found, [1, 2.4, 2])
+
+
+def test_guiding_is_not_credited_with_light_subpaths():
+    """Rationale: light subpaths that lower the mean error alone, by 10 times, are not chosen. Expected: nor
+    are they with guiding that gains nothing."""
+    rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated", "guidable"), 1e-3)
+    base = np.full((moments.GROUPS, len(CANDIDATES)), 2.0)
+    base[:, ALONE.number] = 20
+    alone = np.arange(len(CANDIDATES)) == ALONE.number
+    found = replace(made_of(base, rays, hidden=19.0 * alone), sds=np.full((moments.GROUPS, 2), 0.01))
+    alternatives = Alternatives([ALONE, SPLATS], False, guidable=True)
+    table = choice.choose(found, alternatives)
+    assert table[0].candidate == ALONE and choice.guided_gain(found, alternatives, table) < 1
 
 
 def test_no_group_has_less_than_no_variance():

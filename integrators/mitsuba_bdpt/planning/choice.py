@@ -165,6 +165,7 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
     each = cost(candidate, moments.rays, alternatives.samples)
     others = _by_group(moments, [table[0].candidate, lit.candidate], alternatives.stratified)
     best, variance = np.maximum(others, LEAST_VARIANCE).T
+    best = np.minimum(best, variance * table[0].error / lit.error)  # not what light subpaths do without it
     unguided, guided = moments.sds.T
     # Not the ratio of means: a few vertices may hold all of the variance.
     gains = table[0].cost * (best + unguided) / (each * (variance + guided))
@@ -173,20 +174,35 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first."""
-    candidates, stratified = alternatives.candidates, alternatives.stratified
-    means = np.maximum(_by_group(moments, candidates, stratified).mean(axis=0), LEAST_VARIANCE)
-    typical = moments.typical(stratified)[:, [candidate.number for candidate in candidates]]
-    typical = np.maximum(np.maximum(typical, 0).mean(axis=0), LEAST_VARIANCE)
-    alone = [not c.light_paths and math.isfinite(v) for c, v in zip(candidates, means, strict=True)]
-    errors = np.maximum(
-        *(values / values[alone if any(alone) else slice(None)].min() for values in (means, typical))
-    )
-    table = [
-        Prediction(c, cost(c, moments.rays, alternatives.samples), error, v)
-        for c, v, error in zip(candidates, means.tolist(), errors.tolist(), strict=True)
-        if math.isfinite(v)
-    ]
+    means = _by_group(moments, alternatives.candidates, alternatives.stratified).mean(axis=0)
+    possible = [i for i, mean in enumerate(means) if math.isfinite(mean)]
+    if not possible:
+        return []
+    candidates = [alternatives.candidates[i] for i in possible]
+    typical = moments.typical(alternatives.stratified)[:, [candidate.number for candidate in candidates]]
+    both = np.stack((means[possible], np.maximum(typical, 0).mean(axis=0)))
+    costs = np.array([cost(candidate, moments.rays, alternatives.samples) for candidate in candidates])
+    light = np.array([candidate.light_paths > 0 for candidate in candidates])
+    errors = _errors(np.maximum(both, LEAST_VARIANCE), costs, light)
+    rows = zip(candidates, costs.tolist(), errors.tolist(), both[0].tolist(), strict=True)
+    table = [Prediction(c, each, error, max(v, LEAST_VARIANCE)) for c, each, error, v in rows]
     return sorted(table, key=lambda row: row.score)
+
+
+def _errors(both: np.ndarray, costs: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """The larger error of each candidate, relative to path tracing alone; ``both`` errors, shape (2, n).
+
+    Of candidates with ``light`` subpaths, which are ranked by the ratios to the least errors among them, the
+    best has that error: where path tracing alone has next to no chance, its ratios would not tell them apart.
+    """
+    if light.all() or not light.any():
+        return (both / both.min(axis=1, keepdims=True)).max(axis=0)
+    alone = both[:, ~light][:, [both[:, ~light].prod(axis=0).argmin()]]
+    errors = (both / alone).max(axis=0)
+    ranks = (both[:, light] / both[:, light].min(axis=1, keepdims=True)).max(axis=0)
+    best = (costs[light] * ranks).argmin()
+    errors[light] = ranks * (errors[light][best] / ranks[best])
+    return errors
 
 
 def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:

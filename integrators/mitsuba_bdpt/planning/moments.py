@@ -59,8 +59,8 @@ _SEVERAL = [number for number, candidate in enumerate(CANDIDATES) if candidate.j
 
 # Per camera sample, for each candidate: estimate, and second moments of contributions without t<=1, less
 # their squares; for each candidate with t<=1 the second moments due to t<=1; for each candidate with inner
-# connections the variance of drawing one; sums of the fourth powers, of all classes, of the candidate's
-# contributions; for each of `_SEVERAL` the sum of the inner connections. Then the tile; in scenes with media
+# connections the variance of drawing one; fourth moments of the contributions of all classes, less their
+# fourth powers; for each of `_SEVERAL` the sum of the inner connections. Then the tile; in scenes with media
 # the number of evaluated pairs, else 0.
 SAMPLE = Layout(
     {
@@ -126,8 +126,9 @@ class Moments:
 
     * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, candidates). ``rare``: the part of ``base`` on
       paths too rare for stratification; ``light``: of splats; ``draw``: by drawing one inner connection.
-    * ``hidden``, like ``base``: their part in contributions that fewer than `TRIMMED` of the pixels receive;
-      ``missing`` by candidate: the squared error of a render without them, per sample.
+    * ``hidden``, shape (`GROUPS`, 3, candidates): parts of ``base``, ``rare`` and ``light`` in contributions
+      that fewer than `TRIMMED` of the pixels receive; ``missing`` by candidate: the squared error of a render
+      without them, per sample.
     * ``gain`` by candidate: the factor that the points of a net leave of ``base`` - ``rare``.
     * ``sds``, shape (`GROUPS`, 2): variance of SDS paths on which s = 0 can be guided, excluded from all
       others: unguided and guided (no columns: not measured).
@@ -161,10 +162,9 @@ class Moments:
 
     def typical(self, stratified: bool = False) -> np.ndarray:
         """Like `variance`, of a typical render: trimmed, in which rare contributions are missing."""
-        gain = self._left_by_points() if stratified else 1.0
-        rare = np.maximum(self.rare - self.hidden, 0)
-        base = np.maximum(self.base - self.hidden, 0)
-        return rare + gain * np.maximum(base - rare, 0) + self.draw + self.light + self.missing
+        base, rare, light = self.hidden.swapaxes(0, 1)
+        shown = replace(self, base=self.base - base, rare=self.rare - rare, light=self.light - light)
+        return shown.variance(stratified) + self.missing
 
     def _left_by_points(self) -> float:
         """Stratification gain of the points of a pixel.
@@ -187,8 +187,8 @@ class Samples:
 
     ``estimate`` by candidate; sums of second moments (``moment`` without t <= 1, less the squares that are in
     the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; ``peak``: fourth
-    powers; ``several``: inner connections of `_SEVERAL`; fine ``tile``. Each
-    `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
+    moments, less the powers in the estimate; ``several``: inner connections of `_SEVERAL`; fine ``tile``.
+    Each `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
     """
 
     estimate: np.ndarray
@@ -289,13 +289,13 @@ def moments(
     if sds is not None:
         of_sds = np.matmul(of_group, sds.sums[:, :, 1:])[:, 0] * (GROUPS / sds.lanes)
     estimate = samples.estimate
-    squares = estimate**2 + samples.moment - estimate * _other(estimate)
+    squares = _second(samples) - estimate * _other(estimate)
     for i, candidate in enumerate(_SEVERAL):
-        # Connections with different light subpaths are independent.
+        # As if all of their variance were that of the light subpaths.
         own, several = samples.several[:, i : i + 1], CANDIDATES[candidate].counts["inner"]
-        squares[:, [candidate]] -= (1 - 1 / several) * own * (own - _other(own))
+        squares[:, [candidate]] += (1 - 1 / several) * own * _other(own)
     base = summed(squares, "moment")
-    hidden, missing = _hidden(samples, splats, inverse, spp)
+    hidden, missing = _hidden(samples, squares, splats, inverse, spp)
     by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
         base=np.where(base < RULED_OUT, base, np.inf),
@@ -313,40 +313,59 @@ def moments(
     )
 
 
+def _second(samples: Samples, power: int = 2) -> np.ndarray:
+    """Second moments of camera samples without t <= 1, or fourth ones with ``power`` = 4.
+
+    Connections of `_SEVERAL` with different light subpaths are independent.
+    """
+    found = samples.estimate**power + (samples.moment if power == 2 else samples.peak)
+    for i, candidate in enumerate(_SEVERAL):
+        several = CANDIDATES[candidate].counts["inner"]
+        found[:, candidate] -= (1 - several ** (1 - power)) * samples.several[:, i] ** power
+    return found
+
+
 def _hidden(
-    samples: Samples, splats: Splats, inverse: np.ndarray, spp: float
+    samples: Samples, squares: np.ndarray, splats: Splats, inverse: np.ndarray, spp: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`Moments.hidden` and `Moments.missing`.
+    """`Moments.hidden` and `Moments.missing`; ``squares`` of the camera samples as in ``base``.
 
     Camera samples and cells of splats count as contributions of one size each: of second moment m and fourth
     p they have the squared size p / m and the rate m^2 / p. Those of the largest squared error, up to a rate
-    of `TRIMMED` per pixel, are hidden.
+    of `TRIMMED` per pixel, are hidden. Their light is taken to lie in the fine tiles that the pilot met.
     """
     count, width = samples.estimate.shape
     groups = group(np.arange(count))
     of_sample = inverse[groups % 2, samples.tile][:, None]
-    of_cell = np.repeat(inverse[np.arange(GROUPS) % 2].reshape(-1, 1), width, axis=1)
+    of_cell = inverse[np.arange(GROUPS) % 2].reshape(-1, 1)
     cells = splats.sums.reshape(GROUPS * FINE**2, -1)
-    seconds = (
-        (samples.estimate**2 + samples.moment + _padded(samples.light, width)) * of_sample / count,
-        (SPLAT.of(cells, "moment") + _padded(SPLAT.of(cells, "light"), width)) * of_cell / splats.lanes,
+    of_splats = {name: SPLAT.of(cells, name) * of_cell / splats.lanes for name in ("moment", "rare")}
+    of_splats["light"] = _padded(SPLAT.of(cells, "light"), width) * of_cell / splats.lanes
+    light = _padded(samples.light, width) * of_sample / count
+    second = np.concatenate(
+        (_second(samples) * of_sample / count + light, of_splats["moment"] + of_splats["light"])
     )
-    fourths = (
-        samples.peak * of_sample**2 / count,
-        SPLAT.of(cells, "peak") * of_cell**2 / splats.lanes,
+    fourth = np.concatenate(
+        (_second(samples, 4) * of_sample**2 / count, SPLAT.of(cells, "peak") * of_cell**2 / splats.lanes)
     )
-    second, fourth = np.concatenate(seconds), np.concatenate(fourths)
+    parts = (
+        np.concatenate((squares * of_sample / count, of_splats["moment"])),
+        np.concatenate((np.zeros_like(light), of_splats["rare"])),
+        np.concatenate((light, of_splats["light"])),
+    )
     tile = np.concatenate((samples.tile, np.tile(np.arange(FINE**2), GROUPS)))
-    part = np.concatenate((groups, np.repeat(np.arange(GROUPS), FINE**2)))
-    hidden, missing = np.zeros((GROUPS, width)), np.zeros(width)
+    of_group = np.concatenate((groups, np.repeat(np.arange(GROUPS), FINE**2)))
+    hidden, missing = np.zeros((GROUPS, len(parts), width)), np.zeros(width)
     for c in range(width):
-        real = (second[:, c] > 0) & (fourth[:, c] > 0) & np.isfinite(fourth[:, c])
+        real = np.flatnonzero((second[:, c] > 0) & (fourth[:, c] > 0) & np.isfinite(fourth[:, c]))
         m, p = second[real, c], fourth[real, c]
-        order = np.argsort(-p / m)
+        order = np.argsort(-p / m, kind="stable")
         rare = order[np.cumsum((m**2 / p)[order]) * spp < TRIMMED]
-        hidden[:, c] = np.bincount(part[real][rare], m[rare], GROUPS) * GROUPS
-        light = np.bincount(tile[real][rare], m[rare] * np.sqrt(m[rare] / p[rare]), FINE**2) * FINE**2
-        missing[c] = spp * np.mean(light**2)
+        where = real[rare]
+        for i, part in enumerate(parts):
+            hidden[:, i, c] = np.bincount(of_group[where], part[where, c], GROUPS) * GROUPS
+        missed = np.bincount(tile[where], m[rare] * np.sqrt(m[rare] / p[rare]), FINE**2) * FINE**2
+        missing[c] = spp * np.mean(missed**2)
     return hidden, missing
 
 

@@ -246,13 +246,15 @@ class Pilot:
             scale = size / (total * seldom)
             square = dr.square(scale) * seldom
             moment = dr.select(possible, square * _dot(second, shares | {"light": 0}), lost)
+            peak = dr.select(possible, square * dr.square(scale) * _dot(fourth, shares), 0)
             if weight := weights[c.kind]:
                 estimate = scale if weight == 1 else weight * scale
                 own.append(estimate)
                 if c.kind != "light":
                     moment -= dr.square(estimate) / counts[c.kind]
+                    peak -= dr.square(dr.square(estimate)) / counts[c.kind] ** 3
             squares.append(moment)
-            peaks.append(dr.select(possible, square * dr.square(scale) * _dot(fourth, shares), 0))
+            peaks.append(peak)
             if light := second["light"]:
                 lights.append(dr.select(possible, square * (light * shares["light"]), 0))
         return own, {"moment": squares, "light": lights, "peak": peaks}
@@ -336,7 +338,7 @@ def measure(
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
-    found = pilot.moments(counted, stands_for * batch.size / pixels, found)
+    found = pilot.moments(counted, max(stands_for * batch.size / pixels, 1), found)
     if everything.guidable and not guiding:
         found = replace(found, sds=found.sds[:, :0])
     return found
