@@ -692,19 +692,6 @@ def test_no_group_has_less_than_no_variance():
     assert table[1].variance == pytest.approx(2 * 15 / 16)
 
 
-def test_explained_tables_say_why(monkeypatch):
-    """Expected: in the text of `explain` the first candidate of the table is the chosen one, and those that
-    take less time have their reason beside them; there are some where light subpaths have to gain 1000."""
-    monkeypatch.setattr(choice, "REQUIRED_GAIN", 1000.0)
-    target = mi.load_file(str(SCENES / "veach_bidir.xml"), resolution=64, parallel=False, optimize=False)
-    text = bdpt(max_depth=7).explain(target, spp=64)
-    rows = re.findall(
-        r"^ +([\d.]+) +[\d.]+ +[\d.e-]+  light_paths=[^;\n]*(; not chosen: \S+)?", text, re.MULTILINE
-    )
-    assert rows[0] == ("1.00", "") and "light_paths=1, " in text and "1/1," not in text
-    assert any(why for _, why in rows) and all(why for ratio, why in rows if float(ratio) < 1)
-
-
 def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
     """Rationale: paths that path tracing alone makes once in a billion samples have a huge second moment and
     are in no render. Expected: in `window_room`, where the sun shines on gloss, path tracing alone is

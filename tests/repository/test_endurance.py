@@ -168,18 +168,6 @@ def test_a_scene_that_fails_is_left_out_until_the_source_is_mended(tmp_path, mon
     assert failures(run(path, "--samples", 1000)[0]) == [9, 9]
 
 
-def test_what_pilots_lose_is_judged():
-    """Expected: values of pilots that are not finite are in the record, in words and in what the exit status
-    follows; a record of an older version, which has no such count, is read as one without any."""
-    older = {key: value for key, value in endurance.empty().items() if "pilot" not in key}
-    assert endurance.is_clean({"scenes": {"a": older}})
-    assert "0 values of pilots" in endurance.text({"scenes": {"a": older}})
-    found = endurance.added(older, endurance.empty() | {"non_finite_in_pilot": 3})
-    record = {"scenes": {"a": found}}
-    assert found["non_finite_in_pilot"] == 3 and not endurance.is_clean(record)
-    assert "3 values of pilots" in endurance.text(record)
-
-
 @pytest.mark.parametrize("name", ["no_such_scene"])
 def test_unknown_scenes_are_refused(name, capsys):
     with pytest.raises(SystemExit):

@@ -136,16 +136,6 @@ def test_replays_add_up_to_what_was_rendered(scale):
         assert sum(path.value for path in paths) == pytest.approx(outlier.value, rel=1e-4)
 
 
-def test_a_timed_sky_elsewhere_does_no_harm():
-    """Rationale: calls visit every living emitter, and `timed_sunsky` cannot be called while a kernel is
-    recorded: while a scene with one lived, replays failed ("jit_var_schedule(): not permitted"). Expected:
-    samples are found again as without it."""
-    other = mi.load_dict({"type": "scene", "sky": {"type": "timed_sunsky"}})
-    found = worst(between_mirrors(), 4, 2, 0.3)
-    assert len(found) == 2 and len(other.emitters()) == 1
-    assert all(firefly.doubt == "" and firefly.path.weight == 1 for firefly in found)
-
-
 def test_what_cannot_be_recorded_is_refused():
     """Expected: a film whose bands are not three colours, and a launch whose lanes single precision cannot
     number, are refused in words."""

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1539,  # top files
 }
-OUTSIDE = {"scripts": 6205, "tests": 45580}
+OUTSIDE = {"scripts": 6203, "tests": 45582}
 MOST_WORDS = 70636
 
 

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from ..errors import CommandError, behind
 from ..files.loading import load
-from ..planning.budget import is_by_hand
+from ..planning.budget import fixed_by
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
@@ -140,7 +140,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     The absolute path of the scene file, the options of `loading.load`, and the pilot's decisions.
     """
     properties, settings = dict(options.properties), integrator.settings
-    if not is_by_hand(settings):  # an empty list if no pilot runs: parts, which are shorter, run none either
+    if not fixed_by(settings):  # an empty list if no pilot runs: parts, which are shorter, run none either
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")

@@ -84,7 +84,7 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
 
     ``joined``: light subpaths per lane, where they are few.
     """
-    if not full.light or not _is_auto(settings):
+    if not full.light or not settings.skip == settings.light_paths == settings.connections == "auto":
         return full
     if pixels < FEW_PIXELS:
         return replace(full, camera_paths_per_light_path=1)
@@ -97,12 +97,7 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
 
 def is_open(full: Plan, settings: Settings) -> bool:
     """Whether light subpaths are possible and no parameter fixes the strategies."""
-    return full.light and not is_by_hand(settings)
-
-
-def is_by_hand(settings: Settings) -> bool:
-    """Whether parameters fix the strategies."""
-    return bool(fixed_by(settings))
+    return full.light and not fixed_by(settings)
 
 
 def fixed_by(settings: Settings) -> list[str]:
@@ -112,7 +107,3 @@ def fixed_by(settings: Settings) -> list[str]:
     fixed = [f"{name}={text}" for name, text in texts.items() if text != "auto"]
     fixed += ["decisions"] * (settings.decisions is not None)
     return fixed + ["layers=strategies"] * settings.strategy_images
-
-
-def _is_auto(settings: Settings) -> bool:
-    return settings.skip == settings.light_paths == settings.connections == "auto"

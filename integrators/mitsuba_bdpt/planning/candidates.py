@@ -8,7 +8,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
 from .budget import CHEAP_SAMPLES, EVEN
-from .configuration import CANDIDATES, Configuration, Decision
+from .configuration import CANDIDATES, Configuration, Decision, not_worth
 from .possible import UnsampledPaths, unsampled_paths
 
 # kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
@@ -19,13 +19,8 @@ UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 0.7, 2, 1 << 20
 # gain there pays for it.
 UNIFORM_TIMES = 10
 
-# As in ``statistics["skipped"]``.
 LEFT_OUT = [
-    {
-        "class": name,
-        "level": "not worth its cost here",
-        "why": "all light comes from a uniform environment, and the render is too short for a pilot",
-    }
+    not_worth(name, "all light comes from a uniform environment, and the render is too short for a pilot")
     for name in ("t<=1", "inner")
 ]
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..transport.plan import GUIDED, EmissionTables
-from .configuration import Configuration, Decision
+from .configuration import Configuration, Decision, not_worth
 from .moments import GROUPS, Moments
 
 # Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
@@ -254,7 +254,7 @@ def left_out(
             f"guiding gains {guided:.2f}x or more in three quarters of the pilot's parts, outliers "
             f"included, and has to gain {least:g}x"
         )
-        skipped.append({"class": name, "level": "not worth its cost here", "why": why})
+        skipped.append(not_worth(name, why))
     without: dict[str, Callable[[Configuration], bool]] = {
         "t<=1": lambda c: not c.light_paths,
         "inner": lambda c: c.connections == "none",
@@ -266,5 +266,5 @@ def left_out(
             ratio = best.time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
             why = why_not(best, table[0]) or why
-            skipped.append({"class": name, "level": "not worth its cost here", "why": why})
+            skipped.append(not_worth(name, why))
     return skipped

@@ -101,6 +101,12 @@ CANDIDATES = (
     Configuration(1.0, "one", 1.0, 1.0),
 )
 
+
+def not_worth(name: str, why: str) -> dict[str, str]:
+    """Entry of ``statistics["skipped"]`` of a class of strategies that does not pay."""
+    return {"class": name, "level": "not worth its cost here", "why": why}
+
+
 # Contributions below a share of the image's mean play roulette before their shadow ray is traced: the smaller
 # of this share and this multiple of a sample's relative variance. It bounds the variance that roulette adds.
 MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2

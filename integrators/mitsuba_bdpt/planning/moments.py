@@ -338,21 +338,16 @@ def _hidden(
     groups = group(np.arange(count))
     of_sample = inverse[groups % 2, samples.tile][:, None]
     of_cell = inverse[np.arange(GROUPS) % 2].reshape(-1, 1)
-    cells = splats.sums.reshape(GROUPS * FINE**2, -1)
-    of_splats = {name: SPLAT.of(cells, name) * of_cell / splats.lanes for name in ("moment", "rare")}
-    of_splats["light"] = _padded(SPLAT.of(cells, "light"), width) * of_cell / splats.lanes
-    light = _padded(samples.light, width) * of_sample / count
-    second = np.concatenate(
-        (_second(samples) * of_sample / count + light, of_splats["moment"] + of_splats["light"])
-    )
-    fourth = np.concatenate(
-        (_second(samples, 4) * of_sample**2 / count, SPLAT.of(cells, "peak") * of_cell**2 / splats.lanes)
-    )
-    parts = (
-        np.concatenate((squares * of_sample / count, of_splats["moment"])),
-        np.concatenate((np.zeros_like(light), of_splats["rare"])),
-        np.concatenate((light, of_splats["light"])),
-    )
+
+    def contributions(values: np.ndarray, part: str, power: int = 1) -> np.ndarray:
+        cells = _padded(SPLAT.of(splats.sums, part).reshape(len(of_cell), -1), width)
+        values = _padded(values, width) * of_sample**power / count
+        return np.concatenate((values, cells * of_cell**power / splats.lanes))
+
+    light = contributions(samples.light, "light")
+    second = contributions(_second(samples), "moment") + light
+    fourth = contributions(_second(samples, 4), "peak", 2)
+    parts = contributions(squares, "moment"), contributions(np.zeros_like(squares), "rare"), light
     tile = np.concatenate((samples.tile, np.tile(np.arange(FINE**2), GROUPS)))
     of_group = np.concatenate((groups, np.repeat(np.arange(GROUPS), FINE**2)))
     hidden, missing = np.zeros((GROUPS, len(parts), width)), np.zeros(width)

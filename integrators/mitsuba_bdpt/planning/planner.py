@@ -19,7 +19,7 @@ from ..settings import Settings
 from ..transport.plan import JOINED, EmissionTables, Plan
 from . import budget, choice, pilot
 from .candidates import LEFT_OUT, candidates, without_pilot
-from .configuration import Decision, replayed
+from .configuration import Decision, not_worth, replayed
 from .explain import words
 from .findings import Findings
 from .moments import Moments
@@ -35,12 +35,8 @@ if TYPE_CHECKING:
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
-UNMEASURED = (
-    {
-        "class": "guided s=0",
-        "level": "not worth its cost here",
-        "why": "with so many BSDFs the render is too short for the kernels that would predict its gain",
-    },
+UNMEASURED = not_worth(
+    "guided s=0", "with so many BSDFs the render is too short for the kernels that would predict its gain"
 )
 
 # Why a pilot decides nothing. Directly seen emission is the same for all candidates.
@@ -147,7 +143,7 @@ class Planner:
             unguided = table[0].candidate.emission is None
             left_out = (
                 *choice.left_out(table, gain, alternatives.guide_gain, name),
-                *UNMEASURED * (self.full.guidable and not moments.sds.size),
+                *[UNMEASURED] * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
         return _Result(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.requested)
@@ -159,7 +155,7 @@ class Planner:
         self._with_tables = None
         if not moments.emission.size:
             return table, None
-        learnt = self._fitted_emission(moments, samples)
+        learnt = self._fitted_emission(moments)
         lit = min((row.score for row in table if row.candidate.light_paths), default=math.inf)
         is_lit = table[0].candidate.light_paths > 0
         if learnt.tables is None or (not is_lit and lit * learnt.whole > table[0].score):
@@ -187,38 +183,21 @@ class Planner:
     def _why_not_joined(self) -> str:
         return why_not_joined(self._prepared, self.full.merging)
 
-    def _fitted_emission(self, moments: Moments, samples: int) -> Learnt:
-        """Fit tables of emission, cached (20 ms under a sky)."""
+    def _fitted_emission(self, moments: Moments) -> Learnt:
+        """Fit tables of emission."""
         counts, component = self._prepared.emitters.tables, components.guided_emission
-
-        def learn() -> Learnt:
-            return component.learn(moments.emission, component.side_of(sum(counts)), counts)
-
-        return self._findings.find("emission", (self._settings, self.pilot_seed, samples), learn)[0]
+        return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
     def _measured(self, samples: int, tables: EmissionTables | None = None) -> Moments:
-        """Moments of a pilot (`pilot.measure`) for ``samples`` samples with these tables.
-
-        Cached for later renders until an edit.
-        """
-        count, pilots = budget.lanes(samples), self.decided.pilots
-        pilots = pilots._replace(requested=pilots.requested + 1)
-        self.decided = replace(self.decided, pilots=pilots)
-        stands_for = samples / count
+        """Moments of a pilot (`pilot.measure`) for ``samples`` samples with these tables."""
+        count, number = budget.lanes(samples), self.decided.pilots.requested + 1
+        self.decided = replace(self.decided, pilots=Pilots(number))
         plan = replace(self.full, emission=tables)
         guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
-
-        def trace() -> Moments:
-            seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + pilots.requested)
-            flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
-            with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
-                return pilot.measure(self._prepared, plan, self._settings, seed, count, stands_for, guiding)
-
-        key = self._settings, self.pilot_seed, pilots.requested, count, stands_for, tables, guiding
-        found, is_known = self._findings.find("pilots", key, trace)
-        pilots = pilots._replace(cached=pilots.cached + is_known)
-        self.decided = replace(self.decided, pilots=pilots)
-        return found
+        seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + number)
+        flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
+        with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
+            return pilot.measure(self._prepared, plan, self._settings, seed, count, samples / count, guiding)
 
     def replay(self, passes: tuple[int, ...]):
         """Adopt the decision that the parameters give for the next pass, if any."""
