@@ -1047,9 +1047,8 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
 
 def test_the_table_is_tidy(tmp_path):
     """Rationale: 48 columns, five of them JSON, and images named by a hash. Expected: a row per render whose
-    cells are texts or numbers, with the name of its image, which is there under that name, names of rows
-    before are not, other files stay; parameters, decisions and statistics in a file; all columns in Parquet.
-    """
+    cells are texts or numbers, with the name of its image, which is there under that name, as are other files
+    but those of rows before; parameters, decisions and statistics in a file; all columns in Parquet."""
     row = {
         "scene": "box",
         "method": "path multijitter",
