@@ -2,7 +2,7 @@
 
 ``import mitsuba_bdpt`` selects the LLVM library that Dr.Jit loads (see `llvm`) and registers the plugin
 ``bdpt`` for the current variant and all later ones. Import it before ``mitsuba`` and ``drjit``, which load
-LLVM when first imported. On one core Dr.Jit gets two threads: Mitsuba reads no EXR with one.
+LLVM when first imported. With one thread Mitsuba's EXR reader deadlocks; Dr.Jit gets at least two.
 """
 
 import sys as _sys

@@ -18,8 +18,13 @@ os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 import mitsuba_bdpt
 import drjit as dr, mitsuba as mi, numpy as np
 from mitsuba_bdpt.cli.arguments import main
+from mitsuba_bdpt.host.jit import two_threads
 if sys.argv[1] == "own":
     dr.set_thread_count(1)
+    first, second = two_threads(), two_threads()
+    first.__enter__(), second.__enter__(), first.__exit__(None, None, None)
+    assert dr.thread_count() == 2
+    second.__exit__(None, None, None)
 else:
     mi.set_variant("llvm_ad_rgb")
     mi.Bitmap(np.ones((4, 8, 3), np.float32)).write("sky.exr")
@@ -34,7 +39,7 @@ print(dr.thread_count(), status)
 def test_images_are_read_and_written_on_one_processor(tmp_path):
     """Rationale: Mitsuba's EXR reader and writer wait for another thread than the caller's. Expected: images
     of the user, maps of a scene, renders and mixes are read and written on one processor, also if the user
-    sets one thread, which stays. A process that hangs, ignoring signals, is killed after ten minutes.
+    sets one thread, restored after the last caller. A process that hangs is killed after ten minutes.
     """
     (tmp_path / "scene.xml").write_text(SCENE)
     for threads, count in (("default", 2), ("own", 1)):

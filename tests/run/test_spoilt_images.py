@@ -5,6 +5,8 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_bdpt.scene import diagnostics
+from support import variants
 
 from stress_cases.warned import Warned
 
@@ -48,10 +50,12 @@ SPOILT = {
     "negative": ({"a": {"type": "point", "intensity": -1.0}}, {}, "emitter 'a' has negative radiance"),
     "negative red": ({"a": {"type": "sphere", "lamp": red(-1)}}, {}, "emitter 'a' has negative radiance"),
     "max_depth": (SKY, {"max_depth": 0}, "max_depth=0 leaves no path"),
-    "hidden": (SKY, {"max_depth": 1, "hide_emitters": True}, "max_depth=1 leaves visible emitters alone"),
+    "hidden": (SKY, {"max_depth": 1, "hide_emitters": True}, "max_depth=1 renders only directly"),
     "NaN": (sky_and(type="sphere", center=[math.nan, 0, 0]), {}, "shape 'thing' has NaN or infinity"),
     "point": (sky_and(type="cube", to_world=T().scale(0)), {}, "shape 'thing' is a point or a line"),
     "line": (sky_and(type="disk", to_world=T().scale([0, 1, 1])), {}, "shape 'thing' is a point or a line"),
+    "narrow": (SKY | {"a": {"type": "spot", "cutoff_angle": 0.1}}, {}, "spot 'a' has cutoff_angle=0.1"),
+    "overlap": ({name: {"type": "rectangle", "lamp": red(1)} for name in "ab"}, {}, "overlap in one plane"),
     "flat": (sky_and(type="cylinder", to_world=T().scale([0, 1, 1])), {}, "'thing' is a point or a line"),
 }
 
@@ -64,6 +68,21 @@ def test_what_spoils_an_image_is_said(name):
     _, texts, explained = rendered(parts, **parameters)
     assert [words in text for text in texts] == [True]
     assert texts[0].strip() == explained[0]
+
+
+@pytest.mark.parametrize("colour", ["rgb", "spectral"])
+def test_black_skies(colour):
+    """Expected: a warning in each variant, though spectral ones store coefficients of spectra."""
+    mi.set_variant(variants.of(colour))
+    sky = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((4, 8, 3), np.float32))}
+    assert "no emitter of the scene emits light" in rendered({"sky": sky})[1][0]
+
+
+def test_lamps_are_compared_once(monkeypatch):
+    """Expected: once for two renders and `explain`."""
+    seen = []
+    monkeypatch.setattr(diagnostics, "overlapping_lamps", lambda scene: seen.append(scene) or [])
+    assert rendered(SKY)[1] == [] and len(seen) == 1
 
 
 SOUND = {
@@ -93,9 +112,8 @@ def test_panes_thinner_than_the_ray_offset(x, share):
     thickness = share * 32 * 2**-24 * (x + 1) * (1 if x else 4)
     image, texts, _ = rendered(pane(x, thickness), x=x)
     assert (image.mean() > 0.4) == (share < 1)
-    assert [text.startswith("shape 'thing' lets light through and is thinner") for text in texts] == [
-        True
-    ] * (share < 1)
+    thin = [text.startswith("shape 'thing' lets light through and is thinner") for text in texts]
+    assert thin == [True] * (share < 1)
 
 
 def test_panes_that_are_turned_or_merged():
@@ -106,16 +124,29 @@ def test_panes_that_are_turned_or_merged():
         name: pane(x, thickness, {"type": "ref", "id": "glass"})["thing"]
         for name, x in (("a", 4096), ("b", 4099))
     }
-    assert "thinner than the ray offset" in rendered({"glass": GLASS} | SKY | panes, x=4096)[1][0]
+    assert "thinner than single precision" in rendered({"glass": GLASS} | SKY | panes, x=4096)[1][0]
 
 
-def test_a_flat_mesh_that_is_rounded_is_not_thin():
-    """Expected: no warning of a floor of glass, far from the origin, whose points are off by an ulp."""
-    mesh = mi.Mesh("floor", 4, 2)
+def ball(n=32, radius=0.01):
+    """Vertices and faces of a ball 1 km from the origin, its edges shorter than the ray offset of 2 mm."""
+    i, j = (index.ravel() for index in np.indices((n, n)))
+    height, turn = np.pi * i / (n - 1), 2 * np.pi * j / n
+    points = [np.sin(height) * np.cos(turn), np.sin(height) * np.sin(turn), np.cos(height)]
+    lower, next_one = np.minimum(i + 1, n - 1) * n, (j + 1) % n
+    faces = [i * n + j, lower + j, i * n + next_one, i * n + next_one, lower + j, lower + next_one]
+    return radius * np.transpose(points) + [1000, 0, 0], np.transpose(faces).reshape(-1, 3)
+
+
+FLOOR = [[0, 0, 1000], [1, 0, 1000.0001], [0, 1, 1000], [1, 1, 1000.0001]], [[0, 1, 2], [2, 1, 3]]
+
+
+@pytest.mark.parametrize(("corners", "faces"), [FLOOR, ball()], ids=["floor", "ball"])
+def test_meshes_that_are_not_thin(corners, faces):
+    """Expected: no warning of a floor of glass, far from the origin, whose points are off by an ulp, nor of a
+    finely tessellated ball that is ten ray offsets thick."""
+    mesh = mi.Mesh("mesh", len(corners), np.size(faces) // 3)
     params = mi.traverse(mesh)
-    corners = np.array([[0, 0, 1000], [1, 0, 1000.0001], [0, 1, 1000], [1, 1, 1000.0001]], dtype=np.float32)
-    params["vertex_positions"], params["faces"] = corners.ravel(), [0, 1, 2, 2, 1, 3]
+    params["vertex_positions"], params["faces"] = np.float32(corners).ravel(), np.ravel(faces)
     params.update()
-    assert 0 < np.ptp(corners[:, 2]) < 1e-3
     mesh.set_bsdf(mi.load_dict(GLASS))
-    assert rendered(SKY | {"floor": mesh})[1] == []
+    assert rendered(SKY | {"mesh": mesh})[1] == []

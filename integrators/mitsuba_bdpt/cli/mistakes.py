@@ -50,7 +50,6 @@ STATUSES = (
 
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
-
 OF_PLUGIN = re.compile(
     r"\[(?!\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct|Stream|Pool|Thread|Parser)\])"
     r"[A-Z]\w*(\[\w+\])?\] (?!.*Traceback)",
@@ -89,7 +88,6 @@ REMEDIES = {
     errno.EDQUOT: "free some space and run the command again",
 }
 """What to do about errors of the system."""
-
 
 PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, errno.ELOOP)
 """Errors of the system about a path that the user gave."""

@@ -13,7 +13,7 @@ from .group import Context, HitOnlyEmitters
 _FACTORS = ("radiance", "intensity", "irradiance", "texture")
 
 # Classes of textures whose `mean` is 0 where they are black.
-_KNOWN = ("SRGBReflectanceSpectrum", "UniformSpectrum", "BitmapTexture")
+_KNOWN = ("SRGBReflectanceSpectrum", "UniformSpectrum", "BitmapTexture", "BlackBodySpectrum")
 
 # Values that are read of a picture.
 _QUICKLY_READ = 1 << 16
@@ -76,7 +76,9 @@ def _data(texture: mi.Texture):
 
 
 def _any_lit(data) -> bool:
-    values = None if mi.is_spectral else _values(data)
+    values = _values(data)
+    if mi.is_spectral and values is not None:
+        values = values[3::4]  # of a spectral envmap: the scale of three coefficients
     return values is None or bool(values[:: len(values) // _QUICKLY_READ + 1].any()) or bool(values.any())
 
 

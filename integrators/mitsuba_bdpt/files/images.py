@@ -20,7 +20,6 @@ from .whole import MAGIC, check_format, check_writable, replacing, utf8
 PNG_SIDE = 1_000_000
 """Pixels in a row or column of a PNG, at most: libpng's limit."""
 
-
 MOST_CHANNELS = 1023
 """Of an image file, the weight of a pixel among them: Mitsuba's bitmaps have 4095 bytes for a pixel."""
 
@@ -76,19 +75,22 @@ def _header(path: Path) -> dict[str, Any]:
 
 def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
     """Write the film as an EXR with header `attributes`, and as a PNG beside it."""
+    _write_exr(output, _channels(film), dict(attributes))
+    write_png(film, film.bitmap(), output.with_suffix(".png"), exposure)
+
+
+def _channels(film: mi.Film) -> dict[str, np.ndarray]:
     bitmap = film.bitmap()
     component = re.search(r"component_format = (float16|float32|uint32)", str(film))
     dtype = np.dtype(component[1] if component else np.float32)
     pixels = np.array(bitmap).reshape(bitmap.height(), bitmap.width(), -1)
     names = [channel.name for channel in bitmap.struct_()]
     planes = zip(names, np.moveaxis(pixels, -1, 0), strict=True)
-    channels = {_file_name(name, names): _stored(plane, name, dtype) for name, plane in planes}
-    _write_exr(output, channels, dict(attributes))
-    write_png(film, bitmap, output.with_suffix(".png"), exposure)
+    return {_file_name(name, names): _stored(plane, name, dtype) for name, plane in planes}
 
 
 def _file_name(name: str, names: list[str]) -> str:
-    """Return the name of a channel in a file: depth named ``Z`` has that name, for compositors."""
+    """Name of a channel in a file: the depth feature `Z` is stored as channel `Z`."""
     feature, _, part = name.rpartition(".")
     is_depth = part == "T" and feature.rpartition(".")[2] == "Z"
     return feature if is_depth and feature not in names else name
@@ -103,13 +105,16 @@ def _stored(pixels: np.ndarray, name: str, dtype: np.dtype) -> np.ndarray:
 def _write_exr(path: Path, channels: Mapping[str, np.ndarray], header: dict[str, Any]) -> None:
     """Write an EXR of channels (height, width), by `replacing`, and check that all of it was written."""
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | header
-    with replacing(path) as temporary, OpenEXR.File(header, dict(channels)) as file:
+    with replacing(path) as temporary:
         temporary.touch()  # OpenEXR does not report the cause
-        file.write(utf8(temporary))
+        name = utf8(temporary)
         try:
-            _read_exr(temporary)
-        except CommandError as error:  # OpenEXR does not report a full disk
-            why = "could not be written whole; is the disk full?"
+            with OpenEXR.File(header, dict(channels)) as file:
+                file.write(name)
+            del channels, file
+            _read_exr(temporary)  # OpenEXR does not report every full disk
+        except (CommandError, RuntimeError) as error:
+            why = f"could not be written whole ({error.__cause__ or error}); is the disk full?"
             raise OSError(errno.ENOSPC, why, str(path)) from error
 
 

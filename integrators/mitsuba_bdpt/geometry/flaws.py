@@ -17,6 +17,9 @@ from .rounding import offset_at
 # Most triangles of a mesh that are inspected; share of rims above which it is one of panes (2/3 in a box).
 _INSPECTED, _RIMS = 1 << 16, 0.25
 
+# Largest ratio of the edges of a rim's triangle, the shortest over the next.
+_SLENDER = 1 / 16
+
 _FLAT = (mi.ShapeType.Rectangle.value, mi.ShapeType.Disk.value)
 
 
@@ -32,9 +35,9 @@ class Flaw(Enum):
         "is not 0"
     )
     THIN = (
-        "lets light through and is thinner than the ray offset at its place; a ray that has passed one face "
-        "does not meet the other, as if there were none; move the scene to the origin, make the shape "
-        "thicker, or replace it by a single surface (thindielectric)"
+        "lets light through and is thinner than single precision resolves at its distance from the origin; "
+        "rays miss its second face, so light through it is wrong; move the scene to the origin, make the "
+        "shape thicker, or replace it by a single surface (thindielectric)"
     )
 
     @staticmethod
@@ -78,12 +81,13 @@ def _lets_through(shape: mi.Shape) -> bool:
 
 
 def _is_thin_mesh(shape: mi.Shape) -> bool:
-    """Whether many triangles have an edge within the ray offset, as the rims of panes."""
+    """Whether many triangles are slender with an edge within the ray offset, as the rims of panes."""
     params = own_parameters(shape)
-    p = np.array(renamed.positions(params), dtype=np.float64).reshape(-1, 3)
+    p = np.array(renamed.positions(params)).reshape(-1, 3)
     faces = np.array(renamed.faces(params)).reshape(-1, 3)
     faces = faces[:: len(faces) // _INSPECTED + 1]
-    corners = p[faces[(faces < len(p)).all(axis=1)]]
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-    thin = (edges > 0) & (edges <= offset_at(np.abs(corners).max(axis=(1, 2))))
+    corners = p[faces[(faces < len(p)).all(axis=1)]].astype(np.float64)
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    edge, other, _ = np.sort(edges, axis=1).T
+    thin = (edge > 0) & (edge <= offset_at(np.abs(corners).max(axis=(1, 2)))) & (edge <= _SLENDER * other)
     return thin.sum() > _RIMS * len(thin)

@@ -21,21 +21,17 @@ Found = TypeVar("Found")
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
 OFFSET_ULPS = 32
 
-
 # Bound of the error of t on spheres and cylinders, which Mitsuba intersects in single precision, in units of
 # 2^-24 t^2 / radius; see experiments, section Rounding.
 QUADRIC_ULPS = 8
-
 
 # Cosine at a sphere's point below which that error is taken not to grow (1 % of the points seen from afar);
 # rays to these may still hit the sphere too early; see experiments, section Rounding.
 LEAST_COSINE = 0.1
 
-
 # Diameter of a scene in radii of its smallest sphere or cylinder, above which shadow rays test what they hit:
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
-
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
 # is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).

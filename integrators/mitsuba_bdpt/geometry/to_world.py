@@ -46,9 +46,8 @@ def is_reversed(shape: mi.Shape) -> bool:
     True for mirrored rectangles, whose hits use the cross product of the edges. (Meshes: see `smooth_meshes`;
     mirrored disks and spheres agree, mirrored cylinders raise an error in `check_to_world`.)
     """
-    if shape.shape_type() != mi.ShapeType.Rectangle.value:
-        return False
-    return bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
+    is_rectangle = shape.shape_type() == mi.ShapeType.Rectangle.value
+    return is_rectangle and bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
 
 
 def _disk(matrix, inverse):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import threading
 
 import drjit as dr
 import mitsuba as mi
@@ -13,6 +14,9 @@ from .introspection import own_parameters
 
 # Consecutive unused registry indices that end the search; indices of freed emitters are reused.
 _GAP = 64
+
+# Numbers of threads before each of the calls that are within `two_threads`.
+_before, _lock = [], threading.Lock()
 
 
 def float64(x) -> np.ndarray:
@@ -45,13 +49,16 @@ def ensure_two_threads() -> int:
 
 @contextlib.contextmanager
 def two_threads():
-    """Within, Dr.Jit has at least two threads, also if the user has set one."""
-    before = ensure_two_threads()
+    """Within, Dr.Jit has at least two threads, also if the user has set one, until the last caller leaves."""
+    with _lock:
+        _before.append(ensure_two_threads())
     try:
         yield
     finally:
-        if before < 2:
-            dr.set_thread_count(before)
+        with _lock:
+            before = _before.pop()
+            if before < 2 and not _before:
+                dr.set_thread_count(before)
 
 
 @contextlib.contextmanager

@@ -53,7 +53,8 @@ def _noted(number: int, frame: object) -> None:
 
 
 def _watch(reader: socket.socket) -> None:
-    while number := reader.recv(1):
-        if number[0] in STATUSES:
-            os.write(2, f"{NOTHING_WRITTEN}\n".encode())
-            os._exit(STATUSES[signal.Signals(number[0])])
+    with reader:
+        while number := reader.recv(1):
+            if number[0] in STATUSES:
+                os.write(2, f"{NOTHING_WRITTEN}\n".encode())
+                os._exit(STATUSES[signal.Signals(number[0])])

@@ -40,13 +40,11 @@ def check_film(film, channels: Channels, variance: bool):
         per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
     needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
     wide = is_wide(film.rfilter())
-    if channels.partitions or wide:
-        needed += min(width * height * channels.camera * SINGLE * dr.thread_count(), COPIES_MEMORY)
-    if wide:
-        needed += min(width * height * light * DOUBLE * dr.thread_count(), COPIES_MEMORY)
-    # The memory of a GPU is not known here.
-    on_gpu = (mi.variant() or "").startswith("cuda")
-    if needed > there.bytes and not on_gpu:
+    copied = [channels.camera * SINGLE] if channels.partitions or wide else []
+    copied += [light * DOUBLE] if wide else []
+    copies = (width * height * per_copy * dr.thread_count() for per_copy in copied)
+    needed += sum(size for size in copies if size <= COPIES_MEMORY)  # others are not made: `reduce_mode`
+    if needed > there.bytes and not (mi.variant() or "").startswith("cuda"):  # a GPU's memory is not known
         raise UsageError(
             f"the film of {width} x {height} pixels takes about {needed / 2**30:.3g} GiB of memory; there "
             f"are {there.bytes / 2**30:.3g} GiB ({there.limit}); render a smaller film, or crop windows "

@@ -23,7 +23,7 @@ SIDE = 2  # of the square of inner pixels
 
 
 def is_wide(rfilter) -> bool:
-    """Return whether splats are added to all pixels: of so many that drawing would add noise."""
+    """Whether splats are added to all pixels of the support (radius above 3)."""
     return rfilter.radius() > 3
 
 

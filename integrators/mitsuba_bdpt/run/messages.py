@@ -9,10 +9,8 @@ import mitsuba as mi
 
 from ..emitters.light_groups import LightGroups
 from ..errors import listed
-from ..host.introspection import all_shapes, is_instance
 from ..host.notices import warn_once
-from ..scene import diagnostics
-from ..scene.diagnostics import NAMED
+from ..scene.diagnostics import NAMED, not_finite, spoilt
 
 
 def log(statistics: dict):
@@ -37,24 +35,8 @@ def log(statistics: dict):
 
 def warn_of_parameters(prepared, sensor, settings):
     """Warn once about parameters that spoil images."""
-    scene = prepared.scene
-    for text in diagnostics.spoilt(prepared, settings):
-        warn_once(scene, sensor, f"bdpt: {text}")
-    bright = diagnostics.non_conserving_bsdfs(
-        [shape for shape in all_shapes(scene) if not is_instance(shape)]
-    )
-    overlap = diagnostics.overlapping_lamps(scene)
-    causes = {
-        "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
-        "grows; keep such parameters at 1 or below": bright,
-        "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
-        "strategies do not agree about it; make it 0.2 degrees or more": diagnostics.narrow_spots(scene),
-        "they overlap in one plane, where rays hit one of them but other strategies sample each, so that "
-        "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": overlap,
-    }
-    for text, names in causes.items():
-        if names:
-            warn_once(scene, sensor, f"bdpt: {listed(names, NAMED)}: {text}")
+    for text in spoilt(prepared, settings):
+        warn_once(prepared.scene, sensor, f"bdpt: {text}")
 
 
 def warn_of_light_groups(scene, sensor, groups: LightGroups | None):
@@ -105,15 +87,9 @@ def warn_of_non_finite(statistics: dict, scene):
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]
     if not (lost or in_pilot):
         return
-    some = f"{lost} of the image" if lost else ""
-    some += " and " * bool(
-        lost and in_pilot
-    ) + f"{in_pilot} of the pilot, which decided from the rest" * bool(in_pilot)
-    parts = [f"invalid samples (NaN or infinite) count as zero: {some}"]
-    named = diagnostics.not_finite(scene)
-    parts.append(
-        f"NaN or infinity is in {listed(named, NAMED)}"
-        if named
-        else "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
-    )
-    mi.Log(mi.LogLevel.Warn, f"bdpt: {'; '.join(parts)}")
+    counts = {"of the image": lost, "of the pilot, which decided from the rest": in_pilot}
+    some = " and ".join(f"{count} {where}" for where, count in counts.items() if count)
+    held = "no parameter of the scene holds NaN or infinity: look into its plugins, your own first"
+    if names := not_finite(scene):
+        held = f"NaN or infinity is in {listed(names, NAMED)}"
+    mi.Log(mi.LogLevel.Warn, f"bdpt: invalid samples (NaN or infinite) count as zero: {some}; {held}")

@@ -17,8 +17,9 @@ import numpy as np
 from ..emitters.radiance import is_negative
 from ..errors import listed
 from ..geometry.boxes import is_finite
-from ..geometry.rounding import OFFSET_ULPS
-from ..host.introspection import LEAVES, children, named, number, own_parameters
+from ..geometry.rounding import offset_at
+from ..host.introspection import LEAVES, all_shapes, children, is_instance, named, number, own_parameters
+from ..host.notices import cached
 
 if TYPE_CHECKING:
     from ..settings import Settings
@@ -47,7 +48,7 @@ _QUICKLY_READ = 1 << 17
 
 
 def spoilt(prepared: PreparedScene, settings: Settings) -> list[str]:
-    """Describe what makes images black, incomplete or negative: causes, effects and remedies."""
+    """Describe parameters that spoil the image: causes, effects and remedies."""
     emitters, found = prepared.emitters, []
     if not emitters.count:
         found.append("the scene has no emitter; the image is black; add one, for example of type constant")
@@ -63,8 +64,8 @@ def spoilt(prepared: PreparedScene, settings: Settings) -> list[str]:
         )
     if settings.max_depth == 1 and settings.hide_emitters and not settings.aovs:
         found.append(
-            "max_depth=1 leaves visible emitters alone, which hide_emitters hides; the image is black; set "
-            "max_depth to 2 or more, or hide_emitters to false"
+            "max_depth=1 renders only directly visible emitters, and hide_emitters hides them; the image is "
+            "black; set max_depth to 2 or more, or hide_emitters to false"
         )
     first = emitters.objects[:_INSPECTED]
     negative = [f"emitter {named(e.get_shape() or e)}" for e in first if is_negative(e)]
@@ -73,7 +74,23 @@ def spoilt(prepared: PreparedScene, settings: Settings) -> list[str]:
             f"{listed(negative, NAMED)} has negative radiance; pixels that it lights are too dark or "
             "negative; make its radiance, intensity, irradiance and scale 0 or more"
         )
-    return found + [f"{listed(names, NAMED)} {flaw.value}" for flaw, names in prepared.flaws.items()]
+    found += [f"{listed(names, NAMED)} {flaw.value}" for flaw, names in prepared.facts.flaws.items()]
+    return found + [f"{listed(names, NAMED)}: {text}" for text, names in _wrong(prepared).items() if names]
+
+
+def _wrong(prepared: PreparedScene) -> dict[str, list[str]]:
+    """Parameters of which light is lost or added, by effects and remedies."""
+    scene, sensor, facts = prepared.scene, prepared.sensor, prepared.facts
+    bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
+    overlap, _ = cached(scene, sensor, "overlaps", facts, lambda: overlapping_lamps(scene), most=1)
+    return {
+        "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
+        "grows; keep such parameters at 1 or below": bright,
+        "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
+        "strategies do not agree about it; make it 0.2 degrees or more": narrow_spots(scene),
+        "they overlap in one plane, where rays hit one of them but other strategies sample each, so that "
+        "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": overlap,
+    }
 
 
 def non_conserving_bsdfs(owners) -> list[str]:
@@ -169,7 +186,7 @@ def overlapping_lamps(scene) -> list[str]:
     boxes = [(shape.bbox().min, shape.bbox().max) for shape in shapes]
     low, high = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
     # Shadow rays to the farther of two lamps end before the nearer one, see `rounding`.
-    near = OFFSET_ULPS * 2.0**-24 * np.abs([low, high]).max((0, 2), initial=0)
+    near = offset_at(np.abs([low, high]).max((0, 2), initial=0))
     found = []
     for axis, a, b in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         (flat,) = np.nonzero(high[:, axis] - low[:, axis] <= near)

@@ -34,7 +34,7 @@ _LOBES = 1024
 class PreparedScene:
     """A scene seen by one of its sensors; lives for one render.
 
-    ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``flaws``: see `ShapeFacts`;
+    ``emitters``, ``camera``: the endpoints; ``hits``: surfaces at hits; ``facts`` about shapes;
     ``smooth``, ``delta``, ``refracts``: some BSDF has such a lobe; ``specular``: some BSDF, as of glass or
     mirrors, has delta lobes alone;
     ``near_specular``: BSDFs of shapes with lobes that are not delta, but nearly so, and ``narrowest``, the
@@ -44,11 +44,10 @@ class PreparedScene:
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
         check_not_animated([*all_shapes(scene), *scene.emitters(), sensor, *views(sensor)])
-        self.scene = scene
+        self.scene, self.sensor = scene, sensor
         self.surfaces = bool(scene.shapes())
-        facts = ShapeFacts.of(scene, sensor)
+        self.facts = facts = ShapeFacts.of(scene, sensor)
         self.emitters, self.hits = Emitters(scene, facts), Hits(scene, facts.hits)
-        self.flaws = facts.flaws
         check_sensor(sensor, scene.sensors())
         self.camera = prepare(sensor, self.emitters.shape_errors, scene)
         found = bsdfs(scene)
