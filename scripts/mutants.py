@@ -738,8 +738,8 @@ MUTANTS = (
     Mutant(
         "pilots: all connections are with one light subpath",
         "planning/moments.py",
-        "(1 - 1 / several) * own",
-        "0 * own",
+        "found[:, candidate] -= (1 - several",
+        "found[:, candidate] -= 0 * (1 - several",
         ("tests/planning/test_pilot.py::test_predicted_variance[cornell-four per lane]",),
     ),
     Mutant(
@@ -752,15 +752,15 @@ MUTANTS = (
     Mutant(
         "pilots: a typical render lacks no light",
         "planning/moments.py",
-        "self.draw + self.light + self.missing",
-        "self.draw + self.light",
+        "shown.variance(stratified) + self.missing",
+        "shown.variance(stratified)",
         ("tests/planning/test_pilot.py::test_both_errors_have_to_fall",),
     ),
     Mutant(
         "pilots: the mean error alone decides",
         "planning/choice.py",
-        "for values in (means, typical))",
-        "for values in (means, means))",
+        "np.stack((means[possible], np.maximum(typical, 0).mean(axis=0)))",
+        "np.stack((means[possible], means[possible]))",
         ("tests/planning/test_pilot.py::test_both_errors_have_to_fall",),
     ),
     Mutant(

@@ -325,7 +325,7 @@ def register():
         if variant is None or variant in _classes:
             return
         _classes[variant] = _class_of_variant()
-        mi.register_integrator("bdpt", lambda props, v=variant: _classes[v](props))
+        mi.register_integrator("bdpt", lambda props, v=variant: check_variant(v) or _classes[v](props))
 
     scalar = import_module("mitsuba.scalar_rgb")
     scalar.register_integrator("bdpt", lambda props: check_variant("scalar_rgb"))

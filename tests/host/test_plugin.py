@@ -132,7 +132,9 @@ def test_none_is_the_default_of_texts():
 
 
 def test_scalar_variants_are_refused():
-    """Expected: one sentence, also where the parser makes objects of another variant than the current one."""
+    """Expected: one sentence, also where the parser makes objects of a variant that was current before."""
+    mi.set_variant("scalar_rgb")
+    mi.set_variant("llvm_ad_rgb")
     config = mi.parser.ParserConfig("scalar_rgb")
     with pytest.raises(RuntimeError, match="the variant scalar_rgb is scalar; use a vectorised one"):
         mi.parser.instantiate(config, mi.parser.parse_dict(config, {"type": "bdpt"}))

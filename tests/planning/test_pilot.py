@@ -596,7 +596,6 @@ def test_light_subpaths_have_to_gain(connections):
         base[:, light.number] = 1 / (gain * cost)
         table = choice.choose(made_of(base, rays), Alternatives([ALONE, light], True))
         assert bool(table[0].candidate.light_paths) == chosen
-        assert len(table) == 2
         why = f"light subpaths have to gain {needed:g}x over path tracing alone, and gain {gain:.2f}x"
         assert chosen or why in choice.left_out(table)[0]["why"]
 
