@@ -56,8 +56,8 @@ class Flaw(Enum):
             return Flaw.NO_AREA
         if kind in _FLAT or not _lets_through(shape):
             return None
-        thin = _is_thin_mesh(shape) if shape.is_mesh() else extent[0] <= offset
-        return Flaw.THIN if thin else None
+        is_within = extent[0] <= offset and (not shape.is_mesh() or extent[0] > offset / 8)  # flat ones round
+        return Flaw.THIN if is_within or (shape.is_mesh() and _is_thin_mesh(shape)) else None
 
 
 def _extent(box) -> tuple[list[float], float]:

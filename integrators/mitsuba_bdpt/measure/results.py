@@ -196,7 +196,7 @@ def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]
 
 def _stored(file: Path) -> list[Row]:
     """Return the rows of a file; older sweeps have the variance as ``spread``."""
-    table = pyarrow.parquet.read_table(file)
+    table = pyarrow.parquet.read_table(pa.BufferReader(file.read_bytes()))
     names = ["variance" if name == "spread" else name for name in table.column_names]
     return [_with_points(row) for row in table.rename_columns(names).to_pylist()]
 
@@ -370,12 +370,11 @@ def write_tables(table: list[Row], output: Path) -> None:
     ]
     write_json(output / "rows.json", found)
     arrays = pa.Table.from_pylist(whole)
-    place = columns.index("tile_means")
+    place, written = columns.index("tile_means"), pa.BufferOutputStream()
     means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits, as written
+    pyarrow.parquet.write_table(arrays.set_column(place, "tile_means", means), written, compression="zstd")
     with replacing(output / "rows.parquet") as temporary:
-        pyarrow.parquet.write_table(
-            arrays.set_column(place, "tile_means", means), temporary, compression="zstd"
-        )
+        temporary.write_bytes(written.getvalue())
 
 
 def decided(row: Mapping[str, Any]) -> float:
