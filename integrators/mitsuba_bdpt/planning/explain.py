@@ -138,7 +138,7 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         "pilot: predictions, the chosen configuration first (time to the same error; cost and error relative "
     )
     lines = [
-        head + "to path tracing alone; error: the larger of that of the mean render and of a typical one)",
+        head + "to path tracing alone; error: the larger relMSE, of the mean render or of a typical one)",
         "  relative time  cost per sample     error  configuration",
     ]
     for row in table:
