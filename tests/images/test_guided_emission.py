@@ -492,12 +492,3 @@ def test_a_stopped_render_goes_on():
     assert snapshot.progress.decided.decisions[0].emission is not None
     rest = np.array(method().render(scene, start=snapshot, **arguments))
     np.testing.assert_allclose(rest, whole, **ROUNDING)
-
-
-def test_later_pilots_refine_the_tables():
-    """Expected: a long render asks again, and the sums of both pilots teach; tables change only if better."""
-    scene = spotlit(16)
-    _, method = rendered(scene, spp=256, spp_per_pass=32)
-    statistics = method.statistics
-    assert statistics["pilots"]["rendered"] >= 2
-    assert all(d["emission"] for d in statistics["decisions"])
