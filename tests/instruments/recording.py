@@ -179,8 +179,9 @@ def render(scene, integrator, least, spp: int, seed: int):
         outliers.extend(collector.found(launch))
         return counts
 
-    one = mock.patch.object(planner, "JOINED", (1,))
-    with one, mock.patch.object(rendering, "trace", trace):
+    one = mock.patch.object(planner, "JOINED", (1,))  # of which cached results know
+    each = mock.patch.object(planner.Planner, "_is_worth_joining", return_value=False)
+    with one, each, mock.patch.object(rendering, "trace", trace):
         image = np.array(integrator.render(scene, spp=spp, seed=seed))[..., :3]
     outliers.sort(key=lambda found: -(found.value / least[found.y, found.x]).max())
     return image, outliers
