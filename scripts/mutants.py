@@ -759,8 +759,8 @@ MUTANTS = (
     Mutant(
         "pilots: the mean error alone decides",
         "planning/choice.py",
-        "np.stack((means[possible], np.maximum(typical, 0).mean(axis=0)))",
-        "np.stack((means[possible], means[possible]))",
+        "variances = moments.variance(alternatives.stratified), moments.typical(alternatives.stratified)",
+        "variances = (moments.variance(alternatives.stratified),) * 2",
         ("tests/planning/test_pilot.py::test_both_errors_have_to_fall",),
     ),
     Mutant(
@@ -794,8 +794,8 @@ MUTANTS = (
     Mutant(
         "pilot: a variance below 0 is believed",
         "planning/choice.py",
-        "np.maximum(moments.variance(stratified)[:, [candidate.number for candidate in candidates]], 0)",
-        "moments.variance(stratified)[:, [candidate.number for candidate in candidates]]",
+        "np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)",
+        "variances[:, [candidate.number for candidate in candidates]]",
         ("tests/planning/test_pilot.py::test_no_group_has_less_than_no_variance",),
     ),
     Mutant(

@@ -49,9 +49,14 @@ def whole(text: str) -> int:
     return int(value)
 
 
+def _utf8(text: str) -> str:
+    """Decode an argument as UTF-8, in which Mitsuba's texts are, whatever the encoding of the locale."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+
+
 def weight(text: str) -> tuple[str, tuple[float, ...]]:
     """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer; ids may have ``=``."""
-    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    text = _utf8(text)
     name, equals, values = text.rpartition("=")
     with contextlib.suppress(ValueError):
         if name.strip() and equals:
@@ -104,8 +109,8 @@ def resume(text: str) -> str:
 
 
 def definition(text: str) -> tuple[str, str]:
-    """Parse ``KEY=VALUE``; Mitsuba's texts are in UTF-8, whatever the encoding of the locale."""
-    text = text.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    """Parse ``KEY=VALUE``."""
+    text = _utf8(text)
     key, equals, value = text.partition("=")
     if not key or not equals:
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form KEY=VALUE")

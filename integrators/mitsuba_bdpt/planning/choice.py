@@ -163,7 +163,7 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
         return None
     candidate = replace(lit.candidate, guided=GUIDED)
     each = cost(candidate, moments.rays, alternatives.samples)
-    others = _by_group(moments, [table[0].candidate, lit.candidate], alternatives.stratified)
+    others = _by_group(moments.variance(alternatives.stratified), [table[0].candidate, lit.candidate])
     best, variance = np.maximum(others, LEAST_VARIANCE).T
     best = np.minimum(best, variance * table[0].error / lit.error)  # not what light subpaths do without it
     unguided, guided = moments.sds.T
@@ -174,19 +174,18 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first."""
-    means = _by_group(moments, alternatives.candidates, alternatives.stratified).mean(axis=0)
-    possible = [i for i, mean in enumerate(means) if math.isfinite(mean)]
+    variances = moments.variance(alternatives.stratified), moments.typical(alternatives.stratified)
+    both = [_by_group(values, alternatives.candidates).mean(axis=0) for values in variances]
+    possible = np.flatnonzero(np.isfinite(both[0])).tolist()
     if not possible:
         return []
     candidates = [alternatives.candidates[i] for i in possible]
-    typical = moments.typical(alternatives.stratified)[:, [candidate.number for candidate in candidates]]
-    both = np.stack((means[possible], np.maximum(typical, 0).mean(axis=0)))
+    both = np.maximum(np.stack(both)[:, possible], LEAST_VARIANCE)
     costs = np.array([cost(candidate, moments.rays, alternatives.samples) for candidate in candidates])
     light = np.array([candidate.light_paths > 0 for candidate in candidates])
-    errors = _errors(np.maximum(both, LEAST_VARIANCE), costs, light)
+    errors = _errors(both, costs, light)
     rows = zip(candidates, costs.tolist(), errors.tolist(), both[0].tolist(), strict=True)
-    table = [Prediction(c, each, error, max(v, LEAST_VARIANCE)) for c, each, error, v in rows]
-    return sorted(table, key=lambda row: row.score)
+    return sorted((Prediction(*row) for row in rows), key=lambda row: row.score)
 
 
 def _errors(both: np.ndarray, costs: np.ndarray, light: np.ndarray) -> np.ndarray:
@@ -205,12 +204,12 @@ def _errors(both: np.ndarray, costs: np.ndarray, light: np.ndarray) -> np.ndarra
     return errors
 
 
-def _by_group(moments: Moments, candidates: list[Configuration], stratified: bool) -> np.ndarray:
-    """Variance of each candidate by group of the pilot, shape (`GROUPS`, candidates).
+def _by_group(variances: np.ndarray, candidates: list[Configuration]) -> np.ndarray:
+    """Those of ``candidates`` of all ``variances`` by group of the pilot, shape (`GROUPS`, candidates).
 
     At least 0: an estimate may be negative, and one such group would make a candidate the best.
     """
-    return np.maximum(moments.variance(stratified)[:, [candidate.number for candidate in candidates]], 0)
+    return np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)
 
 
 def confidence(moments: Moments, alternatives: Alternatives) -> float:

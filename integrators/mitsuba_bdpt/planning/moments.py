@@ -106,7 +106,6 @@ LEAST_GAIN = 1e-3
 # Least number of camera samples per pixel; their products estimate the squared mean.
 PER_PIXEL = 2
 
-
 # Share of the pixels of a render whose errors the trimmed error leaves out. Contributions that fewer pixels
 # receive are not in the variance of a typical render, but their light is missing from it.
 TRIMMED = 1e-3

@@ -28,10 +28,9 @@ from .possible import plan, unsampled_paths, why_not_joined
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
 
-# Where the fewest light subpaths and one connection are used, camera subpaths connect with several light
-# subpaths, drawn by an approximation (`connections`), in renders of at least so many samples and pixels. Not
-# with transmissive BSDFs, which the approximation does not cover, and only with LLVM: lanes need four times
-# the local memory. See experiments, "Several light subpaths per lane".
+# Least samples and pixels of a render whose camera subpaths may connect with several light subpaths, drawn by
+# an approximation (`connections`). Not with transmissive BSDFs, which the approximation does not cover, and
+# only with LLVM: lanes need four times the local memory. See experiments, "Several light subpaths per lane".
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
@@ -160,14 +159,13 @@ class Planner:
         is_lit = table[0].candidate.light_paths > 0
         if learnt.tables is None or (not is_lit and lit * learnt.whole > table[0].score):
             return table, learnt
-        tables = learnt.tables
         if not is_lit:
-            found = self._measured(samples, tables)
+            found = self._measured(samples, learnt.tables)
             guided = choice.choose(found, self._alternatives(samples))
             if not found.mean > 0 or not guided or not guided[0].candidate.light_paths:
                 return table, learnt
             self._with_tables, table = found, guided
-        return [row.with_emission(tables, is_lit) for row in table], learnt
+        return [row.with_emission(learnt.tables, is_lit) for row in table], learnt
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
