@@ -47,6 +47,10 @@ def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: Sha
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
 
+# Radii by which a shadow ray may end before a small sphere or cylinder without testing what lies between.
+# 0.02 costs 5 % more in veach-mis, and all rays 7 % (see experiments, section Rounding).
+_SHELL = 0.1
+
 # Lower bound of the cosine that divides an anchor's offset.
 _STEEPEST = 0.05
 
@@ -129,10 +133,14 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """Surface (``number``, see `met`) at a shadow ray's end, hit from ``t`` on."""
+    """Surface (``number``, see `met`) at a shadow ray's end, hit from ``t`` on.
+
+    ``first_hit``: mask, the first hit of the whole ray decides; others are tested up to ``t``.
+    """
 
     number: mi.UInt32
     t: mi.Float
+    first_hit: mi.Bool
 
 
 def shadow_ray(
@@ -146,15 +154,20 @@ def shadow_ray(
         return segment(a, b, shared), None
     end = _before(a, b)
     ray = segment_to(a, end, shared)
-    return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
+    early = ray.maxt * _early(a.p - end, b)
+    behind = dr.dot(b.n, a.p - end) * b.curvature < 0
+    return ray, Own(number, ray.maxt - early, behind | (early * dr.abs(b.curvature) > _SHELL))
 
 
 def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None):
     """Whether any surface (also null, as in ``path``) but ``own`` blocks ``ray``."""
     if own is None:
         return scene.ray_test(ray, active=active)
-    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-    return pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t))
+    before = mi.Ray3f(ray)
+    before.maxt = own.t
+    blocked = scene.ray_test(before, active=active & ~own.first_hit)
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & own.first_hit)
+    return blocked | (pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t)))
 
 
 def intersect_past_emitters(

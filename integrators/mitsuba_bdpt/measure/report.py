@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CommandError
-from ..files.texts import list_of, read_toml, text_of, write_text
+from ..files.texts import read_toml, text_of, write_text
 from ..files.whole import check_own, check_writable
 from . import figures
 from .agreement import BiasCheck
@@ -386,7 +386,7 @@ def stronger(results: Results) -> str:
 
 
 Goal = dict[str, Any]
-"""What an entry of goals.toml says."""
+"""What an entry of goals.toml says, of the repository's own goals."""
 
 # -- goals ------------------------------------------------------------------------------------
 
@@ -565,43 +565,6 @@ OF_ALL: dict[str, Callable[[Results], Measured]] = {
 
 BOUNDS = {"at_least": "", "at_most": " at most"}
 """Keys of a goal's bound, one of which it has, and what its text ends in."""
-
-
-def checked_goals(file: Path, data: dict[str, Any]) -> list[Goal]:
-    """Return the entries [[goal]] of goals.toml; raises ``CommandError`` if invalid."""
-    if data.keys() <= {"aside"}:
-        return []
-    goals = list_of(file, "goal", data.get("goal"), dict, "tables: write [[goal]] and the keys of each below")
-    for goal in goals:
-        text_of(file, "what of a [[goal]]", goal.get("what"))
-        _check_bound(file, goal)
-        if "aim" in goal:
-            text_of(file, f"aim of {goal['what']!r}", goal["aim"])
-        measure, scene = goal.get("measure"), goal.get("scene")
-        if measure is None:
-            continue
-        if measure not in (known := sorted([*OF_A_SCENE, *OF_ALL])):
-            raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} must be one of {known}")
-        if (scene is not None) != (measure in OF_A_SCENE):
-            needs = "needs a scene" if scene is None else "is no figure of one scene: leave out scene"
-            raise CommandError(f"{file}: measure={measure!r} of {goal['what']!r} {needs}")
-    return goals
-
-
-def _check_bound(file: Path, goal: Goal) -> None:
-    """Raise ``CommandError`` unless a goal has one bound, of a number or several, that its text fits."""
-    keys = BOUNDS.keys() & goal.keys()
-    if len(keys) != 1:
-        raise CommandError(f"{file}: {goal['what']!r} needs one of {', '.join(BOUNDS)}")
-    (key,) = keys
-    if not all(isinstance(bound, int | float) for bound in _bounds(goal)):
-        raise CommandError(
-            f"{file}: {key}={goal[key]!r} of {goal['what']!r} must be a number or a list of some"
-        )
-    if text_of(file, f"text of {goal['what']!r}", goal.get("text", "{}")).count("{}") != len(_bounds(goal)):
-        raise CommandError(
-            f"{file}: text={goal.get('text')!r} of {goal['what']!r} needs a {{}} for each bound"
-        )
 
 
 def _bounds(goal: Goal) -> list[Any]:
@@ -928,7 +891,7 @@ class Report:
         kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
         for scene, text in kept["notes"].items():
             text_of(files["notes"], scene, text)
-        goals = checked_goals(files["goals"], kept["goals"])
+        goals = kept["goals"].get("goal", [])
         return Report(results, made, goals, kept["notes"], title(results, folder), missing_text(folder))
 
     def text(self) -> str:
