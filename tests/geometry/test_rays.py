@@ -772,17 +772,15 @@ def test_backs_of_small_shapes_are_not_seen(kind, radius, flipped):
 def test_a_shell_about_a_small_sphere_hides_it(radius):
     """Rationale: shadow rays end before a small sphere, by more than its radius from afar. Expected: of its
     points that face 8 away, not one is seen through a shell a fifth of the radius in front."""
-    shell = {"type": "sphere", "radius": 1.2 * radius}
-    parts = {"lamp": {"type": "sphere", "radius": radius}, "far": far_away(16), "shell": shell}
-    scene, n = mi.load_dict({"type": "scene", **parts}), 1 << 16
-    rng, errors = mi.PCG32(n, 13), rounding.ShapeErrors(scene)
-    lamp = next(shape for shape in scene.shapes() if shape.id() == "lamp")
+    lamp, shell = ({"type": "sphere", "radius": r * radius} for r in (1, 1.2))
+    scene = mi.load_dict({"type": "scene", "lamp": lamp, "far": far_away(16), "shell": shell})
+    rng, errors = mi.PCG32(1 << 16, 13), rounding.ShapeErrors(scene)
+    shape = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "lamp"))
     outwards, origin = _sphere(rng), mi.Point3f(8, 0, 0) + _sphere(rng)
     facing = dr.dot(outwards, origin) > 0
-    shape = mi.ShapePtr(lamp)
     end = rays.sampled_anchor(mi.Point3f(outwards * radius), mi.Normal3f(outwards), errors.at(shape))
-    start, like = rays.free_anchor(origin), dr.zeros(mi.SurfaceInteraction3f)
-    ray, own = rays.shadow_ray(errors, start, end, rounding.met(shape), like)
+    like = dr.zeros(mi.SurfaceInteraction3f)
+    ray, own = rays.shadow_ray(errors, rays.free_anchor(origin), end, rounding.met(shape), like)
     assert errors.small and int(dr.count(facing & ~rays.occluded(scene, ray, facing, own))[0]) == 0
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.emitters import area
 from mitsuba_bdpt.errors import UsageError
-from mitsuba_bdpt.geometry import quadrics, rounding, shape_facts, smooth_meshes
+from mitsuba_bdpt.geometry import boxes, quadrics, rounding, shape_facts, smooth_meshes
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.jit import registered_emitters
 from rendered import same
@@ -31,7 +31,8 @@ def room():
 @pytest.fixture
 def found(monkeypatch):
     """What was asked of shapes."""
-    asked, errors, sphere = [], rounding.ShapeErrors, quadrics.Sphere.of
+    asked, errors, sphere, box = [], rounding.ShapeErrors, quadrics.Sphere.of, boxes.box_of
+    monkeypatch.setattr(boxes, "box_of", lambda shape: (asked.append("box"), box(shape))[1])
     monkeypatch.setattr(shape_facts, "ShapeErrors", lambda *args: (asked.append("errors"), errors(*args))[1])
     monkeypatch.setattr(quadrics.Sphere, "of", lambda shape: (asked.append("sphere"), sphere(shape))[1])
     curved = smooth_meshes._curved_faces
@@ -53,7 +54,7 @@ def test_shapes_are_asked_once(found):
     for number in range(4):
         image(scene, number, light_paths=number % 2)
     assert found.count("errors") == 2 and found.count("sphere") == 3  # of two lamps
-    assert found.count("faces") == 4
+    assert (found.count("faces"), found.count("box")) == (4, 1)
 
 
 EDITS = {

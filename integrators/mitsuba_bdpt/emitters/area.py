@@ -145,7 +145,7 @@ class AreaEmitters(Group):
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
         self._facts = context.facts
-        extent = 2 * scene_box(context.scene).bounding_sphere().radius
+        extent = 2 * scene_box(context.scene, context.facts.about).bounding_sphere().radius
         found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
         self._seen_through = any(

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry.boxes import boxes
+from ..geometry.boxes import asked_anew, boxes
 from .records import Factor
 
 # Longest side of a detail's bounding box, relative to the scene's.
@@ -90,8 +90,9 @@ class Disks:
     the scene's details, or None.
     """
 
-    def __init__(self, scene):
-        each, box = boxes(scene), mi.ScalarBoundingBox3f()
+    def __init__(self, scene, about: Callable = asked_anew):
+        """``about``: caches facts, see `ShapeFacts.about`."""
+        each, box = boxes(scene, about), mi.ScalarBoundingBox3f()
         for one in each:
             box.expand(one)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)

@@ -48,7 +48,7 @@ class InfiniteEmitters(Group):
         return 1 if _is_directional(emitter) else SKY_BINS**2
 
     def __init__(self, emitters, context: Context):
-        self.disks = Disks(context.scene)
+        self.disks = Disks(context.scene, context.facts.about)
         self._directional = Mask(rows(emitters, None, _is_directional))
 
     # -- points of emission -----------------------------------------------------------------

@@ -7,13 +7,22 @@ invalid box too, though rays hit its other triangles.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TypeVar
 
 import mitsuba as mi
 import numpy as np
 
 from ..host import renamed
 from ..host.introspection import own_parameters
+
+Found = TypeVar("Found")
+
+
+def asked_anew(kind: str, find: Callable[[], Found], *shapes) -> Found:
+    """Stand-in for `ShapeFacts.about` without a cache."""
+    return find()
 
 
 def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
@@ -29,17 +38,18 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
     return box if is_finite(box) else None
 
 
-def boxes(scene: mi.Scene) -> list[mi.ScalarBoundingBox3f]:
-    found = (box_of(shape) for shape in scene.shapes())
+def boxes(scene: mi.Scene, about: Callable = asked_anew) -> list[mi.ScalarBoundingBox3f]:
+    """Valid boxes of a scene's shapes; ``about``: caches facts, see `ShapeFacts.about`."""
+    found = (about("box", partial(box_of, shape), shape) for shape in scene.shapes())
     return [box for box in found if box is not None]
 
 
-def scene_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:
-    """Bounding box of a scene, including shapes that Mitsuba leaves out."""
+def scene_box(scene: mi.Scene, about: Callable = asked_anew) -> mi.ScalarBoundingBox3f:
+    """Bounding box of a scene, including shapes that Mitsuba leaves out; ``about`` as in `boxes`."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():
-        partial = shape.class_name() == "Mesh" or not is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
-        if partial and (box := box_of(shape)) is not None:
+        is_partial = shape.class_name() == "Mesh" or not is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
+        if is_partial and (box := about("box", partial(box_of, shape), shape)) is not None:
             whole.expand(box)
     return whole
 

@@ -26,7 +26,8 @@ from ..host.introspection import (
     shape_groups,
     shapes_in,
 )
-from .rounding import asked_anew, met
+from .boxes import asked_anew
+from .rounding import met
 
 # From this number of instances or spheres on they are looked up; of spheres only where other shapes, which
 # are then called through Python, are at most `_OTHERS` times as many.

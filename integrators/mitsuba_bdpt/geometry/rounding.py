@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -13,10 +12,8 @@ import numpy as np
 
 from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
-from .boxes import scene_box
+from .boxes import asked_anew, scene_box
 from .quadrics import ROUND, outward_sign
-
-Found = TypeVar("Found")
 
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
 OFFSET_ULPS = 32
@@ -63,11 +60,6 @@ class Errors:
     reach: mi.Float | float
 
 
-def asked_anew(kind: str, find: Callable[[], Found], *shapes) -> Found:
-    """Stand-in for `ShapeFacts.about` without a cache."""
-    return find()
-
-
 class ShapeErrors:
     """`Errors` of the scene's shapes, by pointer.
 
@@ -78,7 +70,7 @@ class ShapeErrors:
     def __init__(self, scene: mi.Scene, about: Callable = asked_anew):
         """``about``: caches facts, see `ShapeFacts.about`."""
         shapes = scene.shapes()
-        extent = 2 * scene_box(scene).bounding_sphere().radius
+        extent = 2 * scene_box(scene, about).bounding_sphere().radius
         with np.errstate(all="ignore"):  # non-finite values are checked elsewhere
             # An instance does not expose its group: it gets the largest curvature of all groups.
             within = (_curvatures(s, 0.0, np.inf)[0] for s in grouped_shapes(scene))

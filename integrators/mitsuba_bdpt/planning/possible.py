@@ -211,7 +211,7 @@ def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
     """Whether the scene's box extends behind the far plane of the sensor, if any."""
     if not isinstance(sensor, mi.ProjectiveCamera) or not prepared.surfaces:
         return False
-    box, to_world = scene_box(prepared.scene), world_matrix(sensor)
+    box, to_world = scene_box(prepared.scene, prepared.facts.about), world_matrix(sensor)
     corners = np.array([[*box.corner(i)] for i in range(8)], dtype=np.float64).reshape(8, 3)
     forwards, origin = to_world[:3, 2:].T
     return bool(((corners - origin) @ forwards / np.linalg.norm(forwards) > sensor.far_clip()).any())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from collections.abc import Callable
+from functools import cached_property, partial
 
 import drjit as dr
 import mitsuba as mi
@@ -77,9 +78,9 @@ class PreparedScene:
 
         Judged by bounding boxes. An environment counts as small unless it is even.
         """
-        box = scene_box(self.scene)
+        box, about = scene_box(self.scene, self.facts.about), self.facts.about
         size = float(dr.squared_norm(box.extents())) if is_finite(box) else math.inf
-        return any(_is_small(emitter, size) for emitter in self.scene.emitters())
+        return any(_is_small(emitter, size, about) for emitter in self.scene.emitters())
 
     def stored_vertices(self, settings: Settings) -> int:
         """Longest path, in edges, that uses all strategies."""
@@ -88,7 +89,7 @@ class PreparedScene:
         return DEFAULT_STORED if self.space is None else MAX_STORED
 
 
-def _is_small(emitter: mi.Emitter, size: float) -> bool:
+def _is_small(emitter: mi.Emitter, size: float, about: Callable) -> bool:
     """Whether an emitter is small in a scene whose diagonal has the square ``size``."""
     if emitter.is_environment():
         return contrast(emitter) > EVEN_SKY
@@ -96,7 +97,7 @@ def _is_small(emitter: mi.Emitter, size: float) -> bool:
     shape = emitter.get_shape()
     if shape is None or any(mi.has_flag(emitter.flags(), flag) for flag in delta):
         return True
-    box = box_of(shape)
+    box = about("box", partial(box_of, shape), shape)
     if box is None:
         return True
     _, width, height = sorted(float(extent) for extent in box.extents())
