@@ -165,7 +165,8 @@ def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = 
         return scene.ray_test(ray, active=active)
     before = mi.Ray3f(ray)
     before.maxt = own.t
-    blocked = scene.ray_test(before, active=active & ~own.first_hit)
+    # Mitsuba finds rays of negative length blocked, also where not active.
+    blocked = scene.ray_test(before, active=active & ~own.first_hit) & ~own.first_hit
     pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & own.first_hit)
     return blocked | (pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t)))
 
