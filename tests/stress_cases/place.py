@@ -214,9 +214,8 @@ def _render(scene, parameters, spp, seed):
     return image, integrator.statistics
 
 
-def _decided(statistics):
-    """What was decided, without figures."""
-    keys = ("light_paths", "connections", "coefficients")
+def _decided(statistics, keys=("light_paths", "connections", "coefficients")):
+    """What was decided; by default without figures."""
     return [[record[key] for key in keys] for record in statistics["decisions"]]
 
 
@@ -252,12 +251,13 @@ def _equal(subject: Subject, first: Place, places: dict, digits: float, **parame
     for way, of_way in WAYS.items():
         of_way = of_way | parameters
         plain, statistics = _render(subject.load(first), of_way, SPP[way], 3)
-        decided = _decided(statistics)
+        decided, cost = _decided(statistics), _decided(statistics, ["cost"])
         ok &= plain.mean() > 0.01 and (way != "default parameters" or bool(decided))
         for name, place in places.items():
             image, statistics = _render(subject.load(place), of_way, SPP[way], 3)
             apart = np.abs(image / place.light - plain) / plain.mean()
-            differing = max(differing, float((apart > digits).mean()))
+            limit = digits if _decided(statistics, ["cost"]) == cost else DRAWN
+            differing = max(differing, float((apart > limit).mean()))
             worst = max(worst, abs(float(image.mean() / place.light / plain.mean()) - 1))
             if _decided(statistics) != decided or statistics["non_finite"]:
                 ok = False
