@@ -32,7 +32,6 @@ WALLS = {
     "right": ([0, 1, 0], -90),
     "back": ([0, 1, 0], 0),
 }
-DISAGREE = "disagree about the medium between them"
 
 
 def fog(sigma_t=1.0, **more):
@@ -85,6 +84,14 @@ def prepared(scene):
     return found.space.media, found.light_media
 
 
+def starts(scene):
+    """Numbers of the media in which random emissions start."""
+    found, u = PreparedScene(scene, scene.sensors()[0]), np.random.default_rng(0).random((4, 1 << 12))
+    shared = Shared(mi.Float(0), mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
+    e = found.emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), shared, mi.Bool(True))
+    return np.array(found.light_media.at(e))
+
+
 @pytest.mark.parametrize("optimize", [True, False], ids=["merged", "apart"])
 @pytest.mark.parametrize("tagged", [True, False], ids=["tagged", "plain"])
 @pytest.mark.parametrize("medium", [shared, fog], ids=["shared", "each"])
@@ -92,14 +99,14 @@ def test_fog_between_opaque_walls(medium, tagged, optimize):
     """Rationale: lines that look for contradictions went through walls, where no light goes, and to the back
     of the lamp, which scatters nothing; equal media were told apart; a mesh of rectangles that Mitsuba has
     merged has no valid box. Expected: no contradiction and one medium, in which the lamp shines; also where
-    the lamp states no medium, and all its rays end at the ceiling.
+    the lamp states no medium, and all its rays meet the ceiling first.
     """
     up = {"to_world": below_the_ceiling(0.05, down=False)}
     for lamp in (None, {}, up):
         scene = box(medium, (lambda: {"exterior": medium()}) if tagged else None, lamp, optimize=optimize)
         media, light = prepared(scene)
         assert (len(media.objects), light.contradiction, light.outside) == (1, "", 0)
-        assert not light.mixed and light._front[0] == 1
+        assert (starts(scene) != 1).mean() < 5e-3  # rays that stay between the lamp and the ceiling
 
 
 def test_light_in_a_room_of_opaque_walls():
@@ -132,24 +139,7 @@ def test_light_on_a_side_that_states_nothing(light, emits):
     front = {"type": "rectangle", "to_world": parts.transform().scale(5), "exterior": shared()}
     scene = {"type": "scene", "fog": fog(id="fog"), "sensor": parts.sensor(medium=shared())}
     scene |= {"front": front | (glows if emits else {}), "light": lights[light]}
-    _, media = prepared(mi.load_dict(scene))
-    assert media.contradiction == "" and not media.mixed
-    assert list(media._front) == [1] * (1 + emits)
-
-
-def test_a_wrong_shape_in_shells_that_agree():
-    """Rationale: boundaries all along the lines through a shape counted as its own, so that many shells hid
-    one that is wrong. Expected: it is found.
-    """
-    shells = {f"s{i}": parts.ball(radius=0.5 + i / 99, center=(0, 0, 0)) for i in range(40)}
-    both = {"interior": shared(), "exterior": shared()}
-    scene = {"type": "scene", "fog": fog(0.1, id="fog"), "outer": parts.ball(radius=1, center=(0, 0, 0))}
-    scene["outer"]["interior"] = shared()
-    scene |= {name: shell | both for name, shell in shells.items()}
-    scene["glass"] = parts.ball("dielectric", 0.05, (0, 0, 0), interior=fog(2.0), id="glass")
-    scene |= {"sensor": parts.sensor(origin=(0, 0, 4), target=(0, 0, 0)), "lamp": parts.point()}
-    _, light = prepared(mi.load_dict(scene))
-    assert "shape 'glass'" in light.contradiction
+    assert (starts(mi.load_dict(scene)) == 1).all()
 
 
 def windowed(half=0.15, gap=0.0, **more):
@@ -185,12 +175,6 @@ def porch():
     return {"roof": {"type": "rectangle", "bsdf": plaster(), "to_world": to_world}}
 
 
-def sealed(half, at, **more):
-    """A cube of plaster with nothing in it that states a medium."""
-    to_world = parts.transform().translate(list(at)).scale(half)
-    return {"type": "cube", "bsdf": plaster(), "to_world": to_world, **more}
-
-
 @pytest.mark.parametrize("covered", [False, True], ids=["open", "porch"])
 def test_sky_through_a_small_window(covered):
     """Rationale: no ray around the sensor found the window, 10 cm wide, and the sky then started in fog
@@ -198,78 +182,6 @@ def test_sky_through_a_small_window(covered):
     """
     _, light = prepared(windowed(0.05, **(porch() if covered else {})))
     assert (light.contradiction, light.outside, light.hides_infinity) == ("", 0, False)
-
-
-def test_a_lamp_behind_a_keyhole():
-    """Rationale: no ray of a lamp found the boundary, 5 cm wide, and it shone in the vacuum that the sensor
-    outside is in: 6 % too dark. Expected: it is in the fog of the room.
-    """
-    lamp = parts.lamp(center=[2, 1, 2], radius=0.5)
-    eye = parts.sensor(origin=(0, 5.1, 0.01), target=(0, 0, 0), near=1e-3)
-    scene = windowed(0.025, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0]))
-    _, light = prepared(scene)
-    assert (light.contradiction, sorted(light._front)) == ("", [0, 1])
-    assert not light.mixed
-
-
-UNKNOWN = {
-    "a gap under a porch": (lambda: windowed(0.15, gap=2, **porch()), "leave the scene in"),
-    "a hall": (lambda: windowed(0.15, hall=sealed(12, (0, 0, 0))), "in which light from infinity starts"),
-    "a lamp in a box": (
-        lambda: windowed(case=sealed(0.5, (2, 1, 0)), lamp=parts.point(position=[2, 1, 0])),
-        "meets a boundary or leaves the scene",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", UNKNOWN)
-def test_media_that_nothing_tells(name):
-    """Rationale: a medium that no ray finds was that of the sensor. Expected: no light subpaths, and why:
-    a gap beside the window, through which rays leave in fog; opaque walls around all under a sky; a lamp in a
-    closed box.
-    """
-    scene, why = UNKNOWN[name]
-    _, light = prepared(scene())
-    assert why in light.contradiction
-
-
-def closed_room():
-    """Fog that the sensor declares, in plain walls; behind a pillar glass that says it stands in nothing."""
-    behind = parts.ball("dielectric", 0.05, (0, 0.2, -0.8), interior=fog(2.0), id="glass")
-    pillar = parts.ball(parts.matte(0.5, 0.5, 0.5), 0.3, (0, 0.1, -0.2))
-    scene = parts.room(parts.sensor(origin=(0, 0, 0.7), medium=fog()), parts.point(), behind=behind)
-    return mi.load_dict(scene | {"pillar": pillar})
-
-
-CONTRADICTIONS = {
-    "a lamp whose back scatters": lambda: box(
-        shared, lamp={"exterior": shared(), "bsdf": plaster(), "to_world": below_the_ceiling(0.3, gap=0.5)}
-    ),
-    "glass in nothing": lambda: box(
-        shared, glass=parts.ball("dielectric", 0.4, (0.3, -0.6, 0), interior=fog(2.0), id="glass")
-    ),
-    "glass in other fog": lambda: box(shared, glass=parts.ball("dielectric", 0.4, exterior=fog(2.0))),
-    "merged walls in other fog": lambda: box(shared, lambda: {"exterior": fog(2.0)}),
-    "a ceiling in nothing": lambda: box(
-        shared,
-        ceiling={
-            "type": "rectangle",
-            "to_world": parts.transform().rotate(*WALLS["ceiling"]).translate([0, 0, -1]),
-            "bsdf": plaster(),
-            "interior": fog(2.0),
-        },
-    ),
-    "glass behind a pillar": closed_room,
-}
-
-
-@pytest.mark.parametrize("name", CONTRADICTIONS)
-def test_contradictions_in_rooms(name):
-    """Rationale: light and camera subpaths would see two scenes. Expected: an error of one shape among
-    others that agree, in the box above, and out of sight of a sensor that alone declares the medium.
-    """
-    _, light = prepared(CONTRADICTIONS[name]())
-    assert DISAGREE in light.contradiction
 
 
 def grid(values=None, edge=1.0, **more):

@@ -14,7 +14,6 @@ import pytest
 import welch as st
 from mitsuba_bdpt.errors import UnsupportedError, UsageError
 from mitsuba_bdpt.image.layers import strategies
-from mitsuba_bdpt.scene.prepared import PreparedScene
 
 SEEDS = 8
 ALL, CAMERA = {"skip": "none"}, {"light_paths": 0}
@@ -161,32 +160,6 @@ def test_a_lamp_of_which_a_hundredth_is_in_fog():
     }
     scene = mi.load_dict(scene)
     assert_agree(means(scene, 10, depth=4, **ALL), means(scene, 300, depth=4, **CAMERA))
-
-
-@pytest.mark.parametrize("weight, asked", [(1e-4, True), (0.0, False), (0.5, False)])
-def test_a_lamp_that_is_seldom_chosen(weight, asked):
-    """Rationale: emitters are probed as often as they are chosen; half of a lamp in fog with a hundredth of
-    the sampling weight had light of one medium. Expected: where probes are few, each ray of the kernel is
-    asked (lamps in the open here, which need not be if they are probed often, or never chosen).
-    """
-    seldom = parts.lamp(center=[-0.35, 0.35, -0.25], radius=0.1)
-    seldom["emitter"] = seldom["emitter"] | {"sampling_weight": weight}
-    scene = mi.load_dict(parts.room(fog=parts.ball(interior=parts.fog(6, 0.9)), seldom=seldom))
-    assert PreparedScene(scene, scene.sensors()[0]).light_media.mixed == asked
-
-
-def test_a_small_hole_is_found():
-    """Rationale: of random lines through a scene few meet a small shape. Expected: a glass ball, a twentieth
-    of the radius without exterior in a ball of fog is a contradiction that names it.
-    """
-    hole = parts.ball(parts.matte(0.5, 0.5, 0.5), 0.05, (0.3, 0.2, 0), id="hole")
-    fog = parts.ball("null", 1.0, (0, 0, 0), interior=parts.fog(1, 0.8))
-    scene = {"type": "scene", "sensor": parts.sensor(origin=(0, 0, 4)), "fog": fog, "lamp": parts.point()}
-    assert not contradiction(scene)
-    assert not contradiction(scene | {"hole": hole})  # its shape says nothing of media
-    hole = parts.ball("dielectric", 0.05, (0.3, 0.2, 0), id="hole", interior=parts.fog(9, 0.5))
-    found = contradiction(scene | {"hole": hole})
-    assert "shape 'hole'" in found and "give each the interior and exterior medium" in found
 
 
 def test_sensors_are_asked_where_their_rays_start():

@@ -54,18 +54,12 @@ def scene_box(scene: mi.Scene, about: Callable = asked_anew) -> mi.ScalarBoundin
     return whole
 
 
-def corners(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corners (n, 3), double precision, of the boxes ``which``."""
-    low, high = (
-        np.array([np.array(corner, dtype=np.float64).ravel() for corner in of_all])
-        for of_all in ([box.min for box in boxes], [box.max for box in boxes])
-    )
-    return low[which], high[which]
-
-
 def points_in(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray, u: np.ndarray) -> mi.Point3f:
     """Points in the boxes ``which`` at the positions ``u`` (n, 3) of the unit cube."""
-    low, high = corners(boxes, which)
+    low, high = (
+        np.array([np.array(corner, dtype=np.float64).ravel() for corner in of_all])[which]
+        for of_all in ([box.min for box in boxes], [box.max for box in boxes])
+    )
     return mi.Point3f((low + u * (high - low)).T)
 
 
