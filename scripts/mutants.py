@@ -815,8 +815,8 @@ MUTANTS = (
     Mutant(
         "pilot: each BSDF counts as a kind of its own",
         "planning/budget.py",
-        "SAMPLES_PER_KIND * asked.kinds",
-        "SAMPLES_PER_KIND * asked.count",
+        "SAMPLES_PER_KIND * dispatch.kinds",
+        "SAMPLES_PER_KIND * dispatch.count",
         ("tests/run/test_first_image.py::test_rooms_of_many_bsdfs_ask_a_pilot",),
     ),
     Mutant(
@@ -1415,7 +1415,7 @@ MUTANTS = (
     Mutant(
         "hard paths: delta events forget the newest merge",
         "transport/mis.py",
-        "h.scale(h.combine(partial.d_vm, partial.d_vn), step.cos_out)",
+        "h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)",
         "h.scale(partial.d_vm, step.cos_out)",
         ("tests/transport/test_oracle.py::test_recursion_with_merges_on_hard_paths[n1c1-balance-0.0]",),
     ),
@@ -1450,15 +1450,15 @@ MUTANTS = (
     Mutant(
         "hard paths: stored vertices lose the newest merge",
         "transport/light_path.py",
-        "(y.partial.d_vm, y.partial.d_vn), strict=False",
+        "(y.partial.d_vm, y.partial.d_vm_newest), strict=False",
         "(y.partial.d_vm, mi.Float(0)), strict=False",
         ("tests/images/test_hard_paths.py::test_stored_vertices_keep_their_merges",),
     ),
     Mutant(
         "hard paths: photons start with the density of their aim",
         "transport/photons/photon_pass.py",
-        "unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED",
-        "unaimed = kept is Kept.UNDERSAMPLED",
+        "unaimed = kernel.merges_hard or kept is PhotonPolicy.UNDERSAMPLED",
+        "unaimed = kept is PhotonPolicy.UNDERSAMPLED",
         ("tests/images/test_hard_paths.py::test_images_are_those_without_merging[steel]",),
     ),
     Mutant(

@@ -202,8 +202,8 @@ def test_the_best_table_of_paths_that_emission_alone_makes():
     root = np.sqrt(squares)
     expected = 0.25 + 0.75 * root / root.mean()
     np.testing.assert_allclose(learnt.tables.densities()[0], expected, rtol=0.08)
-    assert learnt.left == pytest.approx(root.mean() ** 2 / squares.mean(), rel=0.1)
-    assert learnt.whole == pytest.approx(learnt.left, rel=0.05)
+    assert learnt.variance_ratio == pytest.approx(root.mean() ** 2 / squares.mean(), rel=0.1)
+    assert learnt.whole == pytest.approx(learnt.variance_ratio, rel=0.05)
 
 
 def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
@@ -293,7 +293,7 @@ def test_detail_is_kept_where_it_pays():
     statistics = statistics_of(squares, 16.0, seed=4, noise=1.2)
     narrow, wide = learning.BLURS[24]
     ways = [learning._learnt(statistics.reshape(2, 1, 24, 24, -1), times, [1]) for times in (narrow, wide)]
-    assert narrow < wide and ways[1].left < ways[0].left < learning.PAYS
+    assert narrow < wide and ways[1].variance_ratio < ways[0].variance_ratio < learning.PAYS
     assert learning.learn(statistics, 24, [1]) == ways[0]
 
 

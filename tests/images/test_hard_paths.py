@@ -207,7 +207,7 @@ def test_few_photons_far_from_what_is_sharp(monkeypatch):
 
 @pytest.mark.parametrize("plate", [None, rough(0.5), matte()], ids=["ideal", "rough", "matte"])
 def test_other_scenes_merge_as_before(plate, monkeypatch):
-    """Expected: without a near-specular lobe no hard path is merged, and no subpath carries ``d_vn``."""
+    """Expected: without a near-specular lobe no path is merged as hard, and none has a ``d_vm_newest``."""
     described = mi.load_dict(under_glass(ball(), plate=plate))
     assert not PreparedScene(described, described.sensors()[0]).near_specular
     monkeypatch.setattr(passes, "HardMerging", None)
@@ -251,7 +251,7 @@ def test_stored_vertices_keep_their_merges():
     path = light_path.allocate_light_path(kernel, 2)
     light_path.store_light_vertex(kernel, vertex, path)
     found = light_path.read_light_vertex(kernel, path, mi.UInt32(0)).partial
-    for a, b in zip((found.d_vcm, found.d_vc, found.d_vm, found.d_vn), sums, strict=True):
+    for a, b in zip((found.d_vcm, found.d_vc, found.d_vm, found.d_vm_newest), sums, strict=True):
         np.testing.assert_array_equal(a, b)
 
 

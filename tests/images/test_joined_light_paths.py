@@ -270,7 +270,7 @@ def test_what_is_joined(change, joined):
     asked = SimpleNamespace(
         _prepared=SimpleNamespace(
             traits=SimpleNamespace(
-                transmits=given["transmits"], asked=SimpleNamespace(many=given["many"], count=40)
+                transmits=given["transmits"], dispatch=SimpleNamespace(many=given["many"], count=40)
             )
         ),
         _pixels=given["pixels"],

@@ -16,7 +16,7 @@ from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.measure import analysis, estimates, reference, report, sweep, tables
 from mitsuba_bdpt.measure.agreement import Means
-from mitsuba_bdpt.measure.analysis import Refused, Results
+from mitsuba_bdpt.measure.analysis import Results, Unavailable
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
@@ -89,9 +89,9 @@ def test_efficiency_pairs_the_seeds():
 
 def test_efficiency_is_refused_where_it_means_nothing():
     """An exact render, a single one."""
-    with pytest.raises(Refused, match="path is exact here"):
+    with pytest.raises(Unavailable, match="path is exact here"):
         analysis.efficiency(runs("bdpt", 2), runs("path", 2, rel_mse=0.0), "rel_mse")
-    with pytest.raises(Refused, match="fewer than two renders"):
+    with pytest.raises(Unavailable, match="fewer than two renders"):
         analysis.efficiency(runs("bdpt", 2), runs("path", 1), "rel_mse")
 
 
@@ -112,9 +112,9 @@ def test_the_gap_is_what_the_worst_values_carry():
     assert (found.median, found.smallest, found.largest, found.count) == pytest.approx((4, 2, 9, 3))
     noisy = [r | {"reference_rel_mse": 0.005, "rel_mse": r["rel_mse"] + 0.005} for r in rows]
     assert analysis.gap(noisy).median == pytest.approx(4)
-    with pytest.raises(Refused, match="bdpt is exact here"):
+    with pytest.raises(Unavailable, match="bdpt is exact here"):
         analysis.gap([r | {"rel_mse": 0.0, "rel_mse_trimmed": 0.0} for r in rows])
-    with pytest.raises(Refused, match="fewer than two renders"):
+    with pytest.raises(Unavailable, match="fewer than two renders"):
         analysis.gap(rows[:1])
 
 
@@ -155,7 +155,7 @@ def test_convergence_without_the_references_error():
     assert (found.value, found.low, found.high) == pytest.approx((-1, -1, -1))
     few = tables.said(analysis.convergence, [r for r in rows if r["seed"] < 5])
     assert few == "-1.00 (too few renders for an interval)"
-    with pytest.raises(Refused, match="fewer than two budgets"):
+    with pytest.raises(Unavailable, match="fewer than two budgets"):
         analysis.convergence([r for r in rows if r["budget"] == 4])
 
 
@@ -165,7 +165,7 @@ def test_bias_takes_the_budget_with_most_samples():
     found = analysis.bias(rows, KNOWN)
     assert not found.passed and found.missing.value == pytest.approx(0.05, abs=0.005)
     assert analysis.bias(rows[:9], KNOWN).passed
-    with pytest.raises(Refused, match="fewer than 8 renders"):
+    with pytest.raises(Unavailable, match="fewer than 8 renders"):
         analysis.bias(rows[-5:], KNOWN)
 
 
@@ -203,7 +203,7 @@ def test_the_stronger_path_decides(results):
     found = results.efficiency("dark", "path")
     assert found.bound == "≥" and found.median == pytest.approx(2)
     assert results.against_path("dark").bound == "≥" and "is missing" in results.path_lacks("dark")
-    with pytest.raises(Refused, match="not rendered"):
+    with pytest.raises(Unavailable, match="not rendered"):
         results.bias("pool", "path")
     few = Results(runs("bdpt", 3) + runs("path", 3, rel_mse=0.1), {"box": KNOWN}, {})
     assert few.efficiency("box", "path", "rel_mse").median == pytest.approx(5)
@@ -375,7 +375,7 @@ def test_choices_and_the_cost_of_the_pilot():
     assert found[1] == "t<=1" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and len(found) == 4
     assert report.OF_A_SCENE["pilot"](results, "box") == report.Measured("20.0 % at 64 spp", [20.0])
-    with pytest.raises(Refused, match="cached no pilots"):
+    with pytest.raises(Unavailable, match="cached no pilots"):
         report.OF_A_SCENE["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
 
@@ -531,7 +531,7 @@ def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
     pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
     found, made = load(Project(tmp_path), tmp_path)
     assert found.scenes == ["box"] == list(made) and not found.references
-    with pytest.raises(Refused, match="the reference has fewer than 8 renders"):
+    with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
         found.bias("box", "bdpt")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.measure import page, tables
-from mitsuba_bdpt.measure.analysis import NOTHING, Refused, Summary
+from mitsuba_bdpt.measure.analysis import NOTHING, Summary, Unavailable
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian's package chromium)")
@@ -184,7 +184,7 @@ def results(outcome, lacks=""):
         (Summary(9.0, 9, 9, 8.0, 9.0, 5, "≥"), NOTHING, np.inf, "at least 9x the time .* all energy is miss"),
         (Summary(9.0, 9, 9, 8.0, 9.0, 5, "~"), "2 % too much energy", 9, "about 9x .* here: 2 % too much"),
         (Summary(0.5, 1, 1, 0.5, 0.5, 5, "≥"), "", 0.5, "its efficiency is at most 2x ours"),
-        (Refused("bdpt is exact here"), "", np.nan, "No figure: bdpt is exact here"),
+        (Unavailable("bdpt is exact here"), "", np.nan, "No figure: bdpt is exact here"),
     ],
 )
 def test_answers_in_words(outcome, lacks, ratio, words):

@@ -205,7 +205,7 @@ def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
     for text, pattern in zip(warnings, said, strict=True):
         share = sum(integrator.statistics["unsampled_light"].values())
         assert re.search(pattern, text) and text.startswith("not sampled, "), text
-        assert unsampled_light.WORTH_A_WORD < share <= 1
+        assert unsampled_light.WARN_SHARE < share <= 1
 
 
 def said_before(integrator, scene, spp, monkeypatch):
@@ -323,7 +323,7 @@ def test_red_light_on_a_blue_floor_is_no_loss():
         scene = scene_of(lamp, block=BLOCK, floor=floor() | {"bsdf": blue})
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
         found = sum(unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance.values())
-        assert found > unsampled_light.WORTH_A_WORD if lost else found == 0
+        assert found > unsampled_light.WARN_SHARE if lost else found == 0
 
 
 def test_a_mask_reflects_what_its_opacity_says(monkeypatch):

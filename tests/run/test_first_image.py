@@ -104,7 +104,7 @@ def test_lit_rooms_are_decided(light):
     scene = mi.load_dict(lit_room(light, 54))
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 8})
     render = Render(scene, scene.sensors()[0], integrator.settings, 0, 64)
-    assert render.prepared.traits.asked.count > 54
+    assert render.prepared.traits.dispatch.count > 54
     assert render.planner.begin(()) == (light != "window")
     if light == "window":
         assert not render.plan.light
@@ -183,7 +183,7 @@ def test_rooms_of_many_bsdfs_ask_a_pilot():
     that `room` makes, of all its kinds."""
     scene = mi.load_dict(room(40, 16))
     prepared = PreparedScene(scene, scene.sensors()[0])
-    assert prepared.traits.asked.kinds == len(KINDS) + 1  # and that of the lamp, which is not two-sided
+    assert prepared.traits.dispatch.kinds == len(KINDS) + 1  # and that of the lamp, which is not two-sided
     assert budget.least_samples(prepared) <= 256 * 144 * 64 / 2
 
 
@@ -217,7 +217,7 @@ def test_kinds_of_bsdfs_share_functions(kernels):
         scene = mi.load_dict(room(materials, 16))
         render(scene)
         traits = bsdf.Traits.of([shape.bsdf() for shape in scene.shapes()])
-        counts.append((traits.asked.kinds, functions(max(kernels, key=len))))
+        counts.append((traits.dispatch.kinds, functions(max(kernels, key=len))))
         kernels.clear()
     (kinds, few), (same, many) = counts
     assert kinds == same and few <= many <= 1.1 * few

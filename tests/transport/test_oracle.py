@@ -551,7 +551,7 @@ class Flat:
 
 
 class Directly:
-    """`bsdf.Asked` without virtual calls: stand-ins answer themselves."""
+    """`bsdf.BSDFDispatch` without virtual calls: stand-ins answer themselves."""
 
     shared = False
 
@@ -666,7 +666,7 @@ def kernel_weights(
         emitters=Lights(world),
         plan=plan,
         heuristic=mis.Heuristic(name),
-        traits=bsdf.Traits(full_pdf=False, round_trip=False, asked=Directly()),
+        traits=bsdf.Traits(full_pdf=False, round_trip=False, dispatch=Directly()),
         reverse=True,
         strategy_images=False,
         store_size=64,

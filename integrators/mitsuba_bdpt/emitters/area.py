@@ -232,8 +232,8 @@ class AreaEmitters(Group):
 
     # -- directions of emission -------------------------------------------------------------
 
-    def placed(self, guide: EmissionGuide | None) -> Group:
-        other = super().placed(guide)
+    def with_guide(self, guide: EmissionGuide | None) -> Group:
+        other = super().with_guide(guide)
         other._tables = table(rows(self._emitters, _Table(), self._directions))
         return other
 

@@ -128,18 +128,18 @@ class Emitters:
 
     # -- hooks of guided emission -------------------------------------------------------------
 
-    def placed(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
+    def with_guide(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
         """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
         other = copy(self)
         other.has_places = other.indexed = True
         other.groups = tuple(
-            group.placed(guide if guide is not None and any(is_guided[i] for i in own) else None)
+            group.with_guide(guide if guide is not None and any(is_guided[i] for i in own) else None)
             for group, own in zip(self.groups, self._of_groups, strict=True)
         )
         return other
 
     def place(self, index: mi.UInt32, p, d, cos, side: int, active: mi.Bool) -> tuple[Place, Factor]:
-        """`Group.place` and `Group.factor` of emissions; only for copies made by `placed`."""
+        """`Group.place` and `Group.factor` of emissions; only for copies made by `with_guide`."""
 
         def where(group: Group, mask: mi.Bool):
             return group.place(index, p, d, mask), group.factor(index, p, d, cos, side, mask)

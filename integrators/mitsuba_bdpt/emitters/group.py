@@ -81,7 +81,7 @@ class Group:
         """Number of squares of primary numbers of this emitter, see `place`; 0: not guidable."""
         return 0
 
-    def placed(self, guide: EmissionGuide | None) -> Group:
+    def with_guide(self, guide: EmissionGuide | None) -> Group:
         """Return a copy that has `place`, guided by ``guide`` (None: unguided)."""
         other = copy(self)
         other.guide = guide
@@ -90,7 +90,7 @@ class Group:
     def place(self, index: mi.UInt32, p, d, active) -> Place:
         """Primary numbers of emissions of ``index`` that pass ``p`` along ``d``.
 
-        Only for copies made by `placed`.
+        Only for copies made by `with_guide`.
         """
         raise NotImplementedError(f"{type(self).__name__} has no place")
 

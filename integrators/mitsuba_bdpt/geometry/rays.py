@@ -94,7 +94,7 @@ def _before(a: Anchor, b: Anchor) -> mi.Point3f:
 def end_point(a: Anchor, b: Anchor) -> mi.Point3f:
     """End of a shadow ray from ``a`` to ``b``, just before ``b``'s surface."""
     end = _before(a, b)
-    # Decided at recording: scenes without spheres and cylinders record nothing below.
+    # PlannerState at recording: scenes without spheres and cylinders record nothing below.
     if b.curvature.state == dr.VarState.Literal and b.curvature[0] == 0:
         return end
     back = a.p - end

@@ -95,11 +95,11 @@ class EmissionStatistics:
 class Learnt:
     """Fitted ``tables``, or None without gain, and what they leave of second moments.
 
-    ``left``: of the strategies whose light subpath chooses the emission; ``whole``: of all strategies.
+    ``variance_ratio``: of strategies whose light subpath chooses the emission; ``whole``: of all strategies.
     """
 
     tables: EmissionTables | None
-    left: float = 1.0
+    variance_ratio: float = 1.0
     whole: float = 1.0
 
 
@@ -126,13 +126,13 @@ def _learnt(statistics: np.ndarray, times: int, counts: Sequence[int]) -> Learnt
         left, whole = np.mean(found, axis=0)
         if left.max() < 1:
             judged[a] = Learnt(None, float(np.sqrt(left.prod())), float(np.sqrt(whole.prod())))
-    best = min(judged.values(), key=lambda learnt: learnt.left, default=Learnt(None))
-    if best.left >= PAYS:
+    best = min(judged.values(), key=lambda learnt: learnt.variance_ratio, default=Learnt(None))
+    if best.variance_ratio >= PAYS:
         return best
     least = next(a for a, learnt in judged.items() if learnt is best)
     densities = least + (1 - least) * _fitted(statistics.sum(axis=0), times)
     densities[~guided] = 1
-    return replace(best, tables=EmissionTables.of(densities, best.left))
+    return replace(best, tables=EmissionTables.of(densities, best.variance_ratio))
 
 
 def _worth_a_table(statistics: np.ndarray, halves: list[np.ndarray], counts: Sequence[int]) -> np.ndarray:
@@ -149,9 +149,8 @@ def _worth_a_table(statistics: np.ndarray, halves: list[np.ndarray], counts: Seq
 
 def left_out(learnt: Learnt) -> list[dict[str, str]]:
     """Why what was ``learnt`` is not used, as in ``statistics["skipped"]``."""
-    why = (
-        f"in the pilot, tables leave {learnt.left:.0%} of the squared error of strategies with light subpaths"
-    )
+    ratio = f"{learnt.variance_ratio:.0%}"
+    why = f"in the pilot, tables leave {ratio} of the squared error of strategies with light subpaths"
     why += f"; they are used below {PAYS:.0%}" if learnt.tables is None else "; path tracing alone is better"
     return [{"class": "guided emission", "level": "not worth its cost here", "why": why}]
 

@@ -72,7 +72,7 @@ class EmissionTables:
                 f"{sum(emitters.tables)}; use what a render of this scene has recorded"
             )
         first = _first_tables(emitters.tables, (densities != 1).any(axis=(1, 2)))
-        return emitters.placed(EmissionGuide(self, first), [number > 0 for number in first])
+        return emitters.with_guide(EmissionGuide(self, first), [number > 0 for number in first])
 
     def record(self) -> dict[str, int | float | str]:
         return asdict(self)
@@ -129,7 +129,7 @@ class Cells:
     """
 
     def __init__(self, emitters: Emitters):
-        self.emitters = emitters.placed()
+        self.emitters = emitters.with_guide()
         tables = sum(emitters.tables)
         self.side = side_of(tables)
         self.count = tables * self.side**2

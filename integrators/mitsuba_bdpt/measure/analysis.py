@@ -1,8 +1,8 @@
 """Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
 Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error), with the errors of `estimates`.
-Comparisons pair renders of equal seed, which ran consecutively. Unavailable figures raise `Refused` with the
-reason.
+Comparisons pair renders of equal seed, which ran consecutively. What there is not raises `Unavailable`
+with the reason.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ ALONE_HERE = "fewer than two renders: seeds = 2 or more"
 """Why there is no figure, with the preset's key that mends it."""
 
 
-class Refused(CommandError):
+class Unavailable(CommandError):
     """A figure that cannot be computed from the data; the text has the reason."""
 
 
@@ -135,11 +135,11 @@ def select(rows: Iterable[Row], **wanted: object) -> list[Row]:
 
 
 def paired(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:
-    """Return pairs of renders with equal seeds; raises `Refused` for less than two."""
+    """Return pairs of renders with equal seeds; raises `Unavailable` for less than two."""
     by_seed = {row["seed"]: row for row in theirs}
     pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
     if len(pairs) < 2:
-        raise Refused("fewer than two pairs of seeds")
+        raise Unavailable("fewer than two pairs of seeds")
     return pairs
 
 
@@ -149,14 +149,14 @@ def _ratios(
     """Return the ratio of efficiencies 1 / (seconds * error) of each pair, ours over theirs, and its bound.
 
     Also the ratio of errors at equal time, and of times at equal error, if errors fall as 1 / time, which
-    `slope` tests. Raises `Refused` for errors of 0.
+    `slope` tests. Raises `Unavailable` for errors of 0.
     """
     by_seed: list[dict[int, float]] = []
     bounds: list[Bound] = []
     for rows, differs in zip((ours, theirs), differ, strict=True):
         errors, bound = seed_errors(rows, error, differs)
         if min(errors) == 0:
-            raise Refused(f"{rows[0]['method']} is exact here")
+            raise Unavailable(f"{rows[0]['method']} is exact here")
         by_seed.append({row["seed"]: x * row["seconds"] for row, x in zip(rows, errors, strict=True)})
         bounds.append(bound)
     ratios = [by_seed[1][b["seed"]] / by_seed[0][a["seed"]] for a, b in paired(ours, theirs)]
@@ -171,11 +171,11 @@ def efficiency(
 ) -> Summary:
     """Return the summary of the ratios of efficiencies, ours over theirs, of pairs of seeds.
 
-    ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises `Refused` for fewer
-    than two pairs, and for errors of 0.
+    ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises `Unavailable` for
+    fewer than two pairs, and for errors of 0.
     """
     if len(ours) < 2 or len(theirs) < 2:
-        raise Refused(ALONE_HERE)
+        raise Unavailable(ALONE_HERE)
     ratios, bound = _ratios(ours, theirs, error, differ)
     return replace(summary(ratios), bound=bound)
 
@@ -183,10 +183,10 @@ def efficiency(
 def gap(rows: Sequence[Row], differs: bool = False) -> Summary:
     """Return the summary of raw over trimmed relMSE: large where few values carry most of the error."""
     if len(rows) < 2:
-        raise Refused(ALONE_HERE)
+        raise Unavailable(ALONE_HERE)
     (raw, _), (trimmed, _) = (seed_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
     if min(*raw, *trimmed) == 0:
-        raise Refused(f"{rows[0]['method']} is exact here")
+        raise Unavailable(f"{rows[0]['method']} is exact here")
     return summary([a / b for a, b in zip(raw, trimmed, strict=True)])
 
 
@@ -218,7 +218,7 @@ def convergence(
     budget has fewer than `FEWEST_WITH_INTERVAL` renders.
     """
     if not rows:
-        raise Refused("not rendered")
+        raise Unavailable("not rendered")
     runs: dict[float, list[float]] = {}
     for budget in sorted({row["budget"] for row in rows}):
         at = select(rows, budget=budget)
@@ -226,7 +226,7 @@ def convergence(
         if len(at) >= 2 and min(errors) > 0:
             runs[float(np.median([row["spp"] for row in at]))] = errors
     if len(runs) < 2:
-        raise Refused("fewer than two budgets with two renders")
+        raise Unavailable("fewer than two budgets with two renders")
     found = slope(list(runs), list(runs.values()))
     is_few = min(map(len, runs.values())) < FEWEST_WITH_INTERVAL
     return Estimate(found.value, -math.inf, math.inf) if is_few else found
@@ -240,7 +240,7 @@ def bias(rows: Sequence[Row], reference: Means) -> BiasCheck:
     budgets = {row["budget"]: select(rows, budget=row["budget"]) for row in rows}
     enough = [at for at in budgets.values() if len(at) >= FEWEST_RUNS]
     if not enough:
-        raise Refused(f"fewer than {FEWEST_RUNS} renders of one budget")
+        raise Unavailable(f"fewer than {FEWEST_RUNS} renders of one budget")
     best = max(enough, key=lambda at: sum(row["spp"] for row in at))
     return compare_means(Means.of([row["tile_means"] for row in best]), reference)
 
@@ -332,7 +332,7 @@ class Results:
             for rival in self.rivals:
                 try:
                     self.efficiency(scene, rival)
-                except Refused:
+                except Unavailable:
                     continue
                 return True
         return False
@@ -380,16 +380,16 @@ class Results:
         """Return the bias check against the scene's reference."""
         if scene not in self.references:
             there = self.of(scene, method)
-            raise Refused(FEW if there else "not rendered")
+            raise Unavailable(FEW if there else "not rendered")
         return bias(self.of(scene, method), self.references[scene])
 
     def probed(self, name: str) -> dict[str, list[float]]:
         """Return a probe's results for the software of the rows."""
         probe, row = self.probes.get(name), self.rows[0]
         if probe is None:
-            raise Refused("not measured")
+            raise Unavailable("not measured")
         if probe["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
-            raise Refused("measured of another version or on another machine")
+            raise Unavailable("measured of another version or on another machine")
         return probe["values"]
 
     def lacks(self, scene: str, method: str) -> str:
@@ -405,9 +405,9 @@ class Results:
         counts = Counter(row["budget"] for row in rows)
         several = [n for n, count in counts.items() if count > 1]
         if not several:
-            raise Refused(ALONE_HERE)
+            raise Unavailable(ALONE_HERE)
         if scene not in self.references:
-            raise Refused(FEW)
+            raise Unavailable(FEW)
         budget = self.deciding if counts[self.deciding] > 1 else max(several)
         columns = [row["tile_means"] for row in select(rows, budget=budget)]
         share = missing_energy(Means.of(columns, fewest=2).whole, self.references[scene].whole)
@@ -426,7 +426,7 @@ class Results:
         def found(scene: str, method: str) -> str:
             try:
                 check = self.bias(scene, method)
-            except Refused:
+            except Unavailable:
                 # Too few seeds for a check: only an image that is black where the reference is not fails.
                 rows = self.of(scene, method) if scene in self.references else []
                 return NOTHING if rows and not np.any([row["tile_means"] for row in rows]) else ""
@@ -451,7 +451,7 @@ class Results:
         """Return the relMSE of an integrator at a budget, by default the deciding one."""
         rows = self.of(scene, method, budget or self.deciding)
         if not rows:
-            raise Refused("not rendered")
+            raise Unavailable("not rendered")
         return relative_error(rows, error, self.differs(scene, method, budget))
 
     def convergence(self, scene: str, method: str) -> Estimate:
@@ -468,7 +468,7 @@ class Results:
         def size(scene: str) -> float:
             try:
                 return self.gap(scene, method).median
-            except Refused:
+            except Unavailable:
                 return 0.0
 
         return sorted(self.scenes, key=size, reverse=True)
@@ -502,7 +502,7 @@ class Results:
         """
         rivals = self.standard_in(scene)
         if not rivals:
-            raise Refused(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
+            raise Unavailable(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
         fair = [rival for rival in rivals if not self.lacks(scene, rival)] or rivals
         found = [self.efficiency(scene, rival, error, budget) for rival in fair]
         return min(found, key=lambda ratio: ratio.median)

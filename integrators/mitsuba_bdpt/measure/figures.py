@@ -32,8 +32,8 @@ from .analysis import (
     NONE,
     RIVALS,
     UNAIMED,
-    Refused,
     Results,
+    Unavailable,
 )
 from .estimates import FEWEST_WITH_INTERVAL, Bound
 from .paper import PAPER, WIDTHS, check_figure, save
@@ -301,7 +301,7 @@ def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float,
     """Plot one efficiency with its interval at the height ``y``; return its number of seeds, if any."""
     try:
         ratio = results.efficiency(scene, rival, error)
-    except Refused:
+    except Unavailable:
         return set()
     face = look["color"] if error == "rel_mse_trimmed" else "white"
     axis.plot([ratio.low, ratio.high], [y, y], color=look["color"], linewidth=0.8)

@@ -428,7 +428,7 @@ class Halves:
         return Reference(image, difference, self.means(), provenance)
 
 
-class Aim:
+class AccuracyTarget:
     """The renders that a reference has to judge.
 
     Default `bdpt` with ``spp`` samples per pixel (with `merging` if that makes the reference), and a path
@@ -532,7 +532,8 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
         halves.go_on_from(stored, [window.slices for window in windows])
     spp = _fitting(job, scene, integrator, started) if job.rounds > 1 else PASS_SPP
-    reached = _refined(job, halves, Aim(job, scene, by), (scene, integrator, windows), spp, started)
+    aim = AccuracyTarget(job, scene, by)
+    reached = _refined(job, halves, aim, (scene, integrator, windows), spp, started)
     provenance = provenance_of(
         job,
         integrator=parameters,
@@ -576,7 +577,9 @@ def _fitting(job: Job, scene, integrator, started: float) -> int:
     return samples_taken(scene, integrator, found)
 
 
-def _refined(job: Job, halves: Halves, aim: Aim, rendered: tuple, spp: int, started: float) -> bool:
+def _refined(
+    job: Job, halves: Halves, aim: AccuracyTarget, rendered: tuple, spp: int, started: float
+) -> bool:
     """Add rounds to the ``halves`` until they are good enough or the time is over; return whether they are.
 
     ``rendered``: scene, integrator and windows; ``spp``: of each render. Renders with less than the job's are

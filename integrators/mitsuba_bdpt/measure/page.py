@@ -22,7 +22,7 @@ from markdown_it import MarkdownIt
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..files.whole import check_own
-from .analysis import NOTHING, Refused, Results
+from .analysis import NOTHING, Results, Unavailable
 from .project import Project
 from .reference import HALF_MAX
 from .report import KINDS, Report
@@ -65,7 +65,7 @@ def answer(results: Results, scene: str) -> tuple[float, str]:
     lacks = results.path_lacks(scene)
     try:
         found = results.against_path(scene)
-    except Refused as why:
+    except Unavailable as why:
         return math.nan, f"No figure: {str(why).rstrip('.')}."
     added = f" {rival} fails the bias check here: {lacks}." if lacks else ""
     least, most = BOUNDS[found.bound]

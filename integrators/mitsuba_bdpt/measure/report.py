@@ -37,9 +37,9 @@ from .analysis import (
     NONE,
     RIVALS,
     UNAIMED,
-    Refused,
     Results,
     Summary,
+    Unavailable,
     cost,
     efficiency,
     geometric_mean,
@@ -151,7 +151,7 @@ def budgets_table(results: Results) -> str:
         for budget in sorted({row["budget"] for row in results.of(scene, results.methods[0])}):
             try:
                 figure("rel_mse", budget, scene)
-            except Refused:  # a single render, or none, or an exact one
+            except Unavailable:  # a single render, or none, or an exact one
                 continue
             found.append(budget)
         if found:
@@ -222,7 +222,7 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     def bias(scene: str) -> str:
         try:
             verdict = _verdict(results.bias(scene, ours), made[scene].merged)
-        except Refused as few:
+        except Unavailable as few:
             verdict = said(_without_verdict, results, scene, ours, few)
         return f"{verdict}, by {_maker(made[scene])}"
 
@@ -240,7 +240,7 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     return by_scene(results.scenes, _rendered(results, columns, of))
 
 
-def _without_verdict(results: Results, scene: str, method: str, why: Refused) -> str:
+def _without_verdict(results: Results, scene: str, method: str, why: Unavailable) -> str:
     return f"energy {_energy(results, scene, method)} ({why}: no verdict)"
 
 
@@ -317,10 +317,10 @@ def _pilot_percent(rows: Sequence[Row]) -> float:
     shares: list[float] = []
     for row in rows:
         if (first := row.get("seconds_pilot")) is None:
-            raise Refused("rows of a version that cached no pilots")
+            raise Unavailable("rows of a version that cached no pilots")
         shares.append(first / (first + row["seconds"]))
     if not shares:
-        raise Refused("not rendered")
+        raise Unavailable("not rendered")
     return 100 * float(np.median(shares))
 
 
@@ -411,7 +411,7 @@ def _measured(
     for name, figure in figures.items():
         try:
             found = figure()
-        except Refused as why:
+        except Unavailable as why:
             texts.append(f"{why} {name}")
             values.append(np.nan)
         else:
@@ -453,10 +453,10 @@ def _worst(results: Results) -> Measured:
     for scene in results.scenes:
         try:
             found[scene] = results.against_path(scene)
-        except Refused:  # not rendered, or exact
+        except Unavailable:  # not rendered, or exact
             continue
     if not found:
-        raise Refused("not rendered")
+        raise Unavailable("not rendered")
     worst = min(found, key=lambda scene: found[scene].median)
     return Measured(f"`{worst}` of {len(found)} scenes: {_near(found[worst])}", [found[worst].median])
 
@@ -479,10 +479,10 @@ def _mean_over_none(results: Results, scenes: list[str]) -> Measured:
         for scene in scenes:
             try:
                 medians.append(results.efficiency(scene, NONE, error).median)
-            except Refused:  # not rendered, or exact
+            except Unavailable:  # not rendered, or exact
                 continue
         if not medians:
-            raise Refused("not rendered")
+            raise Unavailable("not rendered")
         found[kind] = geometric_mean(medians)
     text = ", ".join(f"{ratio(mean)} {kind}" for kind, mean in found.items())
     return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", list(found.values()))
@@ -520,7 +520,7 @@ def _pilot(results: Results, scene: str) -> Measured:
         if rows := results.of(scene, results.methods[0], budget):
             shares[budget] = _pilot_percent(rows)
     if not shares:
-        raise Refused(f"no render of {scene}")
+        raise Unavailable(f"no render of {scene}")
     text = ", ".join(f"{share:.1f} % at {budget} spp" for budget, share in shares.items())
     return Measured(text, [shares[max(shares)]])
 
@@ -600,7 +600,7 @@ def goals_table(results: Results, goals: list[Goal]) -> str:
             return Measured("not measured yet", [])
         try:
             return OF_ALL[measure](results) if scene is None else OF_A_SCENE[measure](results, scene)
-        except Refused as why:
+        except Unavailable as why:
             return Measured(str(why), [])
 
     lines: list[list[str]] = []

@@ -8,7 +8,7 @@ import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from ..errors import CommandError
-from .analysis import Refused, Summary
+from .analysis import Summary, Unavailable
 from .estimates import FEWEST_WITH_INTERVAL, RelativeError
 from .metrics import Estimate
 
@@ -100,7 +100,7 @@ def said(figure: Callable[..., object], *given: object) -> str:
     """Call ``figure`` and format what it returns, or the reason why there is none."""
     try:
         found = figure(*given)
-    except Refused as why:
+    except Unavailable as why:
         return str(why)
     if isinstance(found, Summary):
         return ranged(found)

@@ -99,7 +99,7 @@ class Media:
             mi.BSDFFlags.Null
         )
 
-    def is_lit(self, number: mi.UInt32) -> mi.Bool:
+    def allows_next_event(self, number: mi.UInt32) -> mi.Bool:
         """Mask: next-event estimation is allowed in the medium, or on surfaces (number 0)."""
         return dr.gather(mi.UInt32, self._lit, number) == 1
 

@@ -1,7 +1,7 @@
 """Vertex merging (photon mapping) of SDS paths. A component.
 
 `Passes` traces the photons of each pass of a render and returns a `merging.Merging`, the further strategy of
-the kernel (`sds.SdsStrategy`). `estimate` estimates the light that no other strategy samples.
+the kernel (`sds.PhotonStrategy`). `estimate` estimates the light that no other strategy samples.
 """
 
 from .passes import Passes, check

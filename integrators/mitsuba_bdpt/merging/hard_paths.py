@@ -86,7 +86,7 @@ class HardMerging(Merging):
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
-        light = mis.Partial(0, y.older, y.d_vm, y.d_vn), y.connection, f.pdf_fwd_w
+        light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
         camera = z.partial, newest_connection(kernel, kernel.kappa.splat, z), f.pdf_rev_w
         h = kernel.heuristic
         weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera)

@@ -29,7 +29,7 @@ from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon, same_surface
-from ..transport.sds import SdsStrategy, State, begun
+from ..transport.sds import PhotonStrategy, State, begun
 from ..transport.walk import Vertex, is_sds_vertex
 from .radius import Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
@@ -43,7 +43,7 @@ _FLAT = 0.25
 
 
 @dataclass
-class Merging(SdsStrategy):
+class Merging(PhotonStrategy):
     """Vertex merging in one pass.
 
     ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:

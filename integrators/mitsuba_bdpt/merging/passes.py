@@ -16,7 +16,7 @@ from ..transport.inputs import Kernel
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
-from ..transport.photons.photon_pass import Kept
+from ..transport.photons.photon_pass import PhotonPolicy
 from .hard_paths import HardMerging
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
 from .radius import Footprints, in_pass
@@ -103,7 +103,7 @@ def photons_of_pass(samples: int, pixels: int, radius: float, each: int = SAMPLE
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
-    traced = photon_pass.trace(kernel, merging, merging.aim, points, count, Kept.MERGED)
+    traced = photon_pass.trace(kernel, merging, merging.aim, points, count, PhotonPolicy.MERGED)
     return replace(merging, photons=sort(merging, traced.photons, traced.count)), traced.counters
 
 

@@ -22,7 +22,7 @@ from ..transport.inputs import Kernel, Observer
 from ..transport.near_specular import NARROW
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
-from ..transport.photons.photon_pass import Kept
+from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.sds import State
 from ..transport.walk import has_lobe, is_sds_vertex, random_walk
 from .merging import Merging
@@ -80,7 +80,7 @@ def estimate(
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
     undersampled = None if samples is None else Undersampled.of(samples)
-    kept = Kept.UNSAMPLED if samples is None else Kept.UNDERSAMPLED
+    kept = PhotonPolicy.UNSAMPLED if samples is None else PhotonPolicy.UNDERSAMPLED
     traced = photon_pass.trace(kernel, merging, aim, photon_points, count, kept)
     merging.photons = sort(merging, traced.photons, traced.count)
     found = _merged(kernel, merging, batch, points, undersampled)

@@ -65,13 +65,13 @@ def least_samples(prepared: PreparedScene) -> int:
 
 def samples_of_kernel(traits: Traits) -> int:
     """Compilation and recording of a pilot's kernel in samples; 0 without many BSDFs."""
-    asked = traits.asked
-    return SAMPLES_PER_KIND * asked.kinds + SAMPLES_PER_BSDF * asked.count if asked.many else 0
+    dispatch = traits.dispatch
+    return SAMPLES_PER_KIND * dispatch.kinds + SAMPLES_PER_BSDF * dispatch.count if dispatch.many else 0
 
 
 def predicts_guiding(prepared: PreparedScene, samples: int) -> bool:
     """Whether a pilot predicts the gain of photon-guided BSDF sampling."""
-    return not prepared.traits.asked.many or samples >= GUIDING_TIMES * least_samples(prepared)
+    return not prepared.traits.dispatch.many or samples >= GUIDING_TIMES * least_samples(prepared)
 
 
 def lanes(samples: int) -> int:

@@ -14,7 +14,7 @@ from ..scene.prepared import PreparedScene
 Found = TypeVar("Found")
 
 
-class Findings:
+class SceneCache:
     """Cached results for the scene of one render, by kind and key.
 
     Reads the parameters of scene and sensor once (up to 8 ms), and again after `expire`.

@@ -24,7 +24,7 @@ from ..transport import subpaths, techniques
 from ..transport.inputs import Kernel, Observer
 from ..transport.photons import unsampled
 from ..transport.plan import Plan
-from .findings import Findings
+from .findings import SceneCache
 from .possible import Rest, Start, UnsampledPaths, unsampled_paths
 from .unsampled_light import NAMED, called, delta_kernel, points
 
@@ -35,7 +35,7 @@ POINTS = 1 << 10
 HITTING = 1 << 18
 
 
-def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: Findings) -> list[str]:
+def warnings(prepared: PreparedScene, plan: Plan, settings: Settings, findings: SceneCache) -> list[str]:
     """Warnings about such light, direct and by delta events; empty if all is sampled."""
     unsampled = [paths for paths in unsampled_paths(prepared, plan, settings) if paths.rest is Rest.SENSOR]
     return [_warning(prepared, plan, settings, findings, paths) for paths in unsampled]

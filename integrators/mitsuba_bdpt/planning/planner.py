@@ -21,7 +21,7 @@ from . import budget, choice, pilot
 from .candidates import LEFT_OUT, candidates, without_pilot
 from .configuration import Decision, not_worth, replayed
 from .explain import words
-from .findings import Findings
+from .findings import SceneCache
 from .moments import Moments
 from .possible import plan, unsampled_paths, why_not_joined
 
@@ -51,7 +51,7 @@ class Pilots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Decided:
+class PlannerState:
     """Decisions of a render so far; part of its progress.
 
     ``left_out``: what the last of ``decisions`` leaves out, as in ``statistics["skipped"]``; ``no_pilot``:
@@ -91,13 +91,13 @@ class Planner:
     # The same for all seeds of a render, so that all decide alike. The most efficient of 32.
     pilot_seed = 30
 
-    def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: Findings):
+    def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: SceneCache):
         self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
         self._pixels = int(prepared.camera.region.size.prod())
         self.full = plan(prepared, settings)
         joined = JOINED[-1] if self._is_worth_joining(self._expected(())) else 1
         self.full = self.plan = budget.first_plan(self.full, prepared, settings, self._pixels, joined)
-        self.threshold, self.changes, self.decided = None, 0, Decided()
+        self.threshold, self.changes, self.decided = None, 0, PlannerState()
         # Moments of the newest pilot with tables of emission.
         self._with_tables: Moments | None = None
 
@@ -156,22 +156,22 @@ class Planner:
             return table, None
         learnt = self._fitted_emission(moments)
         lit = min((row.score for row in table if row.candidate.light_paths), default=math.inf)
-        is_lit = table[0].candidate.light_paths > 0
-        if learnt.tables is None or (not is_lit and lit * learnt.whole > table[0].score):
+        allows_next_event = table[0].candidate.light_paths > 0
+        if learnt.tables is None or (not allows_next_event and lit * learnt.whole > table[0].score):
             return table, learnt
-        if not is_lit:
+        if not allows_next_event:
             found = self._measured(samples, learnt.tables)
             guided = choice.choose(found, self._alternatives(samples))
             if not found.mean > 0 or not guided or not guided[0].candidate.light_paths:
                 return table, learnt
             self._with_tables, table = found, guided
-        return [row.with_emission(learnt.tables, is_lit) for row in table], learnt
+        return [row.with_emission(learnt.tables, allows_next_event) for row in table], learnt
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
-        asked = self._prepared.traits.asked  # the approximation asks every BSDF five times more
+        dispatch = self._prepared.traits.dispatch  # the approximation asks every BSDF five times more
         return (
-            samples >= JOINED_SAMPLES + (budget.SAMPLES_PER_BSDF * asked.count if asked.many else 0)
+            samples >= JOINED_SAMPLES + (budget.SAMPLES_PER_BSDF * dispatch.count if dispatch.many else 0)
             and self._pixels >= JOINED_PIXELS
             and not self._prepared.traits.transmits
             and dr.backend_v(mi.Float) == dr.JitBackend.LLVM
@@ -227,7 +227,7 @@ class Planner:
         self.decided = replace(self.decided, decisions=decisions, left_out=tuple(left_out))
         self.threshold, self.plan = decision.threshold, adopted
 
-    def restore(self, decided: Decided):
+    def restore(self, decided: PlannerState):
         """Resume from the decisions of an earlier part of the render."""
         for decision in decided.decisions:
             self.adopt(decision, decided.left_out)

@@ -32,12 +32,12 @@ from ..transport.plan import Plan
 from .possible import SHORTEST, Start, unsampled_paths
 
 # Subpaths from either end: the fewest, the most, and samples of the render per subpath. The noise of the
-# estimate suffices for `WORTH_A_WORD`, not for a figure to rely on; see experiments, "Vertex merging". Few
+# estimate suffices for `WARN_SHARE`, not for a figure to rely on; see experiments, "Vertex merging". Few
 # photons from infinity meet a small glass: of 2^13, none did for three of eight seeds.
 SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 64
 
 # Share of an image's light from which on a warning is given.
-WORTH_A_WORD = 0.01
+WARN_SHARE = 0.01
 
 # Least density of a lobe (solid angle) that may leave light undersampled; the estimate is dear beside a short
 # render (see experiments, "Near-specular lobes").
@@ -205,7 +205,7 @@ def points(kind: str) -> Points:
 def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
     """At most `NAMED` of the ``shapes``, by index, through which most of ``found`` is seen."""
     amounts = np.bincount(shapes, np.where(np.isfinite(found), found, 0))
-    order = [i for i in np.argsort(-amounts) if i and amounts[i] > WORTH_A_WORD * amounts.sum()]
+    order = [i for i in np.argsort(-amounts) if i and amounts[i] > WARN_SHARE * amounts.sum()]
     return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0] for i in order[:NAMED]]
 
 
@@ -264,7 +264,7 @@ def in_words(
     ``shares`` of the image's light by emitter index, in a render of ``samples`` per pixel.
     """
     all_of_it = sum(shares.values())
-    if all_of_it < WORTH_A_WORD:
+    if all_of_it < WARN_SHARE:
         return ""
     share = "nearly all" if all_of_it > 0.99 else f"about {100 * all_of_it:.0f} %"
     return _in_words(prepared, plan, shares, unsampled, samples, f"{share} of the image's light")
@@ -293,7 +293,7 @@ def _in_words(
     """`in_words` of this ``share``; ``parts`` of it by emitter index."""
     emitters = prepared.emitters.objects
     order = sorted(parts, key=parts.__getitem__, reverse=True)
-    least = WORTH_A_WORD * sum(parts.values())
+    least = WARN_SHARE * sum(parts.values())
     lamps = [emitters[i] for i in order if parts[i] >= least][:NAMED]
     what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
     if unsampled.is_undersampled:

@@ -25,7 +25,7 @@ from ..image.sink import Image
 from ..planning import missed_direct, unsampled_light
 from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE
-from ..planning.findings import Findings
+from ..planning.findings import SceneCache
 from ..planning.planner import Planner
 from ..planning.unsampled_light import UnsampledLight
 from ..progress import Report
@@ -41,7 +41,7 @@ from ..transport.photons.aim import Aim
 from ..transport.photons.guided_hits import Guiding
 from ..transport.photons.photon_guide import Guide
 from ..transport.plan import Plan
-from ..transport.sds import SdsStrategy
+from ..transport.sds import PhotonStrategy
 from . import messages
 from .schedule import REPLICATES, PassPoints, Step, batches, longest_pass, passes_since, schedule
 from .snapshot import Progress, Snapshot, identity
@@ -87,7 +87,7 @@ class Render:
         messages.warn_of_light_groups(scene, sensor, self.light_groups)
         if settings.merging:
             components.merging.check(sensor, self.prepared.space is not None)
-        self.findings = Findings(self.prepared, sensor)
+        self.findings = SceneCache(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
@@ -266,7 +266,7 @@ class Render:
         """Return whether contributions of strategies in use may play roulette."""
         return self.plan.roulette and self.plan.light
 
-    def _photons(self, step: Step, merging: Passes) -> SdsStrategy:
+    def _photons(self, step: Step, merging: Passes) -> PhotonStrategy:
         """Trace the photons of a pass; returns their merging."""
         done, changes = passes_since(self.passes, step.done), self.planner.changes
         start = self.points.wavelengths(step, changes) if mi.is_spectral else None

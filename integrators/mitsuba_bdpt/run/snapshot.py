@@ -17,7 +17,7 @@ from ..image.accumulator import Accumulator
 from ..image.replicates import Spread
 from ..planning.configuration import read_decisions
 from ..planning.moments import Moments
-from ..planning.planner import Decided, Pilots
+from ..planning.planner import Pilots, PlannerState
 from ..settings import Settings
 from .statistics import Work
 
@@ -32,7 +32,7 @@ class Progress:
     the scene's files.
     """
 
-    decided: Decided = Decided()
+    decided: PlannerState = PlannerState()
     work: Work = Work()
     halves: tuple[Spread, ...] | None = None
     small_first: bool | None = None
@@ -84,7 +84,7 @@ class Progress:
                 Spread(count, spp, **_arrays(arrays, f"replicates.{i}"))
                 for i, (count, spp) in enumerate(replicates["halves"])
             )
-        for name, part in (("decided", Decided), ("work", Work)):
+        for name, part in (("decided", PlannerState), ("work", Work)):
             values[name] = part(**{f.name: values.pop(f.name) for f in fields(part)})
         return cls(**values)
 

@@ -133,7 +133,7 @@ _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # distinguish the keys of the ro
 
 
 @dataclass
-class Seat:
+class LaneSlot:
     """A lane's place in a part: ``row`` and ``column`` of its run, pixel, and sample."""
 
     lane: mi.UInt32
@@ -162,14 +162,15 @@ class Sharing:
         self._last, self._bits = dr.opaque(u32, run - 1), dr.opaque(u32, run.bit_length() - 1)
         self._rows, self._columns = dr.opaque(u32, rows), dr.opaque(u32, columns)
 
-    def seat(self, lane: mi.UInt32) -> Seat:
-        """The `Seat` of a ``lane`` (``UInt32``), the same for all parts."""
+    def seat(self, lane: mi.UInt32) -> LaneSlot:
+        """The `LaneSlot` of a ``lane`` (``UInt32``), the same for all parts."""
         pixel = lane // self._samples
         run = pixel >> self._bits
         row = run // self._columns
-        return Seat(lane, row, run - row * self._columns, pixel & self._last, lane - pixel * self._samples)
+        column, sample = run - row * self._columns, lane - pixel * self._samples
+        return LaneSlot(lane, row, column, pixel & self._last, sample)
 
-    def slot(self, seat: Seat, part: mi.UInt32) -> mi.UInt32:
+    def slot(self, seat: LaneSlot, part: mi.UInt32) -> mi.UInt32:
         """The slot of a lane in a ``part``; none if not below ``total``."""
         keys = self._keys(part)
         row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))

@@ -56,15 +56,15 @@ class Step:
 class Traits:
     """Properties of the BSDFs that rays can hit.
 
-    See `needs_full_pdf`, `needs_round_trip`, `Asked`. ``glossy``: one has a glossy lobe; ``transmits``: one
-    has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map; ``parts``: one is
-    sampled by its parts, see `draws`; ``reverse``: a strategy in use starts from the other side, so that
-    weights need reverse densities; ``only_delta``: only delta lobes are sampled.
+    See `needs_full_pdf`, `needs_round_trip`, `BSDFDispatch`. ``glossy``: one has a glossy lobe;
+    ``transmits``: one has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map;
+    ``parts``: one is sampled by its parts, see `draws`; ``reverse``: a strategy in use starts from the other
+    side, so that weights need reverse densities; ``only_delta``: only delta lobes are sampled.
     """
 
     full_pdf: bool
     round_trip: bool
-    asked: Asked
+    dispatch: BSDFDispatch
     glossy: bool = False
     transmits: bool = False
     mapped: bool = False
@@ -86,11 +86,11 @@ class Traits:
         def ask(self, si, active):
             return mi.UnpolarizedSpectrum(mi.unpolarized_spectrum(self.eval_null_transmission(si, active)))
 
-        return self.asked(si.bsdf(), ask, si, active)
+        return self.dispatch(si.bsdf(), ask, si, active)
 
     @staticmethod
     def of(bsdfs: Iterable[mi.BSDF], unhit: int = 0, family: Sequence[mi.BSDF] = ()) -> Traits:
-        """Traits of the BSDFs that rays can hit; ``unhit``: number of the scene's others, see `Asked`.
+        """Traits of the BSDFs that rays can hit; ``unhit``: number of the scene's others, see `BSDFDispatch`.
 
         BSDFs nested in ``bsdfs`` do not count as ``unhit``. ``family``: `nested` of them, if known.
         """
@@ -104,7 +104,7 @@ class Traits:
         return Traits(
             full_pdf=full_pdf,
             round_trip=needs_round_trip(inner.values()),
-            asked=Asked(hit.values(), None if full_pdf or parts else unhit),
+            dispatch=BSDFDispatch(hit.values(), None if full_pdf or parts else unhit),
             glossy=any(f & int(mi.BSDFFlags.Glossy) for f in flags),
             transmits=any(f & through for f in flags),
             mapped=any(b.class_name() in draws.MAPS for b in inner.values()),
@@ -125,7 +125,7 @@ _UNHIT = 0.25
 _ASKED = 4096
 
 
-class Asked:
+class BSDFDispatch:
     """Virtual calls of ``bsdfs``.
 
     Mitsuba's visit all BSDFs of the process, each with a function in the kernel: also nested ones, which no
@@ -166,12 +166,12 @@ class Asked:
         number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
         return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
 
-    def together(self, bsdf, questions, *args):
-        """Return ``questions(bsdf, *args)``, which calls through this object.
+    def together(self, bsdf, call, *args):
+        """Return ``call(bsdf, *args)``, which calls through this object.
 
         In one virtual call, or with `MANY` BSDFs in one per question.
         """
-        return questions(bsdf, *args) if self.many else self(bsdf, questions, *args)
+        return call(bsdf, *args) if self.many else self(bsdf, call, *args)
 
 
 def registry_id(bsdf: mi.BSDF) -> int:
@@ -220,7 +220,7 @@ def _evaluated(bsdf, si, wo, active, traits: Traits):
         )
         return value, pdf, pdf_rev_w
 
-    return traits.asked(bsdf, ask, si, wo, active)
+    return traits.dispatch(bsdf, ask, si, wo, active)
 
 
 def _value_and_pdf(bsdf, si, wo, active, traits: Traits):
@@ -273,11 +273,11 @@ def sample(
     Returns the `Step`, and the `Evaluation` of ``target`` or None.
     """
 
-    def questions(bsdf, si, u1, u2, sampled, *joined):
+    def call(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=False)
         return drawn, _evaluated(bsdf, si, *joined, traits) if target else None
 
-    drawn, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
+    drawn, evaluated = _called(call, traits.dispatch, target, bsdf, si, u1, u2, active)
     step = _step(si, drawn, drawn.weight)
     if traits.round_trip:  # no alternative has to sample this event from the other side
         step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
@@ -292,30 +292,30 @@ def sample_adjoint(
     The adjoint factor is part of ``weight`` and of the evaluation's ``value``.
     """
 
-    def questions(bsdf, si, u1, u2, sampled, *joined):
+    def call(bsdf, si, u1, u2, sampled, *joined):
         drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=True)
-        if traits.asked.shared and not traits.only_delta:
+        if traits.dispatch.shared and not traits.only_delta:
             smooth = sampled & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
             found = _evaluated_adjoint(bsdf, si, drawn.bs.wo, smooth, traits)
             drawn = replace(drawn, value=_evaluation(*found).value)
         weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
         return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
 
-    drawn, weight, evaluated = _answers(questions, traits.asked, target, bsdf, si, u1, u2, active)
+    drawn, weight, evaluated = _called(call, traits.dispatch, target, bsdf, si, u1, u2, active)
     cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
     step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
     return step, _adjoint(target.cos_ratio, *evaluated) if target else None
 
 
-def _answers(questions, asked: Asked, target, bsdf, *args):
-    """Return ``questions(bsdf, *args)`` for an optional ``target``.
+def _called(call, dispatch: BSDFDispatch, target, bsdf, *args):
+    """Return ``call(bsdf, *args)`` for an optional ``target``.
 
     The last of ``args`` is a mask; direction and mask of ``target`` are appended.
     """
     joined = (target.wo, target.active) if target else ()
     mask = args[-1] | target.active if target else args[-1]
     # The last argument is the call's mask.
-    return asked.together(bsdf, lambda bsdf, *args: questions(bsdf, *args[:-1]), *args, *joined, mask)
+    return dispatch.together(bsdf, lambda bsdf, *args: call(bsdf, *args[:-1]), *args, *joined, mask)
 
 
 def _adjoint_weight(si, drawn: _Drawn, traits: Traits):
@@ -336,9 +336,9 @@ class _Drawn:
 
     ``weight`` and densities (delta: ``pdf_fwd_w`` is the probability of the event, ``pdf_rev_w`` unset);
     ``back``, if `_asks_back`: weight of the delta event sampled from its other end, 0 if it does not lead
-    back; ``value``, of light subpaths with more than delta lobes, unless `Asked.shared`: of the direction
-    from its other end (NaN as in `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in
-    scenes with BSDFs sampled by parts.
+    back; ``value``, of light subpaths with more than delta lobes, unless `BSDFDispatch.shared`: of the
+    direction from its other end (NaN as in `_evaluation`); ``of_parts``: density and rejection as in
+    `draws.Draw` in scenes with BSDFs sampled by parts.
     """
 
     bs: mi.BSDFSample3f
@@ -370,14 +370,15 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         smooth = active & ~delta
         pdf_fwd_w = bs.pdf
         if traits.full_pdf:
-            meant = [self] if isinstance(self, mi.BSDF) else traits.asked.bsdfs  # a pointer may refer to any
+            # A pointer may refer to any.
+            meant = [self] if isinstance(self, mi.BSDF) else traits.dispatch.bsdfs
             behind = draws.none_from_behind(meant, si, bs)
             weight, found.rejected = dr.select(behind, 0, weight), found.rejected | behind
             full = smooth & ~(bs.pdf == 0)
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         density = found.density if draws.by_parts(self) else pdf_fwd_w
         value, pdf_rev_w = None, mi.Float(0)
-        if adjoint and not traits.only_delta and not traits.asked.shared:
+        if adjoint and not traits.only_delta and not traits.dispatch.shared:
             value, pdf = _value_and_pdf(self, with_wi(si, bs.wo), si.wi, smooth, traits)
             value = _evaluation(value, pdf_fwd_w, pdf).value
             pdf_rev_w = pdf if traits.reverse else pdf_rev_w
@@ -388,7 +389,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         answers = bs, weight, pdf_fwd_w, pdf_rev_w, back, value
         return (*answers, (density, found.rejected)) if traits.parts else answers
 
-    return _Drawn(*traits.asked(bsdf, ask, si, u1, u2, active))
+    return _Drawn(*traits.dispatch(bsdf, ask, si, u1, u2, active))
 
 
 def _asks_back(traits: Traits, adjoint: bool) -> bool:

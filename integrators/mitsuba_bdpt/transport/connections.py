@@ -27,7 +27,7 @@ from .light_path import LightPath, StoredVertex, read_light_vertex
 from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
 from .visibility import ShadowRay, guessed, seen
-from .walk import Vertex, hard_merges, is_lit, newest_coefficient, where_lit
+from .walk import Vertex, allows_next_event, hard_merges, newest_coefficient, where_lit
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -51,7 +51,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~spectra.is_zero(value)
 
-    direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
+    direct = where_lit(kernel, kernel.kappa.direct, allows_next_event(kernel, y))
     newest_y = newest_coefficient(kernel, direct, y.edges)
     at_y = newest_y, f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
     newest_z = newest_coefficient(kernel, kernel.kappa.splat, z.edges)

@@ -14,7 +14,7 @@ from ..sampling.points import Points
 from ..settings import MAX_STORED, Settings
 from . import mis
 from .plan import Plan
-from .sds import SdsStrategy
+from .sds import PhotonStrategy
 
 if TYPE_CHECKING:
     from ..emitters.light_groups import LightGroups
@@ -121,7 +121,7 @@ class Kernel:
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
         # The further strategy for SDS paths: that of a pass, or None.
-        self.sds: SdsStrategy | None = None
+        self.sds: PhotonStrategy | None = None
         # Whether photons guide through near-specular events too.
         self.near_specular = bool(prepared.near_specular)
         # Light groups, which contributions store (`Contribution.light_group`); None without such layers.

@@ -104,8 +104,8 @@ class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory.
 
     ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
-    offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vn``, where hard
-    paths are merged; ``s``: light vertices up to and including each; ``count``: number of stored vertices;
+    offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vm_newest``, where
+    hard paths are merged; ``s``: light vertices up to and including each; ``count``: of stored vertices;
     ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
     ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`; ``flags``: of its
     ``sds``, where near-specular events count as specular.
@@ -175,7 +175,7 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         local.write(entry, slot, keep)
     path.d_vcm.write(y.partial.d_vcm, slot, keep)
     path.d_vc.write(y.partial.d_vc, slot, keep)
-    for local, entry in zip(path.merges, (y.partial.d_vm, y.partial.d_vn), strict=False):
+    for local, entry in zip(path.merges, (y.partial.d_vm, y.partial.d_vm_newest), strict=False):
         local.write(entry, slot, keep)
     path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
     path.s.write(y.edges + 1, slot, keep)

@@ -15,8 +15,8 @@ does not contain eta: paths that are not merged keep their weights. Merged are S
 scenes with nearly specular lobes, *hard* paths: with V the sum of kappa p of merges, and S that of all other
 strategies, a path is hard if V >= B S (`HARD`). A merge counts in V if it also has B times the kappa p of the
 connection of either edge at its vertex, since bounds from one side are then exact at that vertex; a fourth
-number, ``d_vn``, is the newest merge, whose later edge is not known yet. Both conditions depend on the path
-alone, so that all strategies agree on them.
+number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. Both conditions depend on the
+path alone, so that all strategies agree on them.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
@@ -64,7 +64,7 @@ class Partial:
     d_vcm: mi.Float | mi.Vector4f | int
     d_vc: mi.Float | mi.Vector4f | int
     d_vm: mi.Float | mi.Vector4f | int = 0
-    d_vn: mi.Float | mi.Vector4f | int = 0
+    d_vm_newest: mi.Float | mi.Vector4f | int = 0
 
 
 @dataclass
@@ -213,7 +213,7 @@ def to_area(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
         d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
         d_vm=heuristic.scale(partial.d_vm, dr.rcp(cos)),
-        d_vn=heuristic.scale(partial.d_vn, dr.rcp(cos)),
+        d_vm_newest=heuristic.scale(partial.d_vm_newest, dr.rcp(cos)),
     )
 
 
@@ -240,16 +240,16 @@ def scatter(
             heuristic.scale(partial.d_vc, step.cos_out),
             heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
         )
-    d_vm = d_vn = 0
+    d_vm = d_vm_newest = 0
     if merge is not None and merge.isolated is not None:
         d_vm = _scattered_merges(heuristic, partial, step, merge)
     elif merge is not None:
-        d_vm, d_vn = _scattered_hard(heuristic, partial, coefficient, step, merge)
+        d_vm, d_vm_newest = _scattered_hard(heuristic, partial, coefficient, step, merge)
     return Partial(
         d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,
         d_vm=d_vm,
-        d_vn=d_vn,
+        d_vm_newest=d_vm_newest,
     )
 
 
@@ -282,20 +282,20 @@ def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev
 
     ``connection``: ``d_vcm`` times its coefficient, of the edge to the last vertex.
     """
-    newest = h.scale(partial.d_vn, pdf_rev_w)
+    newest = h.scale(partial.d_vm_newest, pdf_rev_w)
     older = h.scale(partial.d_vm, pdf_rev_w)
     return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
 
 
 def _scattered_hard(h: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge):
-    """``d_vm`` and ``d_vn`` after an event where hard paths are merged.
+    """``d_vm`` and ``d_vm_newest`` after an event where hard paths are merged.
 
     Next to a delta event no edge is connected: the newest merge counts.
     """
     connection, ratio = h.scale(partial.d_vcm, coefficient), step.cos_out / step.pdf_fwd_w
     older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), ratio)
     newest = h.scale(dr.select(exceeds(merge.ratio, connection), merge.ratio, 0), ratio)
-    through = h.scale(h.combine(partial.d_vm, partial.d_vn), step.cos_out)
+    through = h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)
     return dr.select(step.delta, through, older), dr.select(step.delta, 0, newest)
 
 

@@ -34,9 +34,9 @@ class State:
     ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were
     delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
     (s = 0 by the guide, or by the BSDF) over its own; ``survived``, on photon subpaths of hard paths: the
-    probability with which `SdsStrategy.survival` let it go on. Where near-specular events count as specular
-    ``specular``: the last event was; ``diffuse``: one before the next vertex was not; ``narrow``: all were,
-    some of them not delta, and no edge is connectible with delta events alone as specular ones.
+    probability with which `PhotonStrategy.survival` let it go on. Where near-specular events count as
+    specular ``specular``: the last event was; ``diffuse``: one before the next vertex was not; ``narrow``:
+    all were, some of them not delta, and no edge is connectible with delta events alone as specular ones.
     """
 
     isolated: mi.Bool | None = None
@@ -107,7 +107,7 @@ class Advice:
     other: mi.Float
 
 
-class SdsStrategy:
+class PhotonStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
@@ -192,6 +192,6 @@ def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **mor
     return begun(walk, replace(events, isolated=possible, only_delta=possible, guided=guided), **more)
 
 
-def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vn: mis.PartialSum = 0):
-    """``walk`` with ``state``; ``d_vm``, ``d_vn``: its partial sums of merges, 0 if there are none."""
-    return replace(walk, sds=state, partial=replace(walk.partial, d_vm=d_vm, d_vn=d_vn))
+def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vm_newest: mis.PartialSum = 0):
+    """``walk`` with ``state``; ``d_vm``, ``d_vm_newest``: its partial sums of merges, 0 if there are none."""
+    return replace(walk, sds=state, partial=replace(walk.partial, d_vm=d_vm, d_vm_newest=d_vm_newest))

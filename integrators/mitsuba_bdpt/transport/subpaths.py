@@ -16,7 +16,7 @@ from ..sensors.records import CameraStart
 from . import mis, spectra, techniques
 from .batch import Places
 from .inputs import Kernel, Shared
-from .sds import SdsStrategy
+from .sds import PhotonStrategy
 from .walk import Side, Walk, not_finite
 
 
@@ -71,7 +71,7 @@ def emission(kernel: Kernel, stream, shared):
     return e
 
 
-def light_walk(kernel: Kernel, e, stream, shared, sds: SdsStrategy | None) -> Walk:
+def light_walk(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) -> Walk:
     """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in its weights on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
@@ -91,7 +91,7 @@ def light_walk(kernel: Kernel, e, stream, shared, sds: SdsStrategy | None) -> Wa
     return walk if sds is None else sds.begin_light(kernel, walk)
 
 
-def light_side(kernel: Kernel, e, stream, shared, walk, sds: SdsStrategy | None) -> Side:
+def light_side(kernel: Kernel, e, stream, shared, walk, sds: PhotonStrategy | None) -> Side:
     """The `Side` of a light subpath."""
     return Side(
         "light",

@@ -19,14 +19,14 @@ from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, path_layers, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
-from .sds import SdsStrategy
+from .sds import PhotonStrategy
 from .visibility import ShadowRay, seen
 from .walk import (
     Vertex,
     Walk,
+    allows_next_event,
     hard_merges,
     hard_merges_before_end,
-    is_lit,
     newest_coefficient,
     where_lit,
 )
@@ -44,7 +44,7 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     return active
 
 
-def hit_emitter(kernel: Kernel, z: Vertex, sds: SdsStrategy | None) -> Contribution:
+def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contribution:
     """s = 0: the subpath has hit an emitter (eqs. 42, 43); ``sds``: the strategy beside it on SDS paths."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
@@ -116,14 +116,14 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     Returns an `emitters.Direct` and its `bsdf.Target`.
     """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
-    if (lit := is_lit(kernel, z)) is not None:
+    if (lit := allows_next_event(kernel, z)) is not None:
         active &= lit
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
     return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
 
 
-def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: SdsStrategy | None) -> Contribution:
+def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | None) -> Contribution:
     """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45).
 
     ``sds`` as in `hit_emitter`.
@@ -239,7 +239,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
-    direct = where_lit(kernel, kernel.kappa.direct, is_lit(kernel, y))
+    direct = where_lit(kernel, kernel.kappa.direct, allows_next_event(kernel, y))
     newest = newest_coefficient(kernel, direct, y.edges)
     densities = f.pdf_rev_w, connection.pdf_w * to_area
     light_side = mis.alternatives(h, y.partial, newest, *densities)

@@ -22,7 +22,7 @@ from .contribution import Counters
 from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
-from .sds import SdsStrategy, State, is_specular
+from .sds import PhotonStrategy, State, is_specular
 
 
 @dataclass
@@ -194,7 +194,7 @@ class Side:
     isolated: bool = False
     only_delta: bool = False
     only_specular: float = 0.0
-    sds: SdsStrategy | None = None
+    sds: PhotonStrategy | None = None
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
@@ -229,15 +229,15 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
     return state, walk
 
 
-def is_lit(kernel: Kernel, vertex):
+def allows_next_event(kernel: Kernel, vertex):
     """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
     if kernel.space is None or kernel.space.media.all_lit:
         return None
-    return ~vertex.volume | kernel.space.media.is_lit(vertex.medium)
+    return ~vertex.volume | kernel.space.media.allows_next_event(vertex.medium)
 
 
 def where_lit(kernel: Kernel, direct: mis.Coefficient, lit) -> mis.Coefficient:
-    """Coefficient of next-event estimation where it is allowed (`is_lit`), else 0."""
+    """Coefficient of next-event estimation where it is allowed (`allows_next_event`), else 0."""
     return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
@@ -292,7 +292,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         choose(hit, in_area.d_vcm, d_vcm),
         choose(hit, in_area.d_vc, partial.d_vc),
         choose(hit, in_area.d_vm, partial.d_vm),
-        choose(hit, in_area.d_vn, partial.d_vn),
+        choose(hit, in_area.d_vm_newest, partial.d_vm_newest),
     )
     return Vertex(
         si=si,
@@ -383,7 +383,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
         active |= passes
     first = side.coefficient
     if side.adjoint:
-        first = where_lit(kernel, first, is_lit(kernel, vertex))
+        first = where_lit(kernel, first, allows_next_event(kernel, vertex))
     coefficient = newest_coefficient(kernel, first, walk.edges)
     sds, merge = _sds(kernel, side, walk, vertex, coefficient, step)
     partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
@@ -440,7 +440,7 @@ def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Fl
     """Russian roulette of a subpath: its throughput, and whether it goes on.
 
     With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`;
-    ``useful``: times this probability or None, see `SdsStrategy.survival`. Weights ignore it.
+    ``useful``: times this probability or None, see `PhotonStrategy.survival`. Weights ignore it.
     """
     u = kernel.points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
     playing = walk.edges >= kernel.rr_depth if kernel.space is None else walk.edges > kernel.rr_depth
@@ -561,7 +561,7 @@ def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Wa
     """``after`` and its ray, with media; the edge goes on where it ``passes``."""
     medium = vertex.medium_towards(kernel, after.d)
     u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
-    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, is_lit(kernel, vertex), u)
+    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, allows_next_event(kernel, vertex), u)
     partial = mis.Partial(
         choose(passes, walk.partial.d_vcm, after.partial.d_vcm),
         choose(passes, walk.partial.d_vc, after.partial.d_vc),

@@ -30,7 +30,7 @@ from .. import bsdf, mis, path_layers, spectra, techniques
 from ..contribution import one
 from ..inputs import Kernel
 from ..near_specular import GUIDED
-from ..sds import Advice, SdsStrategy, State, begun, begun_near_specular, is_specular
+from ..sds import Advice, PhotonStrategy, State, begun, begun_near_specular, is_specular
 from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
 from . import photon_guide
 
@@ -38,7 +38,7 @@ from . import photon_guide
 _SEED = 0x5BD1E995
 
 
-class Guiding(SdsStrategy):
+class Guiding(PhotonStrategy):
     """Photon-guided BSDF sampling by a ``guide``; ``near_specular``: through near-specular events too."""
 
     counters = ("aimed", "guided")
@@ -105,7 +105,7 @@ class Guiding(SdsStrategy):
         return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))), active
 
 
-class _Guided(SdsStrategy):
+class _Guided(PhotonStrategy):
     """The same at the end of a guided subpath, whose alternative is s = 0 by the BSDF."""
 
     def __init__(self, near_specular: bool):

@@ -96,12 +96,12 @@ class GuidingPhoton(Photon):
 class HardPhoton(Photon):
     """A photon of hard paths, see `mis`; ``older`` is its ``d_vc``.
 
-    ``connection`` as of a `ConnectedPhoton`; ``d_vm``, ``d_vn``: its partial sums of merges.
+    ``connection`` as of a `ConnectedPhoton`; ``d_vm``, ``d_vm_newest``: its partial sums of merges.
     """
 
     connection: mi.Float
     d_vm: mi.Float
-    d_vn: mi.Float
+    d_vm_newest: mi.Float
 
 
 def same_surface(a: mi.Normal3f, b: mi.Normal3f):

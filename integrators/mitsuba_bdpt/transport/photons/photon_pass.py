@@ -13,7 +13,7 @@ from .. import mis, spectra, subpaths
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..near_specular import GUIDED, NARROW
-from ..sds import SdsStrategy, State, begun_near_specular
+from ..sds import PhotonStrategy, State, begun_near_specular
 from ..walk import has_lobe, is_sds_vertex, newest_connection, random_walk
 from .aim import Aim
 from .photon import ConnectedPhoton, GuidingPhoton, HardPhoton, Photon
@@ -32,7 +32,7 @@ def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
     return min(max(samples // each, FEWEST_PHOTONS), MOST_PHOTONS)
 
 
-class Kept(Enum):
+class PhotonPolicy(Enum):
     """Vertices of photon subpaths that are stored."""
 
     MERGED = "all diffuse vertices of SDS paths"
@@ -43,10 +43,10 @@ class Kept(Enum):
     @property
     def estimates(self) -> bool:
         """Whether photons estimate how much light a render lacks, of which emitter."""
-        return self in (Kept.UNSAMPLED, Kept.UNDERSAMPLED)
+        return self in (PhotonPolicy.UNSAMPLED, PhotonPolicy.UNDERSAMPLED)
 
 
-class _Unconnected(SdsStrategy):
+class _Unconnected(PhotonStrategy):
     """Keeps the partial sum of s = 0 and s = 1 in ``d_vm``, through near-specular events."""
 
     def begin_light(self, kernel, walk):
@@ -61,7 +61,7 @@ class _Unconnected(SdsStrategy):
 class Traced:
     """``count`` ``photons`` in the order of threads, and counters.
 
-    ``broken``, if `Kept.estimates`: mask by emitter, a subpath ended by a non-finite value.
+    ``broken``, if `PhotonPolicy.estimates`: mask by emitter, a subpath ended by a non-finite value.
     """
 
     photons: Photon
@@ -75,12 +75,12 @@ def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[G
 
     The guide is None without photons. ``aim`` samples first directions.
     """
-    traced = trace(kernel, None, aim, points, count, Kept.GUIDED)
+    traced = trace(kernel, None, aim, points, count, PhotonPolicy.GUIDED)
     return Guide.of(traced.photons, traced.count) if traced.count else None, traced.counters
 
 
 def trace(
-    kernel: Kernel, sds: SdsStrategy | None, aim: Aim, points: Points, count: int, kept: Kept
+    kernel: Kernel, sds: PhotonStrategy | None, aim: Aim, points: Points, count: int, kept: PhotonPolicy
 ) -> Traced:
     """Trace ``count`` photon subpaths; ``sds``: the strategy that merges them, None for a guide."""
     kernel = kernel.bound(points, 1.0, Observer())
@@ -95,15 +95,15 @@ def trace(
         capacity = traced.count  # again, with more memory
 
 
-def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Traced:
+def _traced(kernel: Kernel, aim: Aim, count: int, kept: PhotonPolicy, out: Photon) -> Traced:
     """Store photons in ``out``; `Traced.count` may exceed it."""
     capacity = dr.width(out)
     number, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, capacity)
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
-    merges, undersampled = kept is Kept.MERGED, kept is Kept.UNDERSAMPLED
-    near_specular = kept is Kept.GUIDED and kernel.near_specular
+    merges, undersampled = kept is PhotonPolicy.MERGED, kept is PhotonPolicy.UNDERSAMPLED
+    near_specular = kept is PhotonPolicy.GUIDED and kernel.near_specular
     sds = kernel.sds if merges else _Unconnected() if near_specular else None
     e, aimed, finite, walk = _begun(kernel, aim, kept, sds, stream, shared)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
@@ -116,7 +116,8 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         flux = y.throughput
         if sds is not None and sds.hard:
             older, connection = y.partial.d_vc, _connection(kernel, y)
-            more, keep = (connection, y.partial.d_vm, y.partial.d_vn), sds.may_merge(kernel, y, connection)
+            more = connection, y.partial.d_vm, y.partial.d_vm_newest
+            keep = sds.may_merge(kernel, y, connection)
             probability = sds.kept(kernel, y, walk.sds.survived)
             keep &= kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event) < probability
             flux = flux / probability
@@ -129,9 +130,9 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
         if near_specular:
             older = y.partial.d_vc
             more = _connection(kernel, y), y.partial.d_vm, walk.sds.only_delta
-        elif kept is Kept.GUIDED:
+        elif kept is PhotonPolicy.GUIDED:
             keep &= older > 0
-        if kept is Kept.UNSAMPLED:
+        if kept is PhotonPolicy.UNSAMPLED:
             older = dr.select(finite, mi.Float(0), dr.nan)
         if undersampled:
             older = dr.select(finite, mi.Float(older), dr.nan)
@@ -158,7 +159,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: Kept, out: Photon) -> Tr
     return Traced(out, int(number[0]), counts, broken)
 
 
-def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream, shared):
+def _begun(kernel: Kernel, aim: Aim, kept: PhotonPolicy, sds: PhotonStrategy | None, stream, shared):
     """Emissions of photons, `Photon.aim`, a mask of finite emissions, and subpaths on their first edges."""
     e, aimed = aim.emission(
         kernel.emitters,
@@ -171,10 +172,10 @@ def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     # These weights do not know of the aim, see `merging.hard_paths`.
-    unaimed = kernel.merges_hard or kept is Kept.UNDERSAMPLED or isinstance(sds, _Unconnected)
+    unaimed = kernel.merges_hard or kept is PhotonPolicy.UNDERSAMPLED or isinstance(sds, _Unconnected)
     start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
-    if kept is Kept.UNDERSAMPLED:
+    if kept is PhotonPolicy.UNDERSAMPLED:
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
     elif sds is not None and sds.hard:
         walk = replace(walk, sds=State(survived=mi.Float(1)))
@@ -183,13 +184,13 @@ def _begun(kernel: Kernel, aim: Aim, kept: Kept, sds: SdsStrategy | None, stream
     return e, aimed, finite, walk
 
 
-def _kind(kernel: Kernel, kept: Kept) -> type[Photon]:
+def _kind(kernel: Kernel, kept: PhotonPolicy) -> type[Photon]:
     """The record of its photons."""
     if kernel.merges_hard:
         return HardPhoton
-    if kept is Kept.GUIDED and kernel.near_specular:
+    if kept is PhotonPolicy.GUIDED and kernel.near_specular:
         return GuidingPhoton
-    return ConnectedPhoton if kept is Kept.UNDERSAMPLED else Photon
+    return ConnectedPhoton if kept is PhotonPolicy.UNDERSAMPLED else Photon
 
 
 def _connection(kernel: Kernel, y) -> mis.PartialSum:

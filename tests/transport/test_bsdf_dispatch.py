@@ -59,7 +59,7 @@ def test_who_calls(kinds, copies, expected):
     is sampled by its parts. Expected: they are used for many BSDFs without corrections, beside few that no
     ray hits: nested ones, and that of each instance."""
     scene = beads(kinds, copies)
-    assert PreparedScene(scene, scene.sensors()[0]).traits.asked.by_mitsuba == expected
+    assert PreparedScene(scene, scene.sensors()[0]).traits.dispatch.by_mitsuba == expected
 
 
 def test_both_ways_of_calling_give_one_image(monkeypatch):
@@ -79,8 +79,8 @@ def test_both_ways_of_calling_give_one_image(monkeypatch):
 def test_a_sample_is_one_question(take, monkeypatch):
     """Rationale: each question is recorded for every BSDF. Expected: one, of a light subpath too, whose
     sample is evaluated from its other end."""
-    count, call = [], bsdf.Asked.__call__
-    monkeypatch.setattr(bsdf.Asked, "__call__", lambda *args: (count.append(1), call(*args))[1])
+    count, call = [], bsdf.BSDFDispatch.__call__
+    monkeypatch.setattr(bsdf.BSDFDispatch, "__call__", lambda *args: (count.append(1), call(*args))[1])
     scene = beads(PLAIN)
     traits = PreparedScene(scene, scene.sensors()[0]).traits
     si = scene.ray_intersect(mi.Ray3f([0, 0, 1], dr.opaque(mi.Vector3f, [0, 0, -1])))
