@@ -10,11 +10,11 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 7028,
+    "transport merging guided_emission": 7030,
     "planning": 2917,
     "emitters": 2680,
     "cli": 1801,
-    "media": 1409,
+    "media": 1434,
     "geometry": 1619,
     "image": 1508,
     "files": 1226,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1539,  # top files
 }
-OUTSIDE = {"scripts": 6130, "tests": 45457}
+OUTSIDE = {"scripts": 6130, "tests": 45474}
 MOST_WORDS = 70636
 
 

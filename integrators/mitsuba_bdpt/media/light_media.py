@@ -2,7 +2,7 @@
 
 Scenes seldom declare it: an area light on a shape without exterior medium may stand in a ball of milk. The
 ray of each emission tells it: the near side of the first boundary that it meets, or the medium that surrounds
-the scene.
+the scene. Kernels trace it only for emitters whose rays start in several media.
 """
 
 from __future__ import annotations
@@ -17,12 +17,16 @@ from ..emitters.emitters import Emitters
 from ..geometry.boxes import box_of, points_in, scene_box
 from ..geometry.directions import random_directions
 from ..host.introspection import is_instance, named
+from ..transport.inputs import Shared
 from . import boundaries
 from .phase import asymmetry
 from .space import Space
 
 # Rays around the sensor, lines from outside of the scene, rays that may end at the far plane.
 _AROUND, _LINES, _CAMERA_RAYS = 64, 1 << 12, 1 << 12
+
+# Emissions per emitter, and of all, that find emitters in several media; fewest that tell of one.
+_EMISSIONS, _ALL_EMISSIONS, _FEWEST = 1 << 12, 1 << 20, 32
 
 # Most shapes that bound media at which lines aim.
 _MOST_SHAPES = 1024
@@ -43,7 +47,7 @@ class LightMedia:
     """
 
     def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
-        self._space = space
+        self._space, self._emitters = space, emitters
         around = _near_sides(space, _rays_around(sensor))
         through = _points_near_boundaries(space)
         self.outside = outside = _outside(space, around, through)
@@ -68,7 +72,28 @@ class LightMedia:
         infinite = (mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters.objects)
         bounded = through is not None  # else all is in one medium
         asked = [bounded and not (known or away) for known, away in zip(declared, infinite, strict=True)]
-        self._any_asked, self._asked = any(asked), mi.Bool(asked or [False])
+        self._settled, self._any_asked, self._asked = False, any(asked), mi.Bool(asked or [False])
+        dr.make_opaque(self._front, self._back, self._asked)
+
+    def settle(self):
+        """Find the emitters whose emissions all start in one medium; to be called before `at` is recorded."""
+        if self._settled or not self._any_asked:
+            return
+        self._settled, count = True, self._emitters.count
+        u = np.random.default_rng(0).random((4, min(_EMISSIONS * count, _ALL_EMISSIONS)))
+        wavelengths = dr.zeros(mi.UnpolarizedSpectrum, u.shape[1]) + 550 if mi.is_spectral else mi.Color0f()
+        shared = Shared(mi.Float(0), wavelengths, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
+        e = self._emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), shared, mi.Bool(True))
+        number, index = self.at(e), e.index + dr.zeros(mi.UInt32, u.shape[1])
+        dr.eval(number, index)  # one kernel
+        number, order = np.array(number), np.argsort(np.array(index), kind="stable")
+        parts = np.split(number[order], np.searchsorted(np.array(index)[order], np.arange(1, count)))
+        tables = [np.array(table) for table in (self._front, self._back, self._asked)]
+        for i, found in enumerate(parts):
+            if tables[2][i] and len(found) >= _FEWEST and (found == found[0]).all():
+                tables[0][i], tables[1][i], tables[2][i] = found[0], found[0], False
+        self._front, self._back, self._asked = mi.UInt32(tables[0]), mi.UInt32(tables[1]), mi.Bool(tables[2])
+        self._any_asked = bool(tables[2].any())
         dr.make_opaque(self._front, self._back, self._asked)
 
     def at(self, e) -> mi.UInt32:

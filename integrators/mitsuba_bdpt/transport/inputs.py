@@ -102,6 +102,8 @@ class Kernel:
         self.traits = prepared.traits if self.reverse else prepared.traits.from_one_side()
         self.space = prepared.space
         self.light_media = prepared.light_media
+        if self.light_media is not None and plan.light:
+            self.light_media.settle()
         self.sensor_medium = None if self.space is None else u32(self.space.media.sensor)
         self.scatters = self.surfaces or (self.space is not None and self.space.media.scatters)
         depth = settings.max_depth
