@@ -1026,8 +1026,8 @@ MUTANTS = (
     Mutant(
         "media: lamps start outside",
         "media/light_media.py",
-        "dr.select(met.found, met.number, unknown)",
-        "unknown",
+        "dr.select(met.found, met.number, unless_found)",
+        "unless_found",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
     Mutant(

@@ -184,6 +184,27 @@ def test_sky_through_a_small_window(covered):
     assert (light.contradiction, light.outside, light.hides_infinity) == ("", 0, False)
 
 
+def test_a_lamp_in_a_room_seen_from_outside():
+    """Rationale: four of five rays of a lamp among plain walls meet no boundary, and started in the vacuum of
+    the sensor outside: 4 % too bright. Expected: all start in the fog of the room, which the others find."""
+    lamp, eye = parts.lamp(center=[2, 1, 2], radius=0.5), parts.sensor(origin=(0, 5.1, 0.01), near=1e-3)
+    _, light = prepared(windowed(0.75, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0])))
+    light.settle()
+    assert (light.contradiction, sorted(light._front), light._any_asked) == ("", [0, 1], False)
+
+
+def test_light_from_infinity_over_an_open_sea():
+    """Rationale: camera subpaths under a sea without walls are in water for ever, light from infinity starts
+    in air: 6 % too bright. Expected: no light subpaths, and why."""
+    sea = {"type": "rectangle", "bsdf": {"type": "dielectric"}, "interior": fog(0.3), "id": "sea"}
+    sea["to_world"] = parts.transform().rotate([1, 0, 0], -90).scale(50)
+    scene = {"type": "scene", "sensor": parts.sensor(origin=(0, 2, 4), target=(0, 0, 0)), "sea": sea}
+    _, light = prepared(mi.load_dict(scene | {"sky": parts.sky()}))
+    assert "close the boundary between them" in light.contradiction
+    _, light = prepared(mi.load_dict(scene | {"lamp": parts.point(position=[0, 3, 0])}))
+    assert light.contradiction == ""
+
+
 def grid(values=None, edge=1.0, **more):
     values = np.arange(27.0).reshape(3, 3, 3) if values is None else values
     return parts.grid(values, [0, 0, 0], edge, **more)

@@ -14,8 +14,8 @@ MOST = {
     "planning": 2917,
     "emitters": 2680,
     "cli": 1801,
-    "media": 1434,
-    "geometry": 1619,
+    "media": 1468,
+    "geometry": 1656,
     "image": 1508,
     "files": 1226,
     "run": 1196,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1539,  # top files
 }
-OUTSIDE = {"scripts": 6130, "tests": 45474}
+OUTSIDE = {"scripts": 6130, "tests": 45491}
 MOST_WORDS = 70636
 
 

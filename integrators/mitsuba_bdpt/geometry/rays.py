@@ -18,7 +18,17 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .rounding import FAR, LEAST_COSINE, QUADRIC_ULPS, Errors, ShapeErrors, met, offset_at, rounding_offset
+from .rounding import (
+    FAR,
+    LEAST_COSINE,
+    QUADRIC_ULPS,
+    SHELL,
+    Errors,
+    ShapeErrors,
+    met,
+    offset_at,
+    rounding_offset,
+)
 
 
 @dataclass
@@ -46,10 +56,6 @@ def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: Sha
     offset += (QUADRIC_ULPS * 2.0**-24) * dr.square(si.t) * errors.starts
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
-
-# Radii by which a shadow ray may end before a small sphere or cylinder without testing what lies between.
-# 0.02 costs 5 % more in veach-mis, and all rays 7 % (see experiments, section Rounding).
-_SHELL = 0.1
 
 # Lower bound of the cosine that divides an anchor's offset.
 _STEEPEST = 0.05
@@ -94,7 +100,7 @@ def _before(a: Anchor, b: Anchor) -> mi.Point3f:
 def end_point(a: Anchor, b: Anchor) -> mi.Point3f:
     """End of a shadow ray from ``a`` to ``b``, just before ``b``'s surface."""
     end = _before(a, b)
-    # PlannerState at recording: scenes without spheres and cylinders record nothing below.
+    # Known when the kernel is recorded: scenes without spheres and cylinders record nothing below.
     if b.curvature.state == dr.VarState.Literal and b.curvature[0] == 0:
         return end
     back = a.p - end
@@ -135,7 +141,7 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 class Own:
     """Surface (``number``, see `met`) at a shadow ray's end, hit from ``t`` on.
 
-    ``first_hit``: mask, the first hit of the whole ray decides; others are tested up to ``t``.
+    ``first_hit``: mask, the first hit of the whole ray decides; other rays are tested up to ``t`` only.
     """
 
     number: mi.UInt32
@@ -156,7 +162,8 @@ def shadow_ray(
     ray = segment_to(a, end, shared)
     early = ray.maxt * _early(a.p - end, b)
     behind = dr.dot(b.n, a.p - end) * b.curvature < 0
-    return ray, Own(number, ray.maxt - early, behind | (early * dr.abs(b.curvature) > _SHELL))
+    first_hit = behind | (early * dr.abs(b.curvature) > SHELL) | shape_errors.crowded(number)
+    return ray, Own(number, ray.maxt - early, first_hit)
 
 
 def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
-from .boxes import asked_anew, scene_box
+from .boxes import asked_anew, box_of, scene_box
 from .quadrics import ROUND, outward_sign
 
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
@@ -29,6 +29,10 @@ LEAST_COSINE = 0.1
 # Diameter of a scene in radii of its smallest sphere or cylinder, above which shadow rays test what they hit:
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
+
+# Largest gap before a small sphere or cylinder, in radii, that shadow rays leave untested where no box of
+# another shape reaches into it; see experiments, section Rounding.
+SHELL = 0.1
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
 # is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
@@ -94,7 +98,17 @@ class ShapeErrors:
         self._triangles = None
         if len(triangles) > 1:
             self._triangles = mi.UInt32(first), mi.Float(np.concatenate(triangles).astype(np.float32))
-        dr.make_opaque(self._table, self._triangles)
+        crowded = [False] * self._size
+        if self.small:
+            within = _crowded(shapes, [abs(row.ends) for row in rows], about)
+            for index, near in zip(ids, within, strict=True):
+                crowded[index] = near
+        self._crowded = mi.Bool(crowded)
+        dr.make_opaque(self._table, self._triangles, self._crowded)
+
+    def crowded(self, number: mi.UInt32) -> mi.Bool:
+        """Mask: another shape's box reaches nearer than `SHELL` radii to the shape of index ``number``."""
+        return dr.gather(mi.Bool, self._crowded, dr.minimum(number, self._size - 1))
 
     def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
         """`Errors` of hits on ``shape`` or ``instance``; on one ``triangle`` if given."""
@@ -110,6 +124,21 @@ class ShapeErrors:
             found.ends = dr.gather(mi.Float, self._table.ends, index, known)
             found.starts = dr.gather(mi.Float, self._table.starts, index, known)
         return found
+
+
+def _crowded(shapes, curvatures: list[float], about: Callable) -> list[bool]:
+    """Whether another shape's box meets that of each round shape, grown by `SHELL` radii; true if unknown."""
+    found = [about("box", partial(box_of, shape), shape) for shape in shapes]
+    low, high = (
+        np.array([np.full(3, np.nan) if box is None else np.array(corner(box)) for box in found])
+        for corner in (lambda box: box.min, lambda box: box.max)
+    )
+    near = []
+    for i, curvature in enumerate(curvatures):
+        gap = SHELL / curvature if curvature else np.nan
+        apart = (low > high[i] + gap).any(1) | (high < low[i] - gap).any(1)
+        near.append(bool(curvature) and not np.delete(apart, i).all())
+    return near
 
 
 def met(shape, instance=None):

@@ -23,8 +23,8 @@ class ShapeFacts:
 
     ``flaws``: names of shapes by their flaw; ``marks``: fingerprints of the shapes by registry index;
     ``before``: facts of an earlier state of the scene, of which those about shapes with equal marks are kept.
-    Holds no object of Mitsuba: it may outlive the scene. Raises ``UsageError`` for shapes for which Mitsuba's
-    own calls disagree (`check_inverse`).
+    Holds no object of the scene: it may outlive it. Raises ``UsageError`` for shapes for which Mitsuba's own
+    calls disagree (`check_inverse`).
     """
 
     def __init__(

@@ -77,7 +77,8 @@ class SmoothMeshes:
 
     def _face(self, index, u, mesh):
         """Row of the face chosen by ``u``, as Mitsuba's ``DiscreteDistribution::sample``."""
-        part = mi.UInt32(u * dr.gather(mi.Float, self._parts, index, mesh))  # exact, see `_Faces.starts`
+        parts = dr.gather(mi.Float, self._parts, index, mesh)
+        part = mi.UInt32(dr.clip(u * parts, 0, dr.maximum(parts - 1, 0)))  # exact, see `_Faces.starts`
         part += dr.gather(mi.UInt32, self._part, index, mesh)
         low, high = (dr.gather(mi.UInt32, self._starts, part + end, mesh) for end in (0, 1))
         area = dr.gather(mi.Float, self._area, index, mesh)
@@ -122,7 +123,7 @@ class _Faces:
         return _Faces(normals, corners, np.array(chosen.cdf), dr.slice(chosen.sum()))
 
     def starts(self) -> np.ndarray:
-        """The face chosen at the ends of 2^k equal parts of [0, 1], one or two per face.
+        """The face chosen at the ends of 2^k equal parts of [0, 1], between one and two per face.
 
         Within a part the search has few faces left (Chen and Asau's method of cutpoints, 1974).
         """

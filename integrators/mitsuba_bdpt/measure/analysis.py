@@ -1,8 +1,8 @@
 """Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
 Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error), with the errors of `estimates`.
-Comparisons pair renders of equal seed, which ran consecutively. What there is not raises `Unavailable`
-with the reason.
+Comparisons pair renders of equal seed, which ran consecutively. Raises `Unavailable`, with the reason,
+for figures that cannot be computed.
 """
 
 from __future__ import annotations

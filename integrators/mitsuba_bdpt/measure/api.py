@@ -37,7 +37,7 @@ _SCENES = (str, Path, Mapping, SceneDict)
 Plugin = str | Mapping[str, Any]
 """An integrator's type, or its parameters as a dictionary; ``sampler`` among them is the sensor's."""
 
-BSDFDispatch = TypeVar("BSDFDispatch", bound=available.Options)
+OptionsT = TypeVar("OptionsT", bound=available.Options)
 
 
 def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Reference:
@@ -151,7 +151,7 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
             mi.set_variant(before)
 
 
-def _options(kind: type[BSDFDispatch], given: dict) -> BSDFDispatch:
+def _options(kind: type[OptionsT], given: dict) -> OptionsT:
     """Return the options of a measurement; raises ``CommandError`` for others."""
     known = {field.name: field for field in available.options_of(kind)}
     for name in given:

@@ -112,8 +112,8 @@ def draw(found: dict, path: Path, exposure: float, columns: int = 2):
                 else:
                     axis.imshow(tone_map(image, exposure + k - 1), interpolation="nearest", aspect="auto")
                     axis.set_axis_off()
-            allows_next_event = any(found.get((k, s, k + 1 - s)) is not None for s in range(k + 2))
-            text = f"$k={k}$\n{2 ** (k - 1)}x" if allows_next_event else f"$k={k}$"
+            has_image = any(found.get((k, s, k + 1 - s)) is not None for s in range(k + 2))
+            text = f"$k={k}$\n{2 ** (k - 1)}x" if has_image else f"$k={k}$"
             figure.text(0.02 / wide, (bottom + (high - TITLE) / 2) / tall, text, va="center")
         save(figure, path)
 

@@ -42,7 +42,7 @@ from .estimates import FEWEST_WITH_INTERVAL, seed_errors
 from .limited import Pending
 from .making import Job, check, obtained
 from .options import REFERENCE_SECONDS, VARIANT
-from .options import Sweep as BSDFDispatch
+from .options import Sweep as SweepOptions
 from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
 from .record import Row
@@ -543,7 +543,7 @@ def short_of_target(table: list[Row]) -> list[str]:
 
 
 def swept(
-    project: Project, preset: str | Mapping[str, Any], options: BSDFDispatch | Namespace
+    project: Project, preset: str | Mapping[str, Any], options: SweepOptions | Namespace
 ) -> tuple[list[Row], list[str]]:
     """Render the missing cells of a ``preset``; returns all rows, and failures.
 
@@ -593,7 +593,7 @@ def swept(
 
 
 def _read(
-    project: Project, preset: str | Mapping[str, Any], options: BSDFDispatch | Namespace
+    project: Project, preset: str | Mapping[str, Any], options: SweepOptions | Namespace
 ) -> tuple[Preset, Path, str]:
     """Return the preset that the ``options`` ask for, the folder of its rows, and its text."""
     if isinstance(preset, Mapping):
@@ -606,7 +606,7 @@ def _read(
 
 
 def _check_cluster(
-    project: Project, preset: str | Mapping[str, Any], whole: Preset, options: BSDFDispatch | Namespace
+    project: Project, preset: str | Mapping[str, Any], whole: Preset, options: SweepOptions | Namespace
 ) -> None:
     """Raise ``CommandError`` for what workers cannot render."""
     if not options.scheduler:

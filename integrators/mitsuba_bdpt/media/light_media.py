@@ -1,8 +1,8 @@
 """The medium in which light subpaths start.
 
-Scenes seldom declare it: an area light on a shape without exterior medium may stand in a ball of milk. The
-ray of each emission tells it: the near side of the first boundary that it meets, or the medium that surrounds
-the scene. Kernels trace it only for emitters whose rays start in several media.
+Scenes seldom declare it: an area light on a shape without exterior medium may stand in a ball of milk. It is
+determined by the ray of each emission: the near side of the first boundary that it meets, or the medium that
+surrounds the scene. Kernels trace it only for emitters whose rays start in several media.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..emitters.emitters import Emitters
+from ..geometry import rays
 from ..geometry.boxes import box_of, points_in, scene_box
 from ..geometry.directions import random_directions
 from ..host.introspection import is_instance, named
@@ -25,7 +26,7 @@ from .space import Space
 # Rays around the sensor, lines from outside of the scene, rays that may end at the far plane.
 _AROUND, _LINES, _CAMERA_RAYS = 64, 1 << 12, 1 << 12
 
-# Emissions per emitter, and of all, that find emitters in several media; fewest that tell of one.
+# Emissions per emitter, and of all, that find emitters in several media; fewest that settle one.
 _EMISSIONS, _ALL_EMISSIONS, _FEWEST = 1 << 12, 1 << 20, 32
 
 # Most shapes that bound media at which lines aim.
@@ -60,18 +61,23 @@ class LightMedia:
         self.contradiction = (
             _contradiction_of_sensor(space, sensor, around)
             or _contradiction_of_phases(space)
-            or (_contradiction_at_infinity(space, outside) if emitters.at_infinity else "")
+            or (_contradiction_at_infinity(space, outside, through) if emitters.at_infinity else "")
             or _contradiction_at_far_plane(space, sensor, 0 if far == outside else far)
         )
         shapes = [emitter.get_shape() for emitter in emitters.objects]
         declared = [shape is not None and shape.is_medium_transition() for shape in shapes]
         number_of, bounds = space.media.number_of, list(zip(shapes, declared, strict=True))
-        front = [number_of(shape.exterior_medium()) if known else outside for shape, known in bounds]
-        back = [number_of(shape.interior_medium()) if known else outside for shape, known in bounds]
+        unknown = space.media.sensor if through is not None else outside
+        front = [number_of(shape.exterior_medium()) if known else unknown for shape, known in bounds]
+        back = [number_of(shape.interior_medium()) if known else unknown for shape, known in bounds]
         self._front, self._back = mi.UInt32(front or [0]), mi.UInt32(back or [0])
         infinite = (mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters.objects)
+        chosen = (emitter.sampling_weight() > 0 for emitter in emitters.objects)
         bounded = through is not None  # else all is in one medium
-        asked = [bounded and not (known or away) for known, away in zip(declared, infinite, strict=True)]
+        asked = [
+            bounded and may and not (known or away)
+            for known, away, may in zip(declared, infinite, chosen, strict=True)
+        ]
         self._settled, self._any_asked, self._asked = False, any(asked), mi.Bool(asked or [False])
         dr.make_opaque(self._front, self._back, self._asked)
 
@@ -84,14 +90,16 @@ class LightMedia:
         wavelengths = dr.zeros(mi.UnpolarizedSpectrum, u.shape[1]) + 550 if mi.is_spectral else mi.Color0f()
         shared = Shared(mi.Float(0), wavelengths, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), shared, mi.Bool(True))
-        number, index = self.at(e), e.index + dr.zeros(mi.UInt32, u.shape[1])
-        dr.eval(number, index)  # one kernel
-        number, order = np.array(number), np.argsort(np.array(index), kind="stable")
-        parts = np.split(number[order], np.searchsorted(np.array(index)[order], np.arange(1, count)))
+        number, known = self._traced(e)
+        dr.eval(number, known, e.index)  # one kernel
+        known = np.broadcast_to(np.array(known), u.shape[1])
+        index, number = (np.broadcast_to(np.array(x), u.shape[1])[known] for x in (e.index, number))
         tables = [np.array(table) for table in (self._front, self._back, self._asked)]
-        for i, found in enumerate(parts):
-            if tables[2][i] and len(found) >= _FEWEST and (found == found[0]).all():
-                tables[0][i], tables[1][i], tables[2][i] = found[0], found[0], False
+        for i in np.flatnonzero(tables[2]):
+            found = number[index == i]
+            if len(found):
+                tables[0][i] = tables[1][i] = most = np.bincount(found).argmax()
+                tables[2][i] = len(found) < _FEWEST or (found != most).any()
         self._front, self._back, self._asked = mi.UInt32(tables[0]), mi.UInt32(tables[1]), mi.Bool(tables[2])
         self._any_asked = bool(tables[2].any())
         dr.make_opaque(self._front, self._back, self._asked)
@@ -99,19 +107,25 @@ class LightMedia:
     def at(self, e) -> mi.UInt32:
         """Number of the medium in which the first ray of an `emitters.Emission` starts.
 
-        That which the emitter's shape declares on this side; else the near side of the first boundary along
-        the ray, or the medium that the sensor declares if the ray stays among opaque surfaces.
+        The medium that the emitter's shape declares on the side of the direction; otherwise the near side of
+        the first boundary along the ray. Of a ray that stays among opaque surfaces the medium of most other
+        rays of its emitter, see `settle`, or that of the sensor.
         """
-        outwards = dr.dot(e.anchor.n, e.d) >= 0
+        return self._traced(e)[0]
+
+    def _traced(self, e) -> tuple[mi.UInt32, mi.Bool]:
+        """The medium of an emission, and whether it is known."""
+        known, outwards = mi.Bool(True), dr.dot(e.anchor.n, e.d) >= 0
         number = dr.select(
             outwards, dr.gather(mi.UInt32, self._front, e.index), dr.gather(mi.UInt32, self._back, e.index)
         )
         if self._any_asked:
             asked = dr.gather(mi.Bool, self._asked, e.index)
             met = boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), asked)
-            unknown = dr.select(met.escaped, self._outside, dr.opaque(mi.UInt32, self._space.media.sensor))
-            number = dr.select(asked, dr.select(met.found, met.number, unknown), number)
-        return dr.select(e.infinite, self._outside, number)
+            known = ~asked | met.found | met.escaped
+            unless_found = dr.select(met.escaped, self._outside, number)
+            number = dr.select(asked, dr.select(met.found, met.number, unless_found), number)
+        return dr.select(e.infinite, self._outside, number), known
 
 
 def _near_sides(space: Space, ray: mi.Ray3f) -> boundaries.NearSide:
@@ -134,16 +148,22 @@ def _points_near_boundaries(space: Space) -> mi.Point3f | None:
 def _outside(space: Space, around: boundaries.NearSide, through: mi.Point3f | None) -> int:
     """The medium that surrounds the scene.
 
-    That of most rays from the sensor that escape, and of most lines from outside ``through`` points near
-    boundaries in front of the first boundary; the sensor's if there are none.
+    The most frequent medium of two sets of rays: rays from the sensor that escape (the sensor's medium), and
+    lines that enter the scene towards the points ``through`` (the near side of the first boundary). The
+    sensor's if there are none.
     """
     numbers = np.full(around.escaped.sum(), space.media.sensor)
     if through is not None:
-        d = random_directions(np.random.default_rng(2), _LINES)
-        size = float(np.linalg.norm(np.array(scene_box(space.scene).extents())))
-        lines = _near_sides(space, mi.Ray3f(through - d * (size * 1.1), d))
+        lines = _near_sides(space, _lines(space, through))
         numbers = np.concatenate([numbers, lines.number[lines.found]])
     return int(np.bincount(numbers).argmax()) if len(numbers) else space.media.sensor
+
+
+def _lines(space: Space, through: mi.Point3f) -> mi.Ray3f:
+    """Random lines from outside of the scene ``through`` these points."""
+    d = random_directions(np.random.default_rng(2), _LINES)
+    size = float(np.linalg.norm(np.array(scene_box(space.scene).extents())))
+    return mi.Ray3f(through - d * (size * 1.1), d)
 
 
 def _rays_around(sensor: mi.Sensor) -> mi.Ray3f:
@@ -168,14 +188,15 @@ def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: boundaries
     others = numbers[numbers != space.media.sensor]
     if len(others) <= _TOLERATED * len(numbers):
         return ""
-    called = [
-        f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
-        for number in (space.media.sensor, int(np.bincount(others).argmax()))
-    ]
+    says, there = (_called(space, n) for n in (space.media.sensor, int(np.bincount(others).argmax())))
     return (
-        f"sensor {named(sensor)} declares {called[0]}, but the boundaries around it say that it is in "
-        f"{called[1]}: let it refer to that (name medium), or mend the media of the shapes around it"
+        f"sensor {named(sensor)} declares {says}, but the boundaries around it say that it is in {there}: "
+        "let it refer to that (name medium), or mend the media of the shapes around it"
     )
+
+
+def _called(space: Space, number: int) -> str:
+    return f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
 
 
 def _contradiction_of_phases(space: Space) -> str:
@@ -189,8 +210,21 @@ def _contradiction_of_phases(space: Space) -> str:
     return ""
 
 
-def _contradiction_at_infinity(space: Space, outside: int) -> str:
+def _contradiction_at_infinity(space: Space, outside: int, through: mi.Point3f | None) -> str:
     """Why light from infinity differs from the camera's side in ``outside``; or empty."""
+    if through is not None:
+        line = _lines(space, through)
+        si = space.scene.ray_intersect(line)
+        number = space.media.number(si.target_medium(line.d))
+        onwards = mi.Ray3f(line(rays.passed(line, si, space.shape_errors)), line.d)
+        entered, number = (np.array(x) for x in (si.is_valid() & si.is_medium_transition(), number))
+        escaped = entered & _near_sides(space, onwards).escaped
+        wrong = number[escaped & (number != outside)]
+        if len(wrong) > _TOLERATED * entered.sum():
+            return (
+                f"rays leave the scene in {_called(space, int(np.bincount(wrong).argmax()))}, others "
+                f"in {_called(space, outside)}: close the boundary between them"
+            )
     if not outside:
         return ""
     medium, look = space.media.objects[outside - 1], space.media.looks[outside - 1]

@@ -156,20 +156,20 @@ class Planner:
             return table, None
         learnt = self._fitted_emission(moments)
         lit = min((row.score for row in table if row.candidate.light_paths), default=math.inf)
-        allows_next_event = table[0].candidate.light_paths > 0
-        if learnt.tables is None or (not allows_next_event and lit * learnt.whole > table[0].score):
+        has_light_paths = table[0].candidate.light_paths > 0
+        if learnt.tables is None or (not has_light_paths and lit * learnt.whole > table[0].score):
             return table, learnt
-        if not allows_next_event:
+        if not has_light_paths:
             found = self._measured(samples, learnt.tables)
             guided = choice.choose(found, self._alternatives(samples))
             if not found.mean > 0 or not guided or not guided[0].candidate.light_paths:
                 return table, learnt
             self._with_tables, table = found, guided
-        return [row.with_emission(learnt.tables, allows_next_event) for row in table], learnt
+        return [row.with_emission(learnt.tables, has_light_paths) for row in table], learnt
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
-        dispatch = self._prepared.traits.dispatch  # the approximation asks every BSDF five times more
+        dispatch = self._prepared.traits.dispatch  # the approximation calls every BSDF five times more
         return (
             samples >= JOINED_SAMPLES + (budget.SAMPLES_PER_BSDF * dispatch.count if dispatch.many else 0)
             and self._pixels >= JOINED_PIXELS
