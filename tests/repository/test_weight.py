@@ -15,7 +15,7 @@ MOST = {
     "emitters": 2680,
     "cli": 1801,
     "media": 1468,
-    "geometry": 1656,
+    "geometry": 1659,
     "image": 1508,
     "files": 1226,
     "run": 1196,

@@ -12,7 +12,8 @@ import numpy as np
 
 from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
-from .boxes import asked_anew, box_of, scene_box
+from .boxes import asked_anew, scene_box
+from .directions import random_directions
 from .quadrics import ROUND, outward_sign
 
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
@@ -30,9 +31,9 @@ LEAST_COSINE = 0.1
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
 
-# Largest gap before a small sphere or cylinder, in radii, that shadow rays leave untested where no box of
-# another shape reaches into it; see experiments, section Rounding.
-SHELL = 0.1
+# Largest gap before a small sphere, in radii, that shadow rays leave untested where nothing is in it: none of
+# so many rays from the sphere meets another shape there; see experiments, section Rounding.
+SHELL, _AROUND = 0.1, 256
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
 # is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
@@ -100,14 +101,14 @@ class ShapeErrors:
             self._triangles = mi.UInt32(first), mi.Float(np.concatenate(triangles).astype(np.float32))
         crowded = [False] * self._size
         if self.small:
-            within = _crowded(shapes, [abs(row.ends) for row in rows], about)
+            within = _crowded(scene, shapes, [abs(row.ends) for row in rows])
             for index, near in zip(ids, within, strict=True):
                 crowded[index] = near
         self._crowded = mi.Bool(crowded)
         dr.make_opaque(self._table, self._triangles, self._crowded)
 
     def crowded(self, number: mi.UInt32) -> mi.Bool:
-        """Mask: another shape's box reaches nearer than `SHELL` radii to the shape of index ``number``."""
+        """Mask: another shape may be nearer than `SHELL` radii to the one of index ``number``."""
         return dr.gather(mi.Bool, self._crowded, dr.minimum(number, self._size - 1))
 
     def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
@@ -126,18 +127,19 @@ class ShapeErrors:
         return found
 
 
-def _crowded(shapes, curvatures: list[float], about: Callable) -> list[bool]:
-    """Whether another shape's box meets that of each round shape, grown by `SHELL` radii; true if unknown."""
-    found = [about("box", partial(box_of, shape), shape) for shape in shapes]
-    low, high = (
-        np.array([np.full(3, np.nan) if box is None else np.array(corner(box)) for box in found])
-        for corner in (lambda box: box.min, lambda box: box.max)
-    )
-    near = []
-    for i, curvature in enumerate(curvatures):
-        gap = SHELL / curvature if curvature else np.nan
-        apart = (low > high[i] + gap).any(1) | (high < low[i] - gap).any(1)
-        near.append(bool(curvature) and not np.delete(apart, i).all())
+def _crowded(scene: mi.Scene, shapes, curvatures: list[float]) -> list[bool]:
+    """Whether rays from a round shape meet another within `SHELL` radii; true for all but spheres."""
+    spheres = [i for i, s in enumerate(shapes) if curvatures[i] and s.shape_type() == _SPHERE]
+    near = [curvature != 0 for curvature in curvatures]
+    if spheres:
+        d = random_directions(np.random.default_rng(0), _AROUND * len(spheres))
+        radius = np.repeat([1 / curvatures[i] for i in spheres], _AROUND)
+        centre = mi.Point3f(np.repeat([matrix_of(shapes[i])[:3, 3] for i in spheres], _AROUND, axis=0).T)
+        at = mi.Float(radius.astype(np.float32))
+        ray = mi.Ray3f(centre + d * (at * (1 + 0.01 * SHELL)), d)
+        ray.maxt = SHELL * at
+        for i, met in zip(spheres, scene.ray_test(ray).numpy().reshape(-1, _AROUND), strict=True):
+            near[i] = bool(met.any())
     return near
 
 
@@ -209,6 +211,7 @@ def _uses_embree() -> bool:
     return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
+_SPHERE = mi.ShapeType.Sphere.value
 _WHOLE = {*ROUND, mi.ShapeType.SDFGrid.value}
 
 
