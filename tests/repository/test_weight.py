@@ -14,7 +14,7 @@ MOST = {
     "planning": 2917,
     "emitters": 2680,
     "cli": 1801,
-    "media": 1468,
+    "media": 1469,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -38,13 +38,13 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
     return box if is_finite(box) else None
 
 
-def boxes(scene: mi.Scene, about: Callable = asked_anew) -> list[mi.ScalarBoundingBox3f]:
+def boxes(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> list[mi.ScalarBoundingBox3f]:
     """Valid boxes of a scene's shapes; ``about``: caches facts, see `ShapeFacts.about`."""
     found = (about("box", partial(box_of, shape), shape) for shape in scene.shapes())
     return [box for box in found if box is not None]
 
 
-def scene_box(scene: mi.Scene, about: Callable = asked_anew) -> mi.ScalarBoundingBox3f:
+def scene_box(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> mi.ScalarBoundingBox3f:
     """Bounding box of a scene, including shapes that Mitsuba leaves out; ``about`` as in `boxes`."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():

@@ -115,7 +115,8 @@ class LightMedia:
 
     def _traced(self, e) -> tuple[mi.UInt32, mi.Bool]:
         """The medium of an emission, and whether it is known."""
-        known, outwards = mi.Bool(True), dr.dot(e.anchor.n, e.d) >= 0
+        known = mi.Bool(True)
+        outwards = dr.dot(e.anchor.n, e.d) >= 0
         number = dr.select(
             outwards, dr.gather(mi.UInt32, self._front, e.index), dr.gather(mi.UInt32, self._back, e.index)
         )
