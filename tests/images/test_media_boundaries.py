@@ -42,9 +42,9 @@ def plaster():
     return {"type": "twosided", "bsdf": parts.matte(0.7, 0.6, 0.5)}
 
 
-def below_the_ceiling(half, down=True, gap=0.02):
+def below_the_ceiling(half, down=True):
     """Where a rectangle is, 2 cm below the ceiling."""
-    turned = parts.transform().translate([0, 1 - gap, 0]).rotate([1, 0, 0], 90 if down else -90)
+    turned = parts.transform().translate([0, 0.98, 0]).rotate([1, 0, 0], 90 if down else -90)
     return turned.scale(half)
 
 
@@ -142,10 +142,10 @@ def test_light_on_a_side_that_states_nothing(light, emits):
     assert (starts(mi.load_dict(scene)) == 1).all()
 
 
-def windowed(half=0.15, gap=0.0, **more):
+def windowed(half, **more):
     """A room of 10 m with opaque walls and a window in the ceiling, which bounds the fog in the room.
 
-    ``half`` the window's width / 2; ``gap``: how far part of the ceiling is away from it.
+    ``half`` the window's width / 2.
     """
     at, wall = parts.transform(), {"type": "rectangle", "bsdf": plaster()}
     shapes = {
@@ -156,7 +156,7 @@ def windowed(half=0.15, gap=0.0, **more):
     shapes["front"] = {**wall, "to_world": at.translate([0, 0, 5]).scale(5)}
     up, strip, middle = at.translate([0, 5, 0]).rotate([1, 0, 0], -90), (5 - half) / 2, (5 + half) / 2
     for name, x, y, width, height in (
-        ("east", middle + gap, 0, strip, 5),
+        ("east", middle, 0, strip, 5),
         ("west", -middle, 0, strip, 5),
         ("north", 0, middle, half, strip),
         ("south", 0, -middle, half, strip),

@@ -38,18 +38,23 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
     return box if is_finite(box) else None
 
 
+def known_box(shape: mi.Shape, about: Callable[..., Any]) -> mi.ScalarBoundingBox3f | None:
+    """`box_of` a shape, computed once; ``about``: caches facts, see `ShapeFacts.about`."""
+    return about("box", partial(box_of, shape), shape)
+
+
 def boxes(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> list[mi.ScalarBoundingBox3f]:
-    """Valid boxes of a scene's shapes; ``about``: caches facts, see `ShapeFacts.about`."""
-    found = (about("box", partial(box_of, shape), shape) for shape in scene.shapes())
+    """Valid boxes of a scene's shapes; ``about`` as in `known_box`."""
+    found = (known_box(shape, about) for shape in scene.shapes())
     return [box for box in found if box is not None]
 
 
 def scene_box(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> mi.ScalarBoundingBox3f:
-    """Bounding box of a scene, including shapes that Mitsuba leaves out; ``about`` as in `boxes`."""
+    """Bounding box of a scene, including shapes that Mitsuba leaves out; ``about`` as in `known_box`."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
     for shape in scene.shapes():
         is_partial = shape.class_name() == "Mesh" or not is_finite(mi.ScalarBoundingBox3f(shape.bbox()))
-        if is_partial and (box := about("box", partial(box_of, shape), shape)) is not None:
+        if is_partial and (box := known_box(shape, about)) is not None:
             whole.expand(box)
     return whole
 

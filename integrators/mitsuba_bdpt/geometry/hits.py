@@ -27,6 +27,7 @@ from ..host.introspection import (
     shapes_in,
 )
 from .boxes import asked_anew
+from .quadrics import is_sphere
 from .rounding import met
 
 # From this number of instances or spheres on they are looked up; of spheres only where other shapes, which
@@ -65,7 +66,7 @@ class HitTables:
         `ShapeFacts.about`.
         """
         shapes = scene.shapes()
-        instances, spheres = ([s for s in shapes if is_one(s)] for is_one in (is_instance, _is_sphere))
+        instances, spheres = ([s for s in shapes if is_one(s)] for is_one in (is_instance, is_sphere))
         others = len(shapes) - len(instances) - len(spheres)
         many_spheres = len(spheres) >= max(MANY, others / _OTHERS)
         if dr.backend_v(mi.Float) != dr.JitBackend.LLVM or not (many_spheres or len(instances) >= MANY):
@@ -200,13 +201,9 @@ def _frame_of(shape: mi.Shape) -> np.ndarray:
     return np.array([matrix_of(shape)[:3], inverse_of(shape)[:3]])
 
 
-def _is_sphere(shape: mi.Shape) -> bool:
-    return shape.shape_type() == mi.ShapeType.Sphere.value
-
-
 def _targets(scene: mi.Scene) -> list[mi.Shape]:
     """Shapes that are called one by one: all but instances and the scene's spheres, then those of groups."""
-    own = [shape for shape in scene.shapes() if not (is_instance(shape) or _is_sphere(shape))]
+    own = [shape for shape in scene.shapes() if not (is_instance(shape) or is_sphere(shape))]
     return [*own, *grouped_shapes(scene)]
 
 

@@ -47,7 +47,7 @@ class Sphere:
 
     @staticmethod
     def of(shape: mi.Shape) -> Sphere | None:
-        if shape.shape_type() != mi.ShapeType.Sphere.value:
+        if not is_sphere(shape):
             return None
         matrix = matrix_of(shape)
         radius = float(np.sqrt(number(shape.surface_area()) / (4 * np.pi)))
@@ -59,6 +59,10 @@ class Sphere:
         turned = not off <= 1e-6 * radius  # also if it is not finite
         outward = 1.0 if number(local) > 0 else -1.0
         return Sphere(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward, turned)
+
+
+def is_sphere(shape: mi.Shape) -> bool:
+    return shape.shape_type() == mi.ShapeType.Sphere.value
 
 
 def sphere_normal(p, center, outward):

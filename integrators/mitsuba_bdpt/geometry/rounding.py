@@ -14,7 +14,7 @@ from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
 from .boxes import asked_anew, scene_box
 from .directions import random_directions
-from .quadrics import ROUND, outward_sign
+from .quadrics import ROUND, is_sphere, outward_sign
 
 # Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
 OFFSET_ULPS = 32
@@ -99,11 +99,9 @@ class ShapeErrors:
         self._triangles = None
         if len(triangles) > 1:
             self._triangles = mi.UInt32(first), mi.Float(np.concatenate(triangles).astype(np.float32))
-        crowded = [False] * self._size
+        crowded = np.zeros(self._size, dtype=bool)
         if self.small:
-            within = _crowded(scene, shapes, [abs(row.ends) for row in rows])
-            for index, near in zip(ids, within, strict=True):
-                crowded[index] = near
+            crowded[ids] = _crowded(scene, shapes, [abs(row.ends) for row in rows])
         self._crowded = mi.Bool(crowded)
         dr.make_opaque(self._table, self._triangles, self._crowded)
 
@@ -127,19 +125,17 @@ class ShapeErrors:
         return found
 
 
-def _crowded(scene: mi.Scene, shapes, curvatures: list[float]) -> list[bool]:
+def _crowded(scene: mi.Scene, shapes, curvatures: list[float]) -> np.ndarray:
     """Whether rays from a round shape meet another within `SHELL` radii; true for all but spheres."""
-    spheres = [i for i, s in enumerate(shapes) if curvatures[i] and s.shape_type() == _SPHERE]
-    near = [curvature != 0 for curvature in curvatures]
+    near = np.array(curvatures) != 0
+    spheres = [i for i, shape in enumerate(shapes) if near[i] and is_sphere(shape)]
     if spheres:
         d = random_directions(np.random.default_rng(0), _AROUND * len(spheres))
-        radius = np.repeat([1 / curvatures[i] for i in spheres], _AROUND)
+        radius = mi.Float(np.repeat([1 / curvatures[i] for i in spheres], _AROUND).astype(np.float32))
         centre = mi.Point3f(np.repeat([matrix_of(shapes[i])[:3, 3] for i in spheres], _AROUND, axis=0).T)
-        at = mi.Float(radius.astype(np.float32))
-        ray = mi.Ray3f(centre + d * (at * (1 + 0.01 * SHELL)), d)
-        ray.maxt = SHELL * at
-        for i, met in zip(spheres, scene.ray_test(ray).numpy().reshape(-1, _AROUND), strict=True):
-            near[i] = bool(met.any())
+        ray = mi.Ray3f(centre + d * (radius * (1 + 0.01 * SHELL)), d)
+        ray.maxt = SHELL * radius
+        near[spheres] = scene.ray_test(ray).numpy().reshape(-1, _AROUND).any(axis=1)
     return near
 
 
@@ -211,7 +207,6 @@ def _uses_embree() -> bool:
     return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
-_SPHERE = mi.ShapeType.Sphere.value
 _WHOLE = {*ROUND, mi.ShapeType.SDFGrid.value}
 
 

@@ -127,8 +127,7 @@ class _Faces:
 
         Within a part the search has few faces left (Chen and Asau's method of cutpoints, 1974).
         """
-        sums, area = self.sums, np.float32(self.area)
-        parts = 1 << len(sums).bit_length()
+        sums, area, parts = self.sums, np.float32(self.area), 1 << len(self.sums).bit_length()
         u = np.arange(parts + 1, dtype=np.float32) / np.float32(parts) * area
         found = np.maximum(np.searchsorted(sums, u), np.searchsorted(sums, 0, "right"))
         return np.minimum(found, np.searchsorted(sums, area)).clip(0, len(sums) - 1)

@@ -8,6 +8,7 @@ surrounds the scene. Kernels trace it only for emitters whose rays start in seve
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,7 @@ import numpy as np
 
 from ..emitters.emitters import Emitters
 from ..geometry import rays
-from ..geometry.boxes import box_of, points_in, scene_box
+from ..geometry.boxes import known_box, points_in, scene_box
 from ..geometry.directions import random_directions
 from ..host.introspection import is_instance, named
 from ..transport.inputs import Shared
@@ -44,14 +45,14 @@ class LightMedia:
 
     ``outside``: number of the medium that surrounds the scene, see `_outside`; ``contradiction``: why light
     and camera subpaths would disagree on the media, or empty; ``hides_infinity``: light from infinity does
-    not arrive; ``far``: see `medium_at_far_plane`.
+    not arrive; ``far``: see `medium_at_far_plane`; ``about`` as in `known_box`.
     """
 
-    def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int):
+    def __init__(self, space: Space, emitters: Emitters, sensor: mi.Sensor, far: int, about: Callable):
         self._space, self._emitters = space, emitters
         around = _near_sides(space, _rays_around(sensor))
-        through = _points_near_boundaries(space)
-        self.outside = outside = _outside(space, around, through)
+        lines = _lines(space, about)
+        self.outside = outside = _outside(space, around, lines)
         self._outside = dr.opaque(mi.UInt32, outside)
         # An endless homogeneous medium absorbs all light from infinity.
         endless = space.media.objects[outside - 1] if outside else None
@@ -61,19 +62,19 @@ class LightMedia:
         self.contradiction = (
             _contradiction_of_sensor(space, sensor, around)
             or _contradiction_of_phases(space)
-            or (_contradiction_at_infinity(space, outside, through) if emitters.at_infinity else "")
+            or (_contradiction_at_infinity(space, outside, lines) if emitters.at_infinity else "")
             or _contradiction_at_far_plane(space, sensor, 0 if far == outside else far)
         )
         shapes = [emitter.get_shape() for emitter in emitters.objects]
         declared = [shape is not None and shape.is_medium_transition() for shape in shapes]
         number_of, bounds = space.media.number_of, list(zip(shapes, declared, strict=True))
-        unknown = space.media.sensor if through is not None else outside
+        unknown = space.media.sensor if lines is not None else outside
         front = [number_of(shape.exterior_medium()) if known else unknown for shape, known in bounds]
         back = [number_of(shape.interior_medium()) if known else unknown for shape, known in bounds]
         self._front, self._back = mi.UInt32(front or [0]), mi.UInt32(back or [0])
         infinite = (mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters.objects)
         chosen = (emitter.sampling_weight() > 0 for emitter in emitters.objects)
-        bounded = through is not None  # else all is in one medium
+        bounded = lines is not None  # else all is in one medium
         asked = [
             bounded and may and not (known or away)
             for known, away, may in zip(declared, infinite, chosen, strict=True)
@@ -94,14 +95,14 @@ class LightMedia:
         dr.eval(number, known, e.index)  # one kernel
         known = np.broadcast_to(np.array(known), u.shape[1])
         index, number = (np.broadcast_to(np.array(x), u.shape[1])[known] for x in (e.index, number))
-        tables = [np.array(table) for table in (self._front, self._back, self._asked)]
-        for i in np.flatnonzero(tables[2]):
-            found = number[index == i]
-            if len(found):
-                tables[0][i] = tables[1][i] = most = np.bincount(found).argmax()
-                tables[2][i] = len(found) < _FEWEST or (found != most).any()
-        self._front, self._back, self._asked = mi.UInt32(tables[0]), mi.UInt32(tables[1]), mi.Bool(tables[2])
-        self._any_asked = bool(tables[2].any())
+        media = len(self._space.media.objects) + 1
+        found = np.bincount(index * media + number, minlength=count * media).reshape(count, media)
+        front, back, asked = (np.array(table) for table in (self._front, self._back, self._asked))
+        total, told = found.sum(axis=1), asked & found.any(axis=1)
+        front[told] = back[told] = found.argmax(axis=1)[told]
+        asked &= (total < _FEWEST) | (found.max(axis=1) < total)
+        self._front, self._back, self._asked = mi.UInt32(front), mi.UInt32(back), mi.Bool(asked)
+        self._any_asked = bool(asked.any())
         dr.make_opaque(self._front, self._back, self._asked)
 
     def at(self, e) -> mi.UInt32:
@@ -137,34 +138,30 @@ def _near_sides(space: Space, ray: mi.Ray3f) -> boundaries.NearSide:
     return boundaries.NearSide(*(np.broadcast_to(np.array(part), count) for part in parts))
 
 
-def _points_near_boundaries(space: Space) -> mi.Point3f | None:
-    """`_LINES` points in the boxes of shapes that bound media, including instances; None without any."""
+def _lines(space: Space, about: Callable) -> mi.Ray3f | None:
+    """`_LINES` random lines from outside of the scene to shapes that bound media; None without any."""
     shapes = [s for s in space.scene.shapes() if s.is_medium_transition() or is_instance(s)]
-    boxes = [box for s in shapes[:_MOST_SHAPES] if (box := box_of(s)) is not None]
+    boxes = [box for s in shapes if (box := known_box(s, about)) is not None][:_MOST_SHAPES]
     if not boxes:
         return None
-    return points_in(boxes, np.arange(_LINES) % len(boxes), np.random.default_rng(1).random((_LINES, 3)))
+    points = np.random.default_rng(1).random((_LINES, 3))
+    through = points_in(boxes, np.arange(_LINES) % len(boxes), points)
+    d = random_directions(np.random.default_rng(2), _LINES)
+    size = float(np.linalg.norm(np.array(scene_box(space.scene, about).extents())))
+    return mi.Ray3f(through - d * (size * 1.1), d)
 
 
-def _outside(space: Space, around: boundaries.NearSide, through: mi.Point3f | None) -> int:
+def _outside(space: Space, around: boundaries.NearSide, lines: mi.Ray3f | None) -> int:
     """The medium that surrounds the scene.
 
     The most frequent medium of two sets of rays: rays from the sensor that escape (the sensor's medium), and
-    lines that enter the scene towards the points ``through`` (the near side of the first boundary). The
-    sensor's if there are none.
+    ``lines`` from outside (the near side of the first boundary). The sensor's if there are none.
     """
     numbers = np.full(around.escaped.sum(), space.media.sensor)
-    if through is not None:
-        lines = _near_sides(space, _lines(space, through))
-        numbers = np.concatenate([numbers, lines.number[lines.found]])
+    if lines is not None:
+        met = _near_sides(space, lines)
+        numbers = np.concatenate([numbers, met.number[met.found]])
     return int(np.bincount(numbers).argmax()) if len(numbers) else space.media.sensor
-
-
-def _lines(space: Space, through: mi.Point3f) -> mi.Ray3f:
-    """Random lines from outside of the scene ``through`` these points."""
-    d = random_directions(np.random.default_rng(2), _LINES)
-    size = float(np.linalg.norm(np.array(scene_box(space.scene).extents())))
-    return mi.Ray3f(through - d * (size * 1.1), d)
 
 
 def _rays_around(sensor: mi.Sensor) -> mi.Ray3f:
@@ -211,13 +208,12 @@ def _contradiction_of_phases(space: Space) -> str:
     return ""
 
 
-def _contradiction_at_infinity(space: Space, outside: int, through: mi.Point3f | None) -> str:
+def _contradiction_at_infinity(space: Space, outside: int, lines: mi.Ray3f | None) -> str:
     """Why light from infinity differs from the camera's side in ``outside``; or empty."""
-    if through is not None:
-        line = _lines(space, through)
-        si = space.scene.ray_intersect(line)
-        number = space.media.number(si.target_medium(line.d))
-        onwards = mi.Ray3f(line(rays.passed(line, si, space.shape_errors)), line.d)
+    if lines is not None:
+        si = space.scene.ray_intersect(lines)
+        number = space.media.number(si.target_medium(lines.d))
+        onwards = mi.Ray3f(lines(rays.passed(lines, si, space.shape_errors)), lines.d)
         entered, number = (np.array(x) for x in (si.is_valid() & si.is_medium_transition(), number))
         escaped = entered & _near_sides(space, onwards).escaped
         wrong = number[escaped & (number != outside)]

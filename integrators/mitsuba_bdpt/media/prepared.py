@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import mitsuba as mi
@@ -21,10 +22,12 @@ def prepare(
     sensor: mi.Sensor,
     bsdfs: list[mi.BSDF],
     traits: bsdf.Traits,
+    about: Callable,
 ) -> tuple[Space, LightMedia]:
     """The space between vertices, and the media in which light subpaths start.
 
-    ``found``: see `introspection.media_of`; ``bsdfs`` of the scene's shapes, with their ``traits``.
+    ``found``: see `introspection.media_of`; ``bsdfs`` of the scene's shapes, with their ``traits``;
+    ``about``: caches facts about shapes, see `ShapeFacts.about`.
     """
     media = Media(found, sensor.get_medium(), bsdfs)
     for one in bsdf.polarizing(bsdfs):
@@ -35,4 +38,4 @@ def prepare(
     space = Space(emitters.scene, media, emitters.shape_errors, traits.null_transmission)
     far = medium_at_far_plane(space, sensor)
     space = replace(space, clipped=far > 0 and media.objects[far - 1].is_homogeneous())
-    return space, LightMedia(space, emitters, sensor, far)
+    return space, LightMedia(space, emitters, sensor, far, about)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ import mitsuba as mi
 from .. import components
 from ..emitters.emitters import Emitters
 from ..emitters.infinite import contrast
-from ..geometry.boxes import box_of, is_finite, scene_box
+from ..geometry.boxes import is_finite, known_box, scene_box
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of, own_parameters
@@ -67,7 +67,7 @@ class PreparedScene:
         self.space = self.light_media = None
         if media := media_of(scene, [sensor]):
             self.space, self.light_media = components.media.prepare(
-                media, self.emitters, sensor, found, self.traits
+                media, self.emitters, sensor, found, self.traits, facts.about
             )
             delta &= ~null  # which edges pass
         self.delta = any(f & delta for f in flags)
@@ -97,7 +97,7 @@ def _is_small(emitter: mi.Emitter, size: float, about: Callable) -> bool:
     shape = emitter.get_shape()
     if shape is None or any(mi.has_flag(emitter.flags(), flag) for flag in delta):
         return True
-    box = about("box", partial(box_of, shape), shape)
+    box = known_box(shape, about)
     if box is None:
         return True
     _, width, height = sorted(float(extent) for extent in box.extents())
