@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABCMeta
 from collections.abc import Callable
+from dataclasses import replace
 from functools import wraps
 from importlib import import_module
 from typing import cast
@@ -92,6 +93,9 @@ class BDPTIntegrator(metaclass=ABCMeta):
     """Of the last render; empty before the first."""
     on_pass: Callable[[PassReport], object] | None
     """``None``, or a function that is called after each pass."""
+    part: int
+    """How many renders of other seeds come before this one in an average of renders (0). The radius of merging
+    goes on from theirs, so that the average converges."""
 
     def __init__(self, props: mi.Properties):
         tracebacks.install()
@@ -100,7 +104,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         mi.SamplingIntegrator.__init__(self, props)
         self.settings = settings
         self.statistics = cast(Statistics, {})
-        self.on_pass = None
+        self.on_pass, self.part = None, 0
         self._cancelled = False
         # Of the last scene.
         self._light_groups, self._colours = tuple(parsed(settings.light_groups)), tuple("RGB")
@@ -147,14 +151,17 @@ class BDPTIntegrator(metaclass=ABCMeta):
         """
         if self.on_pass is not None and not callable(self.on_pass):
             raise UsageTypeError(f"on_pass={self.on_pass!r} must be None or a function of a PassReport")
-        render = self._new_render(scene, sensor, seed, spp)
         if start is not None:
             check_resumable(start)
+        render = self._new_render(scene, sensor, seed, spp, start)
+        if start is not None:
             render.resume(start)
         messages.warn_of_parameters(render.prepared, render.sensor, self.settings)
         messages.warn_of_media(render.prepared, render.sensor)
         try:
             self._cancelled = False
+            if not render.passes:
+                render = render.decided()
             render.run(self.on_pass, lambda: self._cancelled)
         finally:
             self.statistics = statistics(render)
@@ -164,14 +171,17 @@ class BDPTIntegrator(metaclass=ABCMeta):
         messages.warn_of_late_decisions(self.settings.decisions, len(self.statistics["passes"]))
         return _result(render.sensor.film(), develop, evaluate)
 
-    def _new_render(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int) -> Render:
-        """Check the arguments and prepare a render."""
+    def _new_render(
+        self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int, start: Snapshot | None = None
+    ) -> Render:
+        """Check the arguments and prepare a render, with the ``merging`` of the snapshot ``start``, if any."""
         check_made_for(self, scene)
-        sensor = resolve_sensor(scene, sensor)
-        spp = samples_per_pixel(sensor, spp, self.settings)
-        return self._made(Render(scene, sensor, self.settings, seed, spp))
-
-    def _made(self, render: Render) -> Render:
+        sensor, settings = resolve_sensor(scene, sensor), self.settings
+        spp = samples_per_pixel(sensor, spp, settings)
+        if start is not None and settings.merging == "auto":
+            settings = replace(settings, merging=start.identity.get("merging") is True)
+        render = Render(scene, sensor, settings, seed, spp)
+        render.part = integer(self.part, "part", 0)
         self._colours = render.accumulator.colour.names
         if render.light_groups is not None:
             self._light_groups = render.light_groups.names
@@ -192,14 +202,16 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if spp is not None:
             spp = samples_per_pixel(sensor, integer(spp, "spp", 0), self.settings)
         render = Render(scene, sensor, self.settings, 0, spp or 1)
-        table = render.decide() if spp else []
-        if self.settings.decisions:
-            render.replay()
-        planner = render.planner
+        if spp:
+            render = render.decided()
+        planner, table = render.planner, render.table
         confidence = planner.confidence(render.passes) if table else 0.0
         invalid = planner.lost_by_pilots()
-        warning = render.explained_warning().removeprefix(UsageError.prefix)
-        text = explain(render.prepared, render.plan, self.settings, table, confidence, invalid, warning)
+        warning = render.explained_warning(spp is not None).removeprefix(UsageError.prefix)
+        plan = replace(render.plan, skipped=(*render.plan.skipped, *render.skipped))
+        if plan.merging:
+            warning = f"merging: {render.why_merged}"
+        text = explain(render.prepared, plan, self.settings, table, confidence, invalid, warning)
         if render.light_groups is not None:
             text = "\n".join([text, *render.light_groups.explained()])
         if spp is None and is_open(render.plan, self.settings):
@@ -216,8 +228,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         Empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the reason. As JSON,
         the list is a value of the parameter ``decisions``. Decisions do not depend on ``seed``.
         """
-        render = self._new_render(scene, sensor, seed, spp)
-        render.decide()
+        render = self._new_render(scene, sensor, seed, spp).decided()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)
         return [decision.record() for decision in render.planner.decided.decisions]
@@ -235,12 +246,10 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
         The snapshot may be merged from several (`Snapshot.joined`) of integrators with equal parameters.
         """
-        check_made_for(self, scene)
         if not isinstance(snapshot, Snapshot):
             raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
-        sensor = resolve_sensor(scene, sensor)
-        render = self._made(Render(scene, sensor, self.settings, 0, 1))
-        render.resume(snapshot, apart_from=("seed", "spp", "decisions"))
+        render = self._new_render(scene, sensor, 0, 1, snapshot)
+        render.resume(snapshot, apart_from=("seed", "spp", "decisions", "part"))
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)

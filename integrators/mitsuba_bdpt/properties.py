@@ -26,6 +26,7 @@ from .settings import LAYERS, LIGHT_PATHS, NONE, PARAMETERS, UNLIMITED, Settings
 ARGUMENTS = {
     "spp": f"an integer from 1 to {UNLIMITED}, or 0 for the sampler's sample_count",
     "seed": f"an integer from 0 to {UNLIMITED}",
+    "part": f"an integer from 0 to {UNLIMITED}",
 }
 
 # Remedies for parameters that are mistaken for ours. Mitsuba's upgrade of scene files of version 0.6 writes
@@ -122,6 +123,17 @@ def _light_paths(value, name: str) -> float | str:
     return number
 
 
+def _merging(value, name: str) -> bool | str:
+    choices = {"auto": "auto", "true": True, "false": False}
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, str):
+        raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
+    if value not in choices:
+        raise UsageError(f"{name}={value!r} is not known; use one of {', '.join(choices)}")
+    return choices[value]
+
+
 def _layers(value, name: str) -> tuple[str, ...]:
     """The layers, in the order of `LAYERS`."""
     text = _string(value, name)
@@ -154,6 +166,7 @@ def _light_groups(value, name: str) -> str:
 _READERS = {
     "max_depth": lambda value, name: UNLIMITED if (depth := _integer(value, name)) < 0 else depth,
     "light_paths": _light_paths,
+    "merging": _merging,
     "decisions": lambda value, name: read_decisions(text) if (text := _string(value, name)) else None,
     "aovs": _aovs,
     "layers": _layers,

@@ -141,12 +141,12 @@ class Settings:
         "Random numbers: ``sobol`` (Owen-scrambled Sobol' points) or ``independent``.",
         choices=POINTS,
     )
-    merging: bool = _parameter(
-        False,
-        "true or false",
+    merging: bool | str = _parameter(
+        "auto",
+        "true, false or 'auto'",
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
         as the floor of a pool), also of nearly specular surfaces, by vertex merging with photons: consistent,
-        not unbiased.""",
+        not unbiased. With ``auto`` where the other strategies lack 1 % of the image's light or more.""",
     )
     guiding: str = _parameter(
         "auto",
@@ -244,13 +244,16 @@ class Settings:
     @property
     def merge_images(self) -> bool:
         """Whether there is a strategy image of merges."""
-        return self.strategy_images and self.merging
+        return self.strategy_images and self.merging is True
 
 
 PARAMETERS: dict[str, Parameter] = {
     f.name: f.metadata["parameter"] for f in fields(Settings) if "parameter" in f.metadata
 }
-_MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
+_MANUAL_KINDS = {
+    **{bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"},
+    **{"light_paths": "|string| or |float|", "merging": "|string| or |bool|"},
+}
 
 
 def _default(parameter: Parameter) -> str:
@@ -266,7 +269,7 @@ def manual() -> str:
     """The list of parameters of the plugin's manual, in reStructuredText as in Mitsuba's own."""
     lines = [".. pluginparameters::", ""]
     for name, parameter in PARAMETERS.items():
-        kind = "|string| or |float|" if name == "light_paths" else _MANUAL_KINDS[parameter.kind]
+        kind = _MANUAL_KINDS.get(name) or _MANUAL_KINDS[parameter.kind]
         lines += [
             f" * - {name}",
             f"   - {kind}",

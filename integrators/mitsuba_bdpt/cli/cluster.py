@@ -99,7 +99,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
         job = _job(scene, integrator, options, spp)
         of_pilot = integrator.statistics  # before the parts replace them
         count = options.parts or PARTS_PER_WORKER * worker_count(workers.client)
-        parts = [(job, *part) for part in parts_of(spp, count, options.seed)]
+        parts = [(job, i, *part) for i, part in enumerate(parts_of(spp, count, options.seed))]
         try:
             for index, data in results(workers, render_part, parts):
                 merged.add(index, Snapshot.from_bytes(data))
@@ -131,7 +131,10 @@ def _with_pilot(parts: dict, of_pilot: dict) -> dict:
         name: {key: number + of_pilot[name][key] for key, number in parts[name].items()}
         for name in ("seconds", "kernels")
     }
-    return parts | {name: of_pilot[name] for name in ("no_pilot", "non_finite_in_pilot", "skipped")} | sums
+    names = ("no_pilot", "non_finite_in_pilot", "skipped")
+    if "merging" in parts:
+        sums["merging"] = parts["merging"] | {"why": of_pilot["merging"]["why"]}
+    return parts | {name: of_pilot[name] for name in names} | sums
 
 
 def _job(scene, integrator, options: Namespace, spp: int) -> str:
@@ -140,8 +143,11 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     The absolute path of the scene file, the options of `loading.load`, and the pilot's decisions.
     """
     properties, settings = dict(options.properties), integrator.settings
-    if not fixed_by(settings):  # an empty list if no pilot runs: parts, which are shorter, run none either
+    fixed = fixed_by(settings)
+    if not fixed or settings.merging == "auto":
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
+        properties["merging"] = not integrator.statistics["unbiased"]
+    if not fixed:  # an empty list if no pilot runs: parts, which are shorter, run none either
         properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")
     kept = {name: getattr(options, name) for name in names}
@@ -150,8 +156,8 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
 
 
-def render_part(job: str, seed: int, spp: int) -> bytes:
-    """Render one part of a `_job` on a worker; returns `Snapshot.to_bytes`.
+def render_part(job: str, part: int, seed: int, spp: int) -> bytes:
+    """Render the ``part`` of this index of a `_job` on a worker; returns `Snapshot.to_bytes`.
 
     A process renders one part at a time, on all cores.
     """
@@ -159,7 +165,7 @@ def render_part(job: str, seed: int, spp: int) -> bytes:
         options, scene, integrator = _loaded(job)
         mi.set_variant(options.variant)  # per thread
         reports = []
-        integrator.on_pass = reports.append
+        integrator.on_pass, integrator.part = reports.append, part
         integrator.render(scene, options.sensor, seed, spp, develop=False)
         integrator.on_pass = None
         return reports[-1].snapshot().image_only().to_bytes()

@@ -4,7 +4,7 @@
 the kernel (`sds.PhotonStrategy`). `estimate` estimates the light that no other strategy samples.
 """
 
-from .passes import Passes, check
+from .passes import Passes, why_not
 from .unsampled import Unsampled, estimate
 
-__all__ = ["Passes", "Unsampled", "check", "estimate"]
+__all__ = ["Passes", "Unsampled", "estimate", "why_not"]

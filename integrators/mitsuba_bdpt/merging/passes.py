@@ -8,7 +8,6 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import UnsupportedError
 from ..host.introspection import named
 from ..sampling.points import Points
 from ..settings import Settings
@@ -36,20 +35,14 @@ _SHORT_PASS, _LEAST_SAMPLES = 16, 1 << 16
 _EDGES_BITS, _LANE_BITS = 12, 32
 
 
-def check(sensor: mi.Sensor, media: bool):
-    """Raise ``UnsupportedError`` where vertex merging is not possible.
-
-    ``media``: whether the scene has participating media.
-    """
+def why_not(sensor: mi.Sensor, media: bool) -> str:
+    """Why vertex merging is not possible, or empty; ``media``: the scene has participating media."""
     if sensor.shutter_open_time() > 0:
-        raise UnsupportedError(
+        return (
             f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
-            "subpaths have different times; set shutter_close to shutter_open, or leave out merging"
+            "subpaths have different times"
         )
-    if media:
-        raise UnsupportedError(
-            "merging in scenes with participating media is not supported; leave out merging"
-        )
+    return "merging in scenes with participating media is not supported" if media else ""
 
 
 class Passes:
@@ -78,7 +71,7 @@ class Passes:
     ) -> tuple[Merging, mi.UInt64]:
         """Trace the photons of a pass; returns its strategy, and counters.
 
-        ``samples`` of each pixel; ``done``: passes of the same image or replicate, from which the radius
+        ``samples`` of each pixel; ``done``: earlier passes of all parts of the image, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
         radius = in_pass(self._radius, done)  # in pixels

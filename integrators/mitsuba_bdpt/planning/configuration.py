@@ -102,9 +102,13 @@ CANDIDATES = (
 )
 
 
+# Level of ``statistics["skipped"]`` of strategies that do not pay.
+NOT_WORTH = "not worth its cost here"
+
+
 def not_worth(name: str, why: str) -> dict[str, str]:
     """Entry of ``statistics["skipped"]`` of a class of strategies that does not pay."""
-    return {"class": name, "level": "not worth its cost here", "why": why}
+    return {"class": name, "level": NOT_WORTH, "why": why}
 
 
 # Contributions below a share of the image's mean play roulette before their shadow ray is traced: the smaller

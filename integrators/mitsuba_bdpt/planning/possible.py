@@ -44,8 +44,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     why = _why_not_arrival(prepared, settings)
     arrival = skip("t=0", "impossible", why) if why else True
     specular = prepared.delta or bool(prepared.near_specular)
-    why = _why_not_merging(emitters, specular, bool(direct), "specular") if settings.merging else ""
-    merging = skip("merging", "impossible", why) if why else settings.merging
+    merging = settings.merging is True
+    if merging and (why := _why_not_merging(emitters, specular, bool(direct), "specular")):
+        merging = skip("merging", "impossible", why)
     why = _why_not_guided(prepared, settings, bool(hit), bool(direct), specular)
     if why and settings.guiding == "always":
         skip("guided s=0", "impossible", why)

@@ -266,20 +266,41 @@ def in_words(
     all_of_it = sum(shares.values())
     if all_of_it < WARN_SHARE:
         return ""
-    share = "nearly all" if all_of_it > 0.99 else f"about {100 * all_of_it:.0f} %"
-    return _in_words(prepared, plan, shares, unsampled, samples, f"{share} of the image's light")
+    cause, remedy = _in_words(prepared, plan, shares, unsampled, samples)
+    return f"bdpt: {_kind(unsampled)}, {_share(all_of_it)}: {cause}; {remedy}"
+
+
+def _share(share: float) -> str:
+    return ("nearly all" if share > 0.99 else f"about {100 * share:.0f} %") + " of the image's light"
+
+
+def _kind(unsampled: UnsampledLight) -> str:
+    return "undersampled" if unsampled.is_undersampled else "not sampled"
+
+
+def reason(
+    prepared: PreparedScene, plan: Plan, shares: dict[int, float], unsampled: UnsampledLight, samples: int
+) -> str:
+    """Why light with these ``shares`` is merged; arguments as of `in_words`."""
+    cause, _ = _in_words(prepared, plan, shares, unsampled, samples)
+    return f"without it {_kind(unsampled)}, {_share(sum(shares.values()))}: {cause}"
 
 
 def explained(
-    prepared: PreparedScene, plan: Plan, unsampled: UnsampledLight, samples: int, mean: float | None
+    prepared: PreparedScene,
+    plan: Plan,
+    unsampled: UnsampledLight,
+    samples: int,
+    shares: dict[int, float] | None,
 ) -> str:
-    """`in_words` of light of any share; its radiance if the image's ``mean`` is not known."""
-    shares = unsampled.radiance if mean is None else predicted_shares(unsampled, mean)
-    all_of_it = sum(shares.values())
+    """`in_words` of light of any share; its radiance if the ``shares`` are not known."""
+    parts = unsampled.radiance if shares is None else shares
+    all_of_it = sum(parts.values())
     share = f"light of mean radiance {all_of_it:.2g}"
-    if mean is not None:
+    if shares is not None:
         share = f"{max(100 * all_of_it, 0.01):.2g} % of the image's light"
-    return _in_words(prepared, plan, shares, unsampled, samples, share)
+    cause, remedy = _in_words(prepared, plan, parts, unsampled, samples)
+    return f"bdpt: {_kind(unsampled)}, {share}: {cause}; {remedy}"
 
 
 def _in_words(
@@ -288,9 +309,8 @@ def _in_words(
     parts: dict[int, float],
     unsampled: UnsampledLight,
     samples: int,
-    share: str,
-) -> str:
-    """`in_words` of this ``share``; ``parts`` of it by emitter index."""
+) -> tuple[str, str]:
+    """Cause and remedy of unsampled light; its ``parts`` by emitter index."""
     emitters = prepared.emitters.objects
     order = sorted(parts, key=parts.__getitem__, reverse=True)
     least = WARN_SHARE * sum(parts.values())
@@ -299,8 +319,8 @@ def _in_words(
     if unsampled.is_undersampled:
         remedy = _remedy(prepared, lamps)
         if not plan.splat and prepared.camera.connectible:
-            remedy = f"leave light_paths and decisions to the integrator, {remedy}"
-        return f"bdpt: undersampled, {share}: {_undersampled(what, unsampled, samples, remedy)}"
+            remedy = f"leave light_paths to the integrator, {remedy}"
+        return _undersampled(what, unsampled, samples, remedy)
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
@@ -309,17 +329,17 @@ def _in_words(
         why = f"no light can be traced to the sensor: {prepared.camera.reason}"
     else:
         why = "the render does without light tracing (t=1)"
-        remedy = f"leave light_paths and decisions to the integrator, or {remedy}"
-    return f"bdpt: not sampled, {share}: {what} ({why}); {remedy}"
+        remedy = f"leave light_paths to the integrator, or {remedy}"
+    return f"{what} ({why})", remedy
 
 
-def _undersampled(what: str, unsampled: UnsampledLight, samples: int, remedy: str) -> str:
-    """The rest of the warning about light of which a few samples are expected."""
+def _undersampled(what: str, unsampled: UnsampledLight, samples: int, remedy: str) -> tuple[str, str]:
+    """Cause and remedy of light of which a few samples are expected."""
     objects = " and ".join(unsampled.sharp)
     off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
     why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
     rougher = f"or make the {'surface' if len(unsampled.sharp) == 1 else 'surfaces'} rougher"
-    return f"{what} through or {off} connections rarely sample ({why}); {remedy}, {rougher}"
+    return f"{what} through or {off} connections rarely sample ({why})", f"{remedy}, {rougher}"
 
 
 def called(emitter: mi.Emitter) -> str:
@@ -342,4 +362,6 @@ def _remedy(prepared: PreparedScene, emitters: Iterable[mi.Emitter]) -> str:
         remedy = "make the emitter larger"
     if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
         remedy = "give the sun a disk: sunsky, an envmap, or an area light far away"
-    return remedy if prepared.space is not None else f"set merging=true, or {remedy}"
+    media = prepared.space is not None
+    mergeable = not components.merging.why_not(prepared.camera.sensor, media)
+    return f"set merging=true, or {remedy}" if mergeable else remedy

@@ -19,7 +19,7 @@ def log(statistics: dict):
     times = f"{seconds['total']:.2f} s (compile {seconds['compile']:.2f} s)"
     lines = [f"{sum(statistics['passes'])} spp in {times}; {json.dumps(rays)}"]
     if not statistics["unbiased"]:
-        lines.append(f"merging: consistent, not unbiased; {json.dumps(statistics['merging'])}")
+        lines.append(f"merging (consistent, not unbiased): {json.dumps(statistics['merging'])}")
     lines += [f"no pilot: {no_pilot}"] if no_pilot else []
     lines += [f"decided: {json.dumps(made)}" for made in statistics["decisions"]]
     lines += [f"skipped: {json.dumps(left_out)}" for left_out in statistics["skipped"]]

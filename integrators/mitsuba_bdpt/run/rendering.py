@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import components
 from ..emitters.light_groups import LightGroups
-from ..errors import UsageError, behind
+from ..errors import UnsupportedError, UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
@@ -24,7 +24,7 @@ from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
 from ..planning import missed_direct, unsampled_light
 from ..planning.choice import Prediction
-from ..planning.configuration import MOST_ROULETTE
+from ..planning.configuration import MOST_ROULETTE, NOT_WORTH
 from ..planning.findings import SceneCache
 from ..planning.planner import Planner
 from ..planning.unsampled_light import UnsampledLight
@@ -54,6 +54,9 @@ if TYPE_CHECKING:
 # takes longer than what roulette saves.
 TWO_PASSES = 1 << 18
 
+# Samples that estimate the image's mean, at least.
+LEAST_OF_MEAN = 1 << 12
+
 
 @dataclass(frozen=True)
 class PassReport(Report):
@@ -72,7 +75,9 @@ class Render:
     """One render of ``spp`` samples per pixel, used for a single call.
 
     ``prepared``: the scene; ``planner``: decides the ``plan`` of the ``kernel``; ``points``: random numbers
-    of the passes; ``accumulator``: sums of the image; ``meter``: counts of work and times.
+    of the passes; ``accumulator``: sums of the image; ``meter``: counts of work and times; ``why_merged``:
+    why it merges, or empty; ``skipped``: what it leaves out beside its plan. Renders with ``merging=auto`` do
+    not merge, see `decided`. ``part``: see `BDPTIntegrator.part`.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
@@ -81,12 +86,15 @@ class Render:
         self.light_groups = LightGroups.of(scene, settings.light_groups)
         names = () if self.light_groups is None else self.light_groups.names
         colour = check_film(sensor, settings, names)
-        self.meter = Meter()
+        self.meter, self.part = Meter(), 0
+        self._is_open = settings.merging == "auto"
+        settings = replace(settings, merging=settings.merging is True)
+        self.why_merged, self.skipped = "merging=true" if settings.merging else "", ()
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = PreparedScene(scene, sensor)
         messages.warn_of_light_groups(scene, sensor, self.light_groups)
-        if settings.merging:
-            components.merging.check(sensor, self.prepared.space is not None)
+        if settings.merging and (why := components.merging.why_not(sensor, self.prepared.space is not None)):
+            raise UnsupportedError(f"{why}; leave out merging")
         self.findings = SceneCache(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
@@ -111,10 +119,11 @@ class Render:
         parts = Parts(strip_count(longest), min(longest, spp), names)
         self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
+        # Predictions of the pilot, see `decide`.
+        self.table: list[Prediction] = []
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
-        # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette and
-        # for the share of unsampled light; see `_steps`.
+        # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette.
         self._small_first: bool | None = None
         self._error: float | None = None
         # State of the newest report, see `_freeze`.
@@ -133,7 +142,7 @@ class Render:
     def run(
         self, on_pass: Callable[[PassReport], object] | None, cancelled: Callable[[], bool] = lambda: False
     ):
-        """Trace the samples, and store the image in the film.
+        """Trace the samples, and store the image in the film; `decided` comes first.
 
         Ends early at ``timeout``, ``target_error``, when ``cancelled()`` after a pass, or by an interruption.
         ``on_pass`` is called with a `PassReport` after each pass.
@@ -141,20 +150,15 @@ class Render:
         timeout = self.settings.timeout
         watched = on_pass is not None or timeout >= 0
         with self._finished():
-            if not self.passes:
-                self.decide()
             for number, step in enumerate(self._steps()):
                 if not number and self._is_exact_enough():  # the snapshot is exact enough already
                     break
-                self.replay()
                 if not number:
                     messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
                     missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
                     for text in filter(None, missed):
                         warn_once(self.prepared.scene, self.sensor, text)
                 self._pass(step)
-                if not number:
-                    self.unsampled_light()
                 # Records the second pass while the first, a short one, runs.
                 if watched or number > 0:
                     self.meter.wait()
@@ -166,6 +170,38 @@ class Render:
                     self.findings.expire()
                 if exact or 0 <= timeout <= self.meter.elapsed() or cancelled():
                     break
+
+    def decided(self) -> Render:
+        """Decide how to render; returns this render, or where ``merging=auto`` demands it one that merges."""
+        try:
+            self.decide()
+            if not self._is_open or not (why := self._why_to_merge()):
+                return self
+            settings = replace(self.settings, merging=True)
+            merged = Render(self.prepared.scene, self.sensor, settings, self.points.seed, self.spp)
+            merged.meter, merged.why_merged, merged.part = self.meter, why, self.part
+            merged.decide()
+            return merged
+        except RuntimeError as error:
+            raise_interrupt(error)
+            raise
+
+    def _why_to_merge(self) -> str:
+        """Why this render has to merge; empty, with an entry of `skipped`, if it does not."""
+        unsampled = self._unsampled()
+        if unsampled is None:
+            return ""
+        shares = self._shares(unsampled)
+        level, why = "impossible", components.merging.why_not(self.sensor, self.prepared.space is not None)
+        if not why and self.settings.strategy_images:
+            why = "layers=strategies shows merges with merging=true only"
+        share = sum(shares.values())
+        if share < unsampled_light.WARN_SHARE:
+            level, why = NOT_WORTH, f"the other strategies lack {100 * share:.2g} % of the image's light"
+        if why:
+            self.skipped = ({"class": "merging", "level": level, "why": why},)
+            return ""
+        return unsampled_light.reason(self.prepared, self.plan, shares, unsampled, self._samples())
 
     @contextmanager
     def _finished(self):
@@ -187,17 +223,12 @@ class Render:
         Does nothing without alternatives, or if the render is too short for a pilot. Returns all predictions
         of the pilot, the best first.
         """
-        table = []
         if self.planner.begin(self.passes):
             with self.meter.pilot():
-                table = self.planner.run_pilot(self.passes)
-        self._use_plan()
-        return table
-
-    def replay(self):
-        """Apply the decision for the next pass that the parameters give, if any."""
+                self.table = self.planner.run_pilot(self.passes)
         self.planner.replay(self.passes)
         self._use_plan()
+        return self.table
 
     def _use_plan(self):
         if self.kernel.plan is not self.plan:
@@ -222,8 +253,7 @@ class Render:
             decisions = self.settings.decisions
             known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
-            wanted = long and not known and (self._plays_roulette() or self._unsampled() is not None)
-            self._small_first = bool(wanted)
+            self._small_first = bool(long and not known and self._plays_roulette())
         earlier = sum(self.passes)
         for step in schedule(self.spp, self._longest, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
@@ -271,8 +301,9 @@ class Render:
         done, changes = passes_since(self.passes, step.done), self.planner.changes
         start = self.points.wavelengths(step, changes) if mi.is_spectral else None
         points = self.points.of_photons(step, done, changes)
+        earlier = self.part * len(schedule(self.spp, self._longest, self.settings, False)) + len(self.passes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
-            photons, counts = merging.trace(self.kernel, points, step.size, done, start)
+            photons, counts = merging.trace(self.kernel, points, step.size, earlier, start)
         self.meter.launched(counts)
         return photons
 
@@ -308,7 +339,8 @@ class Render:
         The state is consistent even if an interruption comes while the next pass is recorded.
         """
         passes, arrays = self.accumulator.store()
-        progress = Progress(self.planner.decided, self.meter.work, self.accumulator.halves, self._small_first)
+        decided, halves = self.planner.decided, self.accumulator.halves
+        progress = Progress(decided, self.meter.work, halves, self._small_first, self.why_merged)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
@@ -338,7 +370,7 @@ class Render:
         return image
 
     def _identity(self) -> dict:
-        return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp)
+        return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp, self.part)
 
     def resume(self, snapshot: Snapshot, apart_from=()):
         """Continue after the passes of a snapshot.
@@ -352,7 +384,7 @@ class Render:
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
         self.accumulator.restore(snapshot.passes, arrays, progress.halves)
         self.meter.resume(progress.work, snapshot.spp)
-        self._small_first = progress.small_first
+        self._small_first, self.why_merged = progress.small_first, progress.why_merged
 
     def unsampled_light(self) -> dict[int, float]:
         """Return shares of the image's light that are not sampled, by index in ``scene.emitters()``.
@@ -385,28 +417,41 @@ class Render:
     def predicted_warning(self) -> str:
         """Return the warning about unsampled light before the first pass.
 
-        Empty if there is none, or if no decision has estimated the image's mean.
+        Empty if there is none.
         """
-        mean = self._predicted_mean()
-        unsampled = None if mean is None else self._unsampled()
+        unsampled = self._unsampled()
         if unsampled is None:
             return ""
-        shares = unsampled_light.predicted_shares(unsampled, mean)
+        shares = self._shares(unsampled)
         return unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
 
-    def explained_warning(self) -> str:
+    def explained_warning(self, decided: bool) -> str:
         """Return `predicted_warning`, or what is not sampled though there is no warning."""
-        if text := self.predicted_warning():
-            return text
-        unsampled, mean = self._unsampled(), self._predicted_mean()
-        if unsampled is None or (mean is None and not unsampled.is_undersampled):
+        unsampled = self._unsampled()
+        if unsampled is None or not (decided or unsampled.is_undersampled):
             return ""
-        return unsampled_light.explained(self.prepared, self.plan, unsampled, self._samples(), mean)
+        if decided and (text := self.predicted_warning()):
+            return text
+        shares = self._shares(unsampled) if decided else None
+        return unsampled_light.explained(self.prepared, self.plan, unsampled, self._samples(), shares)
 
-    def _predicted_mean(self) -> float | None:
-        """Return the image's mean as the last decision has estimated it, None if none has."""
+    def _shares(self, unsampled: UnsampledLight) -> dict[int, float]:
+        """Predict shares of ``unsampled`` light by emitter index.
+
+        From the image's mean as a decision has estimated it, else as one sample per pixel does.
+        """
         made = self.planner.decided.decisions
-        return made[-1].mean if made and made[-1].mean > 0 else None
+        if made and made[-1].mean > 0:
+            return unsampled_light.predicted_shares(unsampled, made[-1].mean)
+        mean, _ = self.findings.find("mean", self.settings, self._first_mean)
+        return unsampled_light.shares(unsampled, mean)
+
+    def _first_mean(self) -> float:
+        """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
+        spp = -(-LEAST_OF_MEAN // int(self.prepared.camera.region.size.prod()))
+        other = Render(self.prepared.scene, self.sensor, self.settings, 0, spp)
+        other._pass(Step(0, 0, spp, spp, True))
+        return number(other.accumulator.mean())
 
     def _samples(self) -> int:
         """Samples per pixel of the whole render, or of a snapshot, as far as is known.

@@ -42,7 +42,7 @@ def longest_pass(camera: Sensor, settings: Settings, best: int = 0) -> int:
     # One row of pixels has to fit into four launches, see `batches`.
     whole = max(limit // (width * height), 1)
     most = min(max(4 * limit // width, 1), max(STRIP, whole))
-    if settings.merging:  # photons, radius and wavelengths are those of a pass
+    if settings.merging is True:  # photons, radius and wavelengths are those of a pass
         most = min(most, STRIP)
     return min(settings.spp_per_pass or min(whole, best or whole), most)
 

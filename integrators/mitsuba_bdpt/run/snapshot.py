@@ -28,7 +28,7 @@ class Progress:
 
     ``decided``: decisions so far; ``work``: counts; ``halves``: those of the replicates, ``None`` without
     `variance` (see `image.replicates`); ``small_first``: whether the first pass has one sample per pixel,
-    ``None`` if not yet known; ``whole``: whether a render can continue from it; ``scene``: optional digest of
+    ``None`` if not yet known; ``why_merged``: why vertices are merged, or empty; ``whole``: whether a render can continue from it; ``scene``: optional digest of
     the scene's files.
     """
 
@@ -36,6 +36,7 @@ class Progress:
     work: Work = Work()
     halves: tuple[Spread, ...] | None = None
     small_first: bool | None = None
+    why_merged: str = ""
     whole: bool = True
     scene: str | None = None
 
@@ -108,10 +109,10 @@ def _arrays(arrays: dict, name: str) -> dict:
 
 
 # Version of the stored format; increase with every change.
-FORMAT = 8
+FORMAT = 9
 
 
-def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) -> dict:
+def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:
     """Return the values, as JSON, that a render and its continuation must share.
 
     The scene is not included.
@@ -125,6 +126,7 @@ def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int) 
         "variant": mi.variant(),
         "seed": seed,
         "spp": spp,
+        "part": part,
         "film": [film.class_name(), *accumulator.size, *accumulator.offset],
         "filter": str(film.rfilter()),
         "colours": list(accumulator.colour.names),
@@ -170,9 +172,9 @@ class Snapshot:
     def joined(self, other: Snapshot) -> Snapshot:
         """Merge two renders: sums and counts are added.
 
-        Raises `UsageError` if they differ in more than seed and samples per pixel, or share a seed.
+        Raises `UsageError` if they differ in more than seed, samples per pixel and part, or share a seed.
         """
-        self.check(other.identity, ("seed", "spp"))
+        self.check(other.identity, ("seed", "spp", "part"))
         seeds, others = _seeds(self), _seeds(other)
         if common := set(seeds) & set(others):
             raise UsageError(

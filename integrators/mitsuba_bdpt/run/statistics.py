@@ -128,10 +128,11 @@ class Statistics(TypedDict):
     media: NotRequired[dict[str, int]]
     """In scenes with media: ``segments`` of edges and connections, each with a ray of its own (``rays``
     counts a shadow ray through null surfaces once), and tentative ``collisions`` in grids."""
-    merging: NotRequired[dict[str, int]]
-    """With ``merging``: the ``photons`` kept, and ``merges``, camera vertices near at least one photon."""
+    merging: NotRequired[dict[str, int | str]]
+    """Where vertices are merged: ``why``, the ``photons`` kept, and ``merges``, camera vertices near at least
+    one photon."""
     unbiased: bool
-    """False with ``merging``, which is consistent."""
+    """False where vertices are merged, which is consistent."""
     skipped: list[dict]
     """The strategies that were skipped, and why."""
     decisions: list[dict]
@@ -190,7 +191,7 @@ def statistics(render) -> Statistics:
         "rays": rays(render),
         "connections": connections,
         "unbiased": not render.plan.merging,
-        "skipped": [dict(left_out) for left_out in render.plan.skipped],
+        "skipped": [dict(left_out) for left_out in (*render.plan.skipped, *render.skipped)],
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,
         "pilots": {"rendered": pilots.requested - pilots.cached, "cached": pilots.cached},
@@ -203,7 +204,7 @@ def statistics(render) -> Statistics:
     if render.prepared.space is not None:
         found["media"] = {name: counts[name] for name in MEDIA}
     if render.settings.merging:
-        found["merging"] = {name: counts[name] for name in MERGING}
+        found["merging"] = {"why": render.why_merged} | {name: counts[name] for name in MERGING}
     if render.light_groups is not None:
         found["light_groups"] = {name: list(lamps) for name, lamps in render.light_groups.lamps.items()}
     if render.settings.variance:
