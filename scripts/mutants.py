@@ -1502,11 +1502,11 @@ MUTANTS = (
         ("tests/images/test_merging.py::test_cells_may_share_a_bucket",),
     ),
     Mutant(
-        "merging: the radius shrinks with the passes of all replicates",
+        "merging: the radius begins anew in each part of an average",
         "run/rendering.py",
-        "passes_since(self.passes, step.done)",
-        "len(self.passes)",
-        ("tests/images/test_merging.py::test_the_radius_shrinks_within_a_replicate",),
+        "earlier = self.part * len(schedule",
+        "earlier = 0 * len(schedule",
+        ("tests/images/test_merging.py::test_the_radius_goes_on_from_part_to_part[]",),
     ),
     Mutant(
         "merging: photons of other wavelengths count",

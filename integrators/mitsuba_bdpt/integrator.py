@@ -177,7 +177,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         """Check the arguments and prepare a render, with the ``merging`` of the snapshot ``start``, if any."""
         check_made_for(self, scene)
         sensor, settings = resolve_sensor(scene, sensor), self.settings
-        spp = samples_per_pixel(sensor, spp, settings)
+        if start is None or start.identity["spp"] != spp:
+            spp = samples_per_pixel(sensor, spp, settings)
         if start is not None and settings.merging == "auto":
             settings = replace(settings, merging=start.identity.get("merging") is True)
         render = Render(scene, sensor, settings, seed, spp)
@@ -248,8 +249,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
         """
         if not isinstance(snapshot, Snapshot):
             raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
-        render = self._new_render(scene, sensor, 0, 1, snapshot)
-        render.resume(snapshot, apart_from=("seed", "spp", "decisions", "part"))
+        render = self._new_render(scene, sensor, 0, snapshot.identity["spp"], snapshot)
+        render.resume(snapshot, apart_from=("seed", "decisions", "part"))
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)

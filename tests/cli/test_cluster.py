@@ -53,7 +53,7 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
 )
 def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, merges):
     """Expected: the image is that of the same parts rendered here one after the other and joined, also with
-    merging, whose radius begins anew in each; the pilot ran once, its decisions are in the statistics.
+    merging, whose radius goes on from part to part; the pilot ran once, its decisions are in the statistics.
     Tolerance: rounding of atomic sums and of half precision.
     """
     path, given = SCENE.with_stem(name), ["-P", "merging=true"] * merges
@@ -88,7 +88,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
     merged = cluster.Merged()
     for index, part in enumerate(cluster.parts_of(256, 8, 0)):
-        merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, *part)))
+        merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, index, *part)))
     expected = np.array(integrator.assemble(merged.snapshot, scene))[..., :3]
     np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
 

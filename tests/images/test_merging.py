@@ -46,6 +46,8 @@ from sds_scenes import (
 )
 from snapshots import ROUNDING, stopped
 
+from stress_cases.warned import Warned
+
 import drjit as dr  # isort: skip
 
 
@@ -529,18 +531,21 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     assert expected.any()
 
 
-def test_the_radius_shrinks_within_a_replicate(monkeypatch):
-    """Expected: the radius of each pass follows from the passes of its replicate, two of which have three."""
-    done, bdpt = [], {"type": "bdpt", "max_depth": 4, "merging": True, "spp_per_pass": 1}
+@pytest.mark.parametrize("layers", ["", "variance"])
+def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
+    """Rationale: an average of renders, or of replicates, has the bias of the radii of each. Expected: the
+    radius shrinks from pass to pass over the replicates of a render, and over the parts of an average."""
+    done, bdpt = [], mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 1, "layers": layers})
     monkeypatch.setattr(passes, "in_pass", lambda first, before: done.append(before) or first)
-    mi.load_dict(bdpt | {"layers": "variance"}).render(mi.load_dict(under_glass(point())), spp=18)
-    assert done == [0, 1, 2] * 2 + [0, 1] * 6
+    for bdpt.part in range(3):
+        bdpt.render(mi.load_dict(under_glass(point())), spp=18)
+    assert done == [*range(54)]
 
 
 def test_joined_renders_are_their_mean():
     """Rationale: a part of a render knows nothing of the others. Expected: renders that are joined, of
-    several passes each, are the mean of their images by samples (to rounding of sums, box filter): the radius
-    and the photons of each begin anew. They say that they are not unbiased.
+    several passes each, are the mean of their images by samples (to rounding of sums, box filter). They say
+    that they are not unbiased.
     """
     scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
 
@@ -557,10 +562,27 @@ def test_joined_renders_are_their_mean():
     assert sum(found["passes"]) == 48 and found["merging"]["merges"] and not found["unbiased"]
 
 
+@pytest.mark.parametrize("spp", [1, 64])
+def test_merging_where_light_is_missing(spp):
+    """Expected: without a parameter the image of ``merging=true`` where light is missing, with a pilot and
+    without one, and its reason; where next to none is missing, that of ``merging=false``."""
+    hidden, seen = (mi.load_dict(under_glass(lamp)) for lamp in (point(), ball()))
+    default = mi.load_dict({"type": "bdpt", "max_depth": 6})
+    for scene, merging in ((hidden, True), (seen, False)):
+        found = np.array(default.render(scene, spp=spp, seed=3))
+        given = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": merging})
+        np.testing.assert_allclose(found, np.array(given.render(scene, spp=spp, seed=3)), **ROUNDING)
+        assert default.statistics["unbiased"] != merging
+    default.render(hidden, spp=spp)
+    why = default.statistics["merging"]["why"]
+    assert "nearly all of the image's light: point light 'light' shines through glass" in why
+    assert why in default.explain(hidden, spp=spp)
+
+
 def test_what_a_render_says():
     """Expected: `explain` and the statistics say that the render is not unbiased, and nothing is lost."""
     scene = mi.load_dict(under_glass(point()))
-    plain, merged = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, True))
+    plain, merged = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, "true"))
     assert "not sampled: delta emitter" in plain.explain(scene)
     text = merged.explain(scene)
     assert "not sampled" not in text and "consistent, not unbiased" in text
@@ -711,13 +733,21 @@ def test_what_needs_no_merging():
 
 
 def test_what_is_refused():
-    """Expected: errors that name the parameter, what is in the way, and the remedy."""
-    method = mi.load_dict({"type": "bdpt", "merging": True})
-    moving = under_glass(ball())
+    """Expected: errors that name the parameter, what is in the way, and the remedy; by default, with merging
+    where it is possible, one warning."""
+    method, default = (mi.load_dict({"type": "bdpt", **more}) for more in ({"merging": True}, {}))
+    moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
     fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
-    foggy = under_glass(ball(), plate={"type": "null"})
+    foggy = under_glass(point())
     foggy["plate"]["interior"] = fog
     for scene, words in ((moving, "shutter"), (foggy, "participating media")):
-        with pytest.raises(NotImplementedError, match=words):
-            method.render(mi.load_dict(scene), spp=1)
+        scene = mi.load_dict(scene)
+        with pytest.raises(NotImplementedError, match=f"{words}.*leave out merging"):
+            method.render(scene, spp=1)
+        with Warned() as warnings:
+            for _ in range(2):
+                default.render(scene, spp=1)
+        (left_out,) = (row for row in default.statistics["skipped"] if row["class"] == "merging")
+        assert left_out["level"] == "impossible" and words in left_out["why"]
+        assert len(warnings) == 1 and "set merging" not in warnings[0]

@@ -41,7 +41,7 @@ def principled(roughness, **keys):
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": 10, **parameters})
+    return mi.load_dict({"type": "bdpt", "max_depth": 10, "merging": False, **parameters})
 
 
 def render_of(scene, spp=64, **parameters):

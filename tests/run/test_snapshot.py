@@ -191,7 +191,7 @@ def test_another_format_is_refused():
     other = json.dumps({"identity": {"format": 0}, "passes": [1], "progress": {"unknown": 1}})
     file = io.BytesIO()
     np.savez(file, snapshot=np.array(other))
-    with pytest.raises(ValueError, match="another version of mitsuba-bdpt: its format is 0, here it is 8"):
+    with pytest.raises(ValueError, match="another version of mitsuba-bdpt: its format is 0, here it is 9"):
         Snapshot.from_bytes(file.getvalue())
 
 

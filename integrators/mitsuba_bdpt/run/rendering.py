@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 TWO_PASSES = 1 << 18
 
 # Samples that estimate the image's mean, at least.
-LEAST_OF_MEAN = 1 << 12
+LEAST_OF_MEAN = 1 << 10
 
 
 @dataclass(frozen=True)
