@@ -113,8 +113,9 @@ def by_hand(scene, depth: int, row: Prediction, best: Configuration, mean: float
         emission=best.emission if row.candidate.light_paths else None,
         guided=best.guided,
     )
-    made = json.dumps([Decision.of(way, 0, cost=row.cost, variance=row.variance, mean=mean).record()])
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "decisions": made})
+    made = Decision.of(way, cost=row.cost, variance=row.variance, mean=mean)
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": depth, "merging": False})
+    integrator.settings = integrator.settings.varied(decisions=(made,))
     integrator.render(scene, spp=1)  # compiles
     return integrator
 

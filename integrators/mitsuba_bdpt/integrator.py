@@ -94,8 +94,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
     on_pass: Callable[[PassReport], object] | None
     """``None``, or a function that is called after each pass."""
     part: int
-    """How many renders of other seeds come before this one in an average of renders (0). The radius of merging
-    goes on from theirs, so that the average converges."""
+    """Number of renders of other seeds that come before this one in an average of renders (0). The radius of
+    merging goes on from theirs, so that the average converges."""
 
     def __init__(self, props: mi.Properties):
         tracebacks.install()
@@ -168,13 +168,12 @@ class BDPTIntegrator(metaclass=ABCMeta):
             messages.warn_of_non_finite(self.statistics, scene)
         messages.log(self.statistics)
         self.statistics["unsampled_light"] = render.unsampled_light()
-        messages.warn_of_late_decisions(self.settings.decisions, len(self.statistics["passes"]))
         return _result(render.sensor.film(), develop, evaluate)
 
     def _new_render(
         self, scene: mi.Scene, sensor: int | mi.Sensor, seed: int, spp: int, start: Snapshot | None = None
     ) -> Render:
-        """Check the arguments and prepare a render, with the ``merging`` of the snapshot ``start``, if any."""
+        """Check the arguments and prepare a render, with the ``merging`` of the snapshot ``start``."""
         check_made_for(self, scene)
         sensor, settings = resolve_sensor(scene, sensor), self.settings
         if start is None or start.identity["spp"] != spp:
@@ -226,8 +225,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:
         """Run the pilot alone and return its decisions, as in ``statistics["decisions"]``.
 
-        Empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the reason. As JSON,
-        the list is a value of the parameter ``decisions``. Decisions do not depend on ``seed``.
+        Empty where neither a pilot nor the scene decides; ``statistics["no_pilot"]`` has the reason.
+        Decisions do not depend on ``seed``.
         """
         render = self._new_render(scene, sensor, seed, spp).decided()
         self.statistics = statistics(render)
@@ -250,7 +249,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if not isinstance(snapshot, Snapshot):
             raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
         render = self._new_render(scene, sensor, 0, snapshot.identity["spp"], snapshot)
-        render.resume(snapshot, apart_from=("seed", "decisions", "part"))
+        render.resume(snapshot, apart_from=("seed", "part"))
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)

@@ -19,7 +19,6 @@ from .image import denoising, features, film_limits
 from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
 from .image.layers import GROUP, PATH, film_layers, partitions
-from .planning.configuration import read_decisions
 from .settings import LAYERS, LIGHT_PATHS, NONE, PARAMETERS, UNLIMITED, Settings
 
 # Valid values of a render's arguments, for messages; for parameters see `settings.PARAMETERS`.
@@ -167,7 +166,6 @@ _READERS = {
     "max_depth": lambda value, name: UNLIMITED if (depth := _integer(value, name)) < 0 else depth,
     "light_paths": _light_paths,
     "merging": _merging,
-    "decisions": lambda value, name: read_decisions(text) if (text := _string(value, name)) else None,
     "aovs": _aovs,
     "layers": _layers,
     "light_groups": _light_groups,
@@ -210,12 +208,6 @@ def _check_together(settings: Settings):
         raise UsageError(
             f"layers=strategies needs a finite max_depth of 1 or greater, not {depth}; "
             "set max_depth, for example to 5"
-        )
-    by_hand = settings.light_paths != "auto" or settings.connections != "auto" or settings.skip != "auto"
-    if settings.decisions is not None and (by_hand or settings.strategy_images):
-        raise UsageError(
-            "decisions together with light_paths, connections, skip or layers=strategies is "
-            "contradictory; leave out one or the other"
         )
     named = film_layers(
         settings, light_groups=[*light_groups.parsed(settings.light_groups), light_groups.REST]

@@ -12,6 +12,7 @@ REMOVED = {
     "merging_radius": "leave it out: the radius is about a pixel and shrinks from pass to pass; for a "
     "smaller one render more samples, or a larger film",
     "stored_vertices": "leave it out; for path tracing alone set light_paths=0",
+    "decisions": "set light_paths and connections; checkpoints and clusters hand over what was decided",
     "points=sampler": "use sobol, which is as good as Mitsuba's best sampler; the scene's sampler gives the "
     "number of samples alone",
     "photon_guiding": "use guiding: always (which leaves emission to the pilot), never, or emission to guide "

@@ -73,19 +73,21 @@ def _converted(
 
 @dataclass(frozen=True)
 class Internals:
-    """Values of the method that no parameter sets; tests and the makers of references vary them."""
+    """Values of the method that no parameter sets; tests, makers of references and clusters vary them."""
 
     merging_radius: float = 1.0
     """Radius of vertex merging in the first pass, in pixels as they are seen directly."""
     stored_vertices: int | None = None
     """Longest path in edges that uses all strategies; None: `DEFAULT_STORED`, with media `MAX_STORED`."""
+    decisions: tuple[Any, ...] | None = None
+    """In place of a pilot's decisions, each a `planning.configuration.Decision`; None: a pilot decides."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """The parameters, checked.
 
-    ``max_depth`` is `UNLIMITED` for -1, ``decisions`` a tuple or None, ``layers`` in the order of `LAYERS`.
+    ``max_depth`` is `UNLIMITED` for -1, ``layers`` in the order of `LAYERS`.
     """
 
     max_depth: int = _converted(
@@ -155,13 +157,6 @@ class Settings:
         paths, and tables guide emission; ``photons`` or ``emission`` allows one of them, ``never`` neither;
         ``always`` uses photons wherever it is possible.""",
         choices=GUIDING,
-    )
-    decisions: tuple[Any, ...] | None = _converted(
-        "",
-        None,
-        "a string of JSON",
-        """Decisions of an earlier render to use instead of a pilot: its ``statistics["decisions"]`` as
-        JSON.""",
     )
     aovs: str = _parameter(
         "",
@@ -250,10 +245,8 @@ class Settings:
 PARAMETERS: dict[str, Parameter] = {
     f.name: f.metadata["parameter"] for f in fields(Settings) if "parameter" in f.metadata
 }
-_MANUAL_KINDS = {
-    **{bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"},
-    **{"light_paths": "|string| or |float|", "merging": "|string| or |bool|"},
-}
+_MANUAL_KINDS = {bool: "|bool|", int: "|int|", float: "|float|", str: "|string|"}
+_OWN_KINDS = {"light_paths": "|string| or |float|", "merging": "|string| or |bool|"}
 
 
 def _default(parameter: Parameter) -> str:
@@ -269,7 +262,7 @@ def manual() -> str:
     """The list of parameters of the plugin's manual, in reStructuredText as in Mitsuba's own."""
     lines = [".. pluginparameters::", ""]
     for name, parameter in PARAMETERS.items():
-        kind = _MANUAL_KINDS.get(name) or _MANUAL_KINDS[parameter.kind]
+        kind = _OWN_KINDS.get(name) or _MANUAL_KINDS[parameter.kind]
         lines += [
             f" * - {name}",
             f"   - {kind}",

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import distributed
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     )
     scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 256)
-    assert json.loads(dict(json.loads(job)["properties"])["decisions"]) == [decided]
+    assert json.loads(job)["decisions"] == [decided]
     merged = cluster.Merged()
     for index, part in enumerate(cluster.parts_of(256, 8, 0)):
         merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, index, *part)))
@@ -104,8 +105,7 @@ def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
     options.properties = properties
     scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 1)
-    assert ("decisions" in dict(json.loads(job)["properties"])) == decided
-    assert cluster._loaded(job)[2].settings.decisions == (() if decided else None)
+    assert cluster._loaded(job)[2].settings.internals.decisions == (() if decided else None)
 
 
 def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
@@ -123,7 +123,7 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     parts = sum(seconds[name] for name in ("compile", "pilot", "render"))
     assert seconds["total"] == pytest.approx(parts, rel=1e-6)
     assert {row["level"] for row in statistics["skipped"]}.isdisjoint({"by hand"})
-    given = ["-P", f"decisions={json.dumps(statistics['decisions'])}"]
+    given = ["-P", "light_paths=1"]
     assert main(arguments(workers, tmp_path / "b.exr", *given)) == 0
     statistics = rendered.image(tmp_path / "b.exr", "RGB")[1]
     assert statistics["non_finite_in_pilot"] == 0 == statistics["seconds"]["pilot"]
@@ -311,8 +311,7 @@ def test_a_farm_in_a_bad_night(tmp_path):
     options = build_parser().parse_args([*command])
     scene, integrator, _ = load(options)
     merged, reports = cluster.Merged(), []
-    decided = json.dumps(night["decisions"])
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": integrator.max_depth, "decisions": decided})
+    integrator = internals.bdpt(max_depth=integrator.max_depth, decisions=night["decisions"])
     integrator.on_pass = reports.append
     for index, (seed, spp) in enumerate(cluster.parts_of(512, 24, 0)):
         integrator.render(scene, 0, seed, spp, develop=False)

@@ -723,8 +723,8 @@ def test_a_value_out_of_bounds_is_named_with_its_parameter(scene, capsys):
         + ("error: -P max_dept=4 is not a parameter; did you mean max_depth? Parameters:",),
         ((), ["-P", "max_depth=four", "--integrator", "bdpt"])
         + ("error: -P max_depth='four' must be an integer: the longest path",),
-        ((), ["-P", "decisions=[]", "-P", "skip=none", "--integrator", "bdpt"])
-        + ("error: -P decisions together with light_paths, connections, skip or",),
+        ((), ["-P", "decisions=[]", "--integrator", "bdpt"])
+        + ("error: -P decisions='[]': the parameter was removed; set light_paths and connections",),
         (
             ("<boolean", '<integer name="max_dept" value="4"/><boolean'),
             ["-P", "skip=none", "--integrator", "scene", "-D", "integrator=bdpt"],

@@ -75,10 +75,7 @@ def test_a_dictionary_is_written_as_a_scene_file(transformed):
     np.testing.assert_allclose(images[1], images[0], rtol=1e-3, atol=1e-4)
 
 
-DECISIONS = """[{"pass": 0, "light_paths": 0.25, "connections": "one",
-"coefficients": {"t<=1": 0.5, "s=1": 1}, "cost": 1, "variance": 1, "mean": 1}]"""
-
-# Values other than the defaults; three sets, since some exclude others.
+# Values other than the defaults; two sets, since some exclude others.
 PARAMETER_SETS = (
     {
         "max_depth": 7,
@@ -100,11 +97,10 @@ PARAMETER_SETS = (
         "timeout": 12.5,
     },
     {"max_depth": 3, "layers": "strategies"},
-    {"decisions": DECISIONS},
 )
 
 
-@pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategies", "decisions"])
+@pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategies"])
 def test_parameters_are_written(changed):
     """Expected: an integrator read from the written file has the settings of the dictionary, none of which is
     the default.
@@ -125,7 +121,7 @@ def test_none_is_the_default_of_texts():
     """Rationale: the manual names it as the default. Expected: ``none`` is that of each parameter whose
     default is no text; ``--denoise`` adds to it."""
     given = {name: "none" for name, parameter in PARAMETERS.items() if parameter.default == ""}
-    assert set(given) == {"decisions", "aovs", "layers", "light_groups"}
+    assert set(given) == {"aovs", "layers", "light_groups"}
     assert mi.load_dict({"type": "bdpt"} | given).settings == mi.load_dict({"type": "bdpt"}).settings
     with pytest.raises(RuntimeError, match="there is no layer 'none'"):
         mi.load_dict({"type": "bdpt", "layers": "variance,none"})

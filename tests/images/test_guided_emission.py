@@ -36,7 +36,7 @@ def random_tables(scene, seed=1):
 
 def decided(tables, light_paths=1.0, connections="all", kappa=1.0):
     """The decision for all strategies, with ``tables``."""
-    way = {"pass": 0, "light_paths": light_paths, "connections": connections, "emission": tables.record()}
+    way = {"light_paths": light_paths, "connections": connections, "emission": tables.record()}
     more = {"coefficients": {"t<=1": kappa, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
     return json.dumps([way | more])
 
@@ -166,7 +166,7 @@ def test_weights_are_those_of_explicit_densities(lamps, heuristic):
     tables = random_tables(scene)
     more = {"max_depth": 4, "heuristic": heuristic, "decisions": decided(tables)}
     tally = Tally()
-    weigh(tally, Capture(scene, mi.load_dict({"type": "bdpt", **more}), 4000, 3), heuristic)
+    weigh(tally, Capture(scene, internals.bdpt(**more), 4000, 3), heuristic)
     assert tally.bad == 0 and tally.paths > 3000
     # Within rounding of a cell's edge one side takes the neighbour's density.
     assert tally.wrong < 2e-3 * tally.paths and tally.off < 2e-3 * tally.paths
@@ -458,23 +458,6 @@ def test_a_decision_is_done_again():
         "rendered": 0,
         "cached": 0,
     }
-
-
-def test_tables_of_another_scene():
-    """Expected: an error that names ``decisions``, before anything is rendered."""
-    scene = scene_of("sun and sky")
-    method = mi.load_dict({"type": "bdpt", "decisions": decided(random_tables(scene_of("sphere")))})
-    with pytest.raises(ValueError, match="decisions: emission has 1 tables"):
-        method.render(scene, spp=1)
-
-
-@pytest.mark.parametrize("record", [{"side": 16}, 3, "text"])
-def test_broken_tables(record):
-    """Expected: an error that quotes ``decisions`` and names what is wrong."""
-    way = json.loads(decided(random_tables(scene_of("sphere"))))
-    way[0]["emission"] = record
-    with pytest.raises(Exception, match="entry 0.*emission"):
-        mi.load_dict({"type": "bdpt", "decisions": json.dumps(way)})
 
 
 def test_a_stopped_render_goes_on():

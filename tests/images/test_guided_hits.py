@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 from xml.etree import ElementTree
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ ASIDE = [5.0, 0.0, 4.5]
 
 def guided(samples):
     """The decision for all strategies, with so many guided samples."""
-    way = {"pass": 0, "light_paths": 1.0, "connections": "one", "guided": samples}
+    way = {"light_paths": 1.0, "connections": "one", "guided": samples}
     more = {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 1.0, "mean": 0.0}
     return json.dumps([way | more])
 
@@ -274,7 +275,7 @@ def test_the_pilot_guides_where_it_pays():
     assert "used: guided s=0" in text
     better = [row for row in text.splitlines() if re.match(r" +0\.\d+ .* light_paths=", row)]
     assert better and all("; not chosen: without guided s=0" in row for row in better)
-    again = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": json.dumps(found["decisions"])})
+    again = internals.bdpt(max_depth=6, decisions=found["decisions"])
     np.testing.assert_allclose(np.array(mi.render(scene, integrator=again, spp=16)), image, **ROUNDING)
     never = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "emission"})
     assert "skipped (by hand): guided s=0: guiding=emission" in never.explain(scene, spp=16)

@@ -568,11 +568,11 @@ def test_merging_where_light_is_missing(spp):
     without one, and its reason; where next to none is missing, that of ``merging=false``."""
     hidden, seen = (mi.load_dict(under_glass(lamp)) for lamp in (point(), ball()))
     default = mi.load_dict({"type": "bdpt", "max_depth": 6})
-    for scene, merging in ((hidden, True), (seen, False)):
+    for scene, merged in ((hidden, True), (seen, False)):
         found = np.array(default.render(scene, spp=spp, seed=3))
-        given = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": merging})
+        given = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": merged})
         np.testing.assert_allclose(found, np.array(given.render(scene, spp=spp, seed=3)), **ROUNDING)
-        assert default.statistics["unbiased"] != merging
+        assert default.statistics["unbiased"] != merged
     default.render(hidden, spp=spp)
     why = default.statistics["merging"]["why"]
     assert "nearly all of the image's light: point light 'light' shines through glass" in why

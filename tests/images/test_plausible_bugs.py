@@ -1,8 +1,7 @@
 """Bugs that are easily made and were once not seen: each of these tests was seen failing on one of them."""
 
-import json
-
 import drjit as dr
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -197,8 +196,8 @@ def test_what_plays_roulette_is_made_up_for():
     scene = mi.load_dict(room)
     expected = np.array(mi.render(scene, spp=512, seed=1)).mean()
     for connections in ("none", "one"):
-        decision = {"pass": 0, "light_paths": 1, "connections": connections, "cost": 1.0, "variance": 1.0}
+        decision = {"light_paths": 1, "connections": connections, "cost": 1.0, "variance": 1.0}
         decision |= {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "mean": 20 * float(expected)}
-        decided = mi.load_dict({"type": "bdpt", "max_depth": 5, "decisions": json.dumps([decision])})
+        decided = internals.bdpt(max_depth=5, decisions=[decision])
         assert np.array(decided.render(scene, seed=2, spp=512)).mean() == pytest.approx(expected, rel=0.02)
         assert decided.statistics["connections"]["rouletted"] > 32 * 32 * 512 / 2

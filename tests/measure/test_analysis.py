@@ -50,7 +50,7 @@ def row(method="bdpt", seed=1, **values):
         "first": "bdpt",
         "reference_sha256": "",
         "tile_means": list(TRUE),
-        "decisions": json.dumps([{"pass": 0, "light_paths": 0.25, "connections": "one"}]),
+        "decisions": json.dumps([{"light_paths": 0.25, "connections": "one"}]),
         "statistics": json.dumps(
             {"seconds": {"pilot": 0.02}, "skipped": [{"class": "t=0", "level": "impossible", "why": "x"}]}
         ),

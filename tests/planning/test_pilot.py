@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -26,8 +27,6 @@ from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run import rendering, schedule
 from mitsuba_bdpt.transport import kernel, mis
 from mitsuba_bdpt.transport.batch import NET, NETS, Batch, Places
-
-from stress_cases.warned import Warned
 
 T = mi.ScalarTransform4f
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -99,7 +98,7 @@ def camera(size):
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": 5, **parameters})
+    return internals.bdpt(**{"max_depth": 5, **parameters})
 
 
 def of(target, **parameters):
@@ -138,11 +137,11 @@ def made_of(base, rays, light=0.0, hidden=0.0, missing=0.0):
 
 
 def decision(way: Configuration, mean=0.0):
-    return Decision.of(way, first_pass=0, cost=1.0, variance=1.0, mean=mean)
+    return Decision.of(way, cost=1.0, variance=1.0, mean=mean)
 
 
-def forced(*decisions, **parameters):
-    return bdpt(decisions=json.dumps([d.record() for d in decisions]), **parameters)
+def forced(decision, **parameters):
+    return bdpt(decisions=[decision.record()], **parameters)
 
 
 ALONE = Configuration(0.0, "none", 1.0, 1.0)
@@ -790,99 +789,6 @@ def test_replay():
     assert second.statistics["seconds"]["pilot"] == 0
 
 
-def test_replay_without_a_pilot():
-    """Rationale: a short render has no pilot, and its record is an empty list. Expected: given to another,
-    no pilot either, even for a long one, and the same image."""
-    target, first = cornell(), bdpt()
-    image = np.array(first.render(target, seed=4, spp=15))
-    assert first.statistics["decisions"] == []
-    second = bdpt(decisions=json.dumps(first.statistics["decisions"]))
-    np.testing.assert_allclose(np.array(second.render(target, seed=4, spp=15)), image, rtol=1e-3, atol=1e-4)
-    second.render(target, spp=1024)
-    assert second.statistics["decisions"] == [] and second.statistics["seconds"]["pilot"] == 0
-
-
-def test_asked_again_in_long_renders():
-    """Rationale: a short pilot may miss what a long render suffers from.
-
-    Expected: pilots before the first pass, after 32 samples per pixel and after 128, a quarter of the render,
-    of which each knows what the ones before found; the replay is the same image.
-    """
-    target = cornell(64)
-    integrator = bdpt(spp_per_pass=16)
-    image = np.array(integrator.render(target, seed=2, spp=512))
-    made = integrator.statistics["decisions"]
-    assert [d["pass"] for d in made] == [0, 2, 8]
-    again = bdpt(spp_per_pass=16, decisions=json.dumps(made)).render(target, seed=2, spp=512)
-    np.testing.assert_allclose(np.array(again), image, rtol=1e-3, atol=1e-4)
-
-
-def test_replicates_have_one_decision():
-    """Rationale: images that are made in different ways do not say how far one of them is off. Expected: with
-    `variance` a long render asks one pilot, also when its first replicate has passes after 32 samples."""
-    integrator = bdpt(layers="variance", spp_per_pass=8)
-    integrator.render(caustic(64), spp=512)
-    assert [d["pass"] for d in integrator.statistics["decisions"]] == [0]
-
-
-def test_changed_decisions_change_the_points():
-    """Rationale: what follows must not depend on the numbers that were decided from.
-
-    Expected: the image's own sequence before the change, another one after it, none where nothing changes.
-    """
-    render = of(cornell())
-    path, full = decision(ALONE), decision(CONNECTED)
-    changes = []
-    for made in (full, full, path, path, full):
-        render.planner.adopt(made, ())
-        changes.append(render.planner.changes)
-    assert changes == [0, 0, 1, 1, 2]
-    late = of(cornell())
-    late.planner.adopt(replace(path, first_pass=2), ())  # after passes without a decision
-    assert late.planner.changes == 1
-    step = schedule.Step(0, 0, 1, 64, False)
-    changed, first = (render.points.of(step, n) for n in (render.planner.changes, 0))
-    assert first.seed[0] == 1 != changed.seed[0]
-
-
-@pytest.mark.parametrize(
-    "text, words",
-    [
-        ("{", "Expecting property name"),
-        ("[1]", "writes: entry 0: 1 is no decision"),
-        ("{}", "a list of decisions is needed"),
-        ('""', "a list of decisions is needed"),
-        (json.dumps([decision(ALONE).record() | {"pass": n} for n in (3, 1)]), "[3, 1] must rise"),
-        (json.dumps([decision(ALONE).record() | {"pass": 0.5}]), "pass=0.5"),
-        (json.dumps([decision(ALONE).record() | {"pass": False}]), "pass=False"),
-        (
-            json.dumps([decision(ALONE).record() | {"light_paths": True}]),
-            "light_paths=True must be",
-        ),
-        (json.dumps([decision(ALONE).record() | {"cost": "1"}]), "entry 0: cost='1' must be"),
-        (json.dumps([decision(ALONE).record() | {"colour": 0}]), "colour is no part"),
-        ("[{}]", "writes: entry 0 lacks 'light_paths'"),
-        (json.dumps([decision(ALONE).record(), {}]), "writes: entry 1 lacks 'light_paths'"),
-        (json.dumps([decision(ALONE).record() | {"coefficients": {}}]), "entry 0 lacks 't<=1'"),
-        (json.dumps([decision(ALONE).record() | {"coefficients": 1}]), "is no decision"),
-        ("[" * 100000, "maximum recursion depth"),
-        (json.dumps([decision(ALONE).record() | {"mean": 10**400}]), "too large to convert"),
-        (json.dumps([decision(ALONE).record() | {"mean": 1e300}]), "mean=1e+300"),
-        (json.dumps([decision(ALONE).record() | {"light_paths": 0.3}]), "light_paths=0.3"),
-        (json.dumps([decision(ALONE).record() | {"connections": "some"}]), "connections='some'"),
-        (json.dumps([decision(ALONE).record() | {"connections": "all"}]), "without light paths"),
-        (
-            json.dumps([decision(ALONE).record() | {"coefficients": {"t<=1": 1, "s=1": 0}}]),
-            "kappa_direct=0.0",
-        ),
-    ],
-)
-def test_bad_decisions(text, words):
-    with pytest.raises(RuntimeError, match="bdpt: decisions=") as caught:
-        bdpt(decisions=text)
-    assert words in str(caught.value)
-
-
 def test_pilots_that_see_nothing_decide_nothing(monkeypatch):
     """Rationale: a sky alone is seen directly, which pilots leave out; `explain` printed a
     table of equals beside a plan that was not the first of them. Expected: no decision, and no table."""
@@ -905,28 +811,6 @@ def test_pilots_without_a_finite_value_say_so():
     integrator = bdpt()
     integrator.render(scene, spp=1024)
     assert integrator.statistics["no_pilot"] == "the pilot found only invalid samples (NaN or infinite)"
-
-
-def test_decisions_that_never_begin_are_named():
-    """Expected: one warning names the passes that the render does not have; none where all begin."""
-    made = decision(ALONE)
-    for integrator, late in ((forced(made), ""), (forced(made, replace(made, first_pass=7)), "pass 7 on")):
-        with Warned() as warnings:
-            integrator.render(cornell(8), spp=2)
-        assert len(warnings) == bool(late) and all(late in text for text in warnings)
-
-
-def test_decisions_by_two_hands():
-    text = json.dumps([decision(ALONE).record()])
-    with pytest.raises(RuntimeError, match="decisions together with light_paths, connections, skip"):
-        bdpt(decisions=text, light_paths=1)
-    with pytest.raises(RuntimeError, match="skip or layers=strategies is contradictory"):
-        bdpt(decisions=text, layers="strategies")
-    for given in ({"skip": "none"}, {"light_paths": 0}, {"layers": "strategies", "max_depth": 3}):
-        with pytest.raises(RuntimeError, match="is contradictory"):  # no decision is a choice too
-            bdpt(decisions="[]", **given)
-    with pytest.raises(RuntimeError, match="decisions=3 must be a string"):
-        bdpt(decisions=3)
 
 
 def test_weights_by_class():

@@ -1,10 +1,10 @@
 """Light that no strategy finds: how much it is, and when a word is said about it."""
 
 import itertools
-import json
 import re
 from pathlib import Path
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ def scene_of(lamp, eye=None, **shapes):
 
 
 def bdpt(max_depth=16, **parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": max_depth, "merging": False, **parameters})
+    return internals.bdpt(**{"max_depth": max_depth, "merging": False, **parameters})
 
 
 def mean(scene, integrator, spp, seed=0):
@@ -231,9 +231,9 @@ def said_before(integrator, scene, spp, monkeypatch):
 )
 def test_it_is_said_before_the_samples_are_traced(parameters, spp, long, passes, monkeypatch):
     """Rationale: the warning came after the last pass, when the time was spent. Expected: before the first
-    pass, from the mean of a pilot, or without one of an image of one sample per pixel, and not again; the share
-    that is stated is that of the whole image, within a fifth (both have the same estimate of what is lost;
-    noise of the image's mean, of 1,024 samples at least).
+    pass, from the mean of a pilot, or without one of an image of one sample per pixel, and not again; the
+    share that is stated is that of the whole image, within a fifth (both have the same estimate of what is
+    lost; noise of the image's mean, of 1,024 samples at least).
     """
     scene, integrator = scene_of(LAMPS["point"], block=BLOCK), bdpt(**parameters)
     if long:
@@ -263,7 +263,7 @@ def test_explain_knows_the_share():
 def test_given_decisions_know_the_share(monkeypatch):
     """Expected: before the first pass too where the decisions of another render are given."""
     scene = scene_of(LAMPS["point"], block=BLOCK)
-    decisions = json.dumps(bdpt().decide(scene, spp=64))
+    decisions = bdpt().decide(scene, spp=64)
     begun, warnings = said_before(bdpt(decisions=decisions), scene, 8, monkeypatch)
     assert begun == [(8, 1)] and len(warnings) == 1
 

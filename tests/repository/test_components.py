@@ -3,7 +3,6 @@
 Run as a script, this module is a process that renders with another copy of the package: see `_render`.
 """
 
-import json
 import os
 import re
 import shutil
@@ -12,6 +11,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import internals
 import mitsuba as mi
 import mitsuba_bdpt
 import numpy as np
@@ -39,7 +39,6 @@ class Component:
 # A decision that names tables of guided emission.
 _TABLES = {"side": 4, "left": 0.5, "levels": "eJxjYGhgGAUEAAAAgIAB"}
 _DECISION = {
-    "pass": 0,
     "light_paths": 1,
     "connections": "one",
     "emission": _TABLES,
@@ -58,7 +57,7 @@ _OF_MEDIA = (
 KNOWN = {
     "guided_emission": Component(
         never={"guiding": "photons"},
-        asked={"decisions": json.dumps([_DECISION])},
+        asked={"decisions": [_DECISION]},
         tests=("guided_emission", "images/test_guided_emission.py"),
     ),
     "merging": Component(
@@ -136,7 +135,7 @@ def _render(name: str, out: str):
     mi.set_variant(variants.of("rgb"))
     said, known = "", KNOWN[name]
     try:
-        mi.load_dict({"type": "bdpt"} | known.asked).render(scene(known.things), spp=1)
+        internals.bdpt(**known.asked).render(scene(known.things), spp=1)
     except Exception as error:  # Mitsuba wraps what is raised
         said = str(error)
     np.savez(out, said=said, package=mitsuba_bdpt.__file__, **images({}))

@@ -1,9 +1,9 @@
 """What is compiled before the first image is seen: counted, since seconds depend on the machine."""
 
-import json
 import re
 
 import drjit as dr
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import bsdf
 from room import KINDS, LIGHTS, lit_room, room
 
-ALL = [{"pass": 0, "light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]
+ALL = [{"light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]
 ALL[0]["coefficients"] = {"t<=1": 1.0, "s=1": 1.0}
 
 
@@ -34,7 +34,7 @@ def kernels(monkeypatch):
 
 def render(scene, **parameters):
     """An image of ``scene`` with all strategies, by one kernel."""
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 6, "decisions": json.dumps(ALL), **parameters})
+    integrator = internals.bdpt(**{"max_depth": 6, "decisions": ALL, **parameters})
     return np.array(integrator.render(scene, seed=3, spp=4), dtype=np.float64)[..., :3]
 
 
@@ -172,8 +172,8 @@ def test_light_subpaths_without_a_decision(more, size, served, joined):
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": size, "height": size}
     scene = mi.load_dict(scene | more)
-    for replayed in ({}, {"decisions": "[]"}):
-        integrator = mi.load_dict({"type": "bdpt", **replayed})
+    for replayed in ({}, {"decisions": []}):
+        integrator = internals.bdpt(**replayed)
         plan = Render(scene, scene.sensors()[0], integrator.settings, 0, 16).plan
         assert (plan.camera_paths_per_light_path, plan.joined) == (served, joined)
 
@@ -229,7 +229,7 @@ def test_bitmaps_do_not_cut_kernels(kernels):
     in rooms two seconds of a short render's four. Expected: of a scene that was just loaded all passes run
     the same kernel."""
     scene = mi.load_dict(room(2, 16))
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 3, "decisions": "[]", "spp_per_pass": 2})
+    integrator = internals.bdpt(max_depth=3, decisions=[], spp_per_pass=2)
     integrator.render(scene, spp=4)
     assert len(integrator.statistics["passes"]) == 2
     large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
@@ -268,6 +268,6 @@ def test_decisions_share_kernels(kernels):
     for light_paths, splat, connections in ways:
         coefficients = {"t<=1": splat, "s=1": 1.0}
         made = ALL[0] | {"light_paths": light_paths, "connections": connections, "coefficients": coefficients}
-        render(scene, decisions=json.dumps([made]))
+        render(scene, decisions=[made])
     large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
     assert [large.index(kernel) for kernel in large] == [0, 0, 2, 2, 4]

@@ -1,7 +1,6 @@
 """Renders of a scene with media that stop, go on, are replayed, edited, and report errors and features."""
 
-import json
-
+import internals
 import media_parts as parts
 import mitsuba as mi
 import numpy as np
@@ -30,7 +29,7 @@ def misty():
 
 
 def bdpt(**parameters):
-    return mi.load_dict({"type": "bdpt", "max_depth": 4, "spp_per_pass": 16} | parameters)
+    return internals.bdpt(**{"max_depth": 4, "spp_per_pass": 16} | parameters)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +46,7 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     start = stopped(bdpt(**parameters), misty(), 2, seed=3, spp=SPP)
     assert 0 < start.spp < SPP
     decided = whole.statistics["decisions"]
-    replay = {"decisions": json.dumps(decided)} if decided else {}
+    replay = {"decisions": decided} if decided else {}
     for more, begun in (({}, {"start": start}), (replay, {})):
         again = bdpt(**parameters, **more)
         image = np.array(again.render(target, seed=3, spp=SPP, **begun))

@@ -47,7 +47,6 @@ SENSIBLE = {
     "points": ("sobol", "independent"),
     "guiding": ("auto", "always", "photons", "emission", "never"),
     "aovs": ("", "albedo:albedo", "dd:depth,nn:sh_normal"),
-    "decisions": ("", "[]"),
 }
 NAMES = tuple(SENSIBLE)
 

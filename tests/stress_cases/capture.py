@@ -149,7 +149,7 @@ class Capture(Observer):
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
         render = rendering.Render(scene, scene.sensors()[0], integrator.settings, seed, 1)
-        render.replay()  # what is decided by hand, if anything is
+        render.decide()  # what is decided by hand, if anything is
         self.world, self.plan = render.prepared, render.plan
         self.depth = integrator.settings.max_depth
         self.lamps, self.camera = lamps_of(scene), Camera.of(scene.sensors()[0])

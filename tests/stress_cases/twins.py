@@ -5,12 +5,9 @@ Same seed, same random numbers, so that the images are the same up to the order 
 
 from __future__ import annotations
 
-import json
-
+import internals
 import numpy as np
 from mitsuba_bdpt.planning import budget
-
-import mitsuba as mi  # isort: skip
 
 from .agreement import WAYS
 from .case import Outcome
@@ -30,7 +27,7 @@ RENDERS = {"all strategies": (EVERYTHING, SPP), "default parameters": (DEFAULTS,
 
 def rendered(scene, parameters, spp, seed=1):
     """Image, statistics and warnings of a render."""
-    bdpt = mi.load_dict({"type": "bdpt", **parameters})
+    bdpt = internals.bdpt(**parameters)
     with Warned() as warnings:
         image = np.array(bdpt.render(scene, spp=spp, seed=seed), dtype=np.float64)
     return image, bdpt.statistics, warnings
@@ -57,7 +54,7 @@ def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     same = decided(statistics) == decided(of_twin)
     if not same and means(statistics) == means(of_twin):
         # Rays that are traced for the bad number alone turned the scale: the twin does the same.
-        made = json.dumps(statistics["decisions"])
+        made = statistics["decisions"]
         twin, replayed, _ = rendered(make(0.0), parameters | {"decisions": made}, spp)
         same = decided(replayed) == decided(statistics)
     found = statistics["non_finite"]

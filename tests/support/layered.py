@@ -13,7 +13,7 @@ LAMPS = {"panel": (5, 1, 1), "globe": (0, 3, 1), "bulb": (0, 0, 4), "sky": (0.1,
 # One connection to one of four light subpaths in each lane.
 JOINED = json.dumps(
     [
-        {"pass": 0, "light_paths": 1 / 16, "connections": "one", "joined": 4}
+        {"light_paths": 1 / 16, "connections": "one", "joined": 4}
         | {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
     ]
 )

@@ -20,6 +20,7 @@ import mitsuba as mi
 from ..errors import CommandError, behind
 from ..files.loading import load
 from ..planning.budget import fixed_by
+from ..planning.configuration import Decision
 from ..run.rendering import PassReport
 from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
@@ -147,11 +148,11 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     if not fixed or settings.merging == "auto":
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
         properties["merging"] = not integrator.statistics["unbiased"]
-    if not fixed:  # an empty list if no pilot runs: parts, which are shorter, run none either
-        properties["decisions"] = json.dumps(decided)
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")
     kept = {name: getattr(options, name) for name in names}
     kept["append"] = [str(folder.resolve()) for folder in options.append]
+    # An empty list if no pilot runs: parts, which are shorter, run none either.
+    kept["decisions"] = None if fixed else decided
     kept["render"] = uuid.uuid4().hex  # the scene may have been edited since the last render
     return json.dumps(kept | {"scene": str(options.scene.resolve()), "properties": list(properties.items())})
 
@@ -177,4 +178,7 @@ def _loaded(job: str):
     options = Namespace(**json.loads(job))
     options.scene, options.append = Path(options.scene), [Path(folder) for folder in options.append]
     scene, integrator, _ = load(options)
+    if options.decisions is not None:
+        decisions = tuple(map(Decision.read, options.decisions))
+        integrator.settings = integrator.settings.varied(decisions=decisions)
     return options, scene, integrator

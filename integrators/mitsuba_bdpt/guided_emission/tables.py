@@ -15,7 +15,6 @@ import base64
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -24,7 +23,6 @@ import numpy as np
 from ..emitters.emitters import Emitters
 from ..emitters.records import Cell, Place
 from ..emitters.tables import BELOW_ONE, cell_at
-from ..errors import UsageError
 
 # Candidate cells per side, and the most cells of all tables: 24 x 24 still fits an environment and a sun (17
 # tables).
@@ -56,48 +54,20 @@ class EmissionTables:
 
     def densities(self) -> np.ndarray:
         """Densities, shape (tables, side, side); the mean of each table is 1."""
-        levels = np.frombuffer(_unpacked(self.levels), np.uint8).reshape(-1, self.side, self.side)
+        levels = np.frombuffer(zlib.decompress(base64.b64decode(self.levels)), np.uint8).reshape(
+            -1, self.side, self.side
+        )
         values = np.exp2((levels.astype(float) - _OFFSET) / _STEPS)
         return values / values.mean(axis=(1, 2), keepdims=True)
 
     def guided(self, emitters: Emitters) -> Emitters:
-        """Return a copy of ``emitters`` that these tables guide.
-
-        Raises ``UsageError`` for tables of other emitters.
-        """
+        """Return a copy of ``emitters`` that these tables guide."""
         densities = self.densities()
-        if len(densities) != sum(emitters.tables):
-            raise UsageError(
-                f"decisions: emission has {len(densities)} tables, but the scene's emitters need "
-                f"{sum(emitters.tables)}; use what a render of this scene has recorded"
-            )
         first = _first_tables(emitters.tables, (densities != 1).any(axis=(1, 2)))
         return emitters.with_guide(EmissionGuide(self, first), [number > 0 for number in first])
 
     def record(self) -> dict[str, int | float | str]:
         return asdict(self)
-
-    @staticmethod
-    def read(record: Any) -> EmissionTables:
-        """Inverse of `record`; raises ``ValueError`` or ``TypeError`` for invalid input."""
-        if not isinstance(record, dict) or set(record) != {"side", "left", "levels"}:
-            raise TypeError(f"emission={record!r} is no table of emission")
-        side, left, levels = (record[name] for name in ("side", "left", "levels"))
-        if side not in SIDES or not isinstance(side, int):
-            raise ValueError(f"emission: side={side!r}")
-        if isinstance(left, bool) or not isinstance(left, (int, float)) or not 0 < left <= 1:
-            raise ValueError(f"emission: left={left!r}")
-        try:
-            cells = len(_unpacked(levels))
-        except (zlib.error, TypeError, ValueError) as error:
-            raise ValueError(f"emission: levels: {error}") from error
-        if not 0 < cells <= MOST_CELLS or cells % side**2:
-            raise ValueError(f"emission: levels holds {cells} cells")
-        return EmissionTables(side, float(left), levels)
-
-
-def _unpacked(levels: str) -> bytes:
-    return zlib.decompressobj().decompress(base64.b64decode(levels, validate=True), MOST_CELLS + 1)
 
 
 def side_of(tables: int) -> int:

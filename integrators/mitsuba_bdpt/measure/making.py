@@ -57,7 +57,7 @@ from .reference import (
 from .scenes import MeasuredScene, integrator_of, path_tracers, samples_taken
 from .showing import amount
 
-EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all"}
+EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all", "merging": False}
 WAYS = {
     "path": {"type": "path"},
     "bdpt": EVERYTHING,

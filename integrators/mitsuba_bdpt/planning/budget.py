@@ -105,5 +105,5 @@ def fixed_by(settings: Settings) -> list[str]:
     values = {name: getattr(settings, name) for name in ("skip", "light_paths", "connections")}
     texts = {name: value if isinstance(value, str) else f"{value:g}" for name, value in values.items()}
     fixed = [f"{name}={text}" for name, text in texts.items() if text != "auto"]
-    fixed += ["decisions"] * (settings.decisions is not None)
+    fixed += ["decisions"] * (settings.internals.decisions is not None)
     return fixed + ["layers=strategies"] * settings.strategy_images

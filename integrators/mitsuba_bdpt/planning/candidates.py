@@ -62,4 +62,4 @@ def without_pilot(
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
         return None
     alone = Configuration(0.0, "none", 1.0, UNIFORM_DIRECT if contrast <= UNIFORM else 1.0)
-    return Decision.of(alone, first_pass=0, cost=1.0, variance=0.0, mean=0.0)
+    return Decision.of(alone, cost=1.0, variance=0.0, mean=0.0)

@@ -127,9 +127,9 @@ class Prediction:
         candidate = replace(self.candidate, emission=tables)
         return replace(self, candidate=candidate, without_tables=without_tables)
 
-    def decided(self, first_pass: int, mean: float) -> Decision:
-        """The candidate's decision from pass ``first_pass`` on; ``mean`` of the image."""
-        return Decision.of(self.candidate, first_pass, cost=self.cost, variance=self.variance, mean=mean)
+    def decided(self, mean: float) -> Decision:
+        """The candidate's decision; ``mean`` of the image."""
+        return Decision.of(self.candidate, cost=self.cost, variance=self.variance, mean=mean)
 
 
 def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:

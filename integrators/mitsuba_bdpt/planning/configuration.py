@@ -6,15 +6,12 @@ predictions; it has a JSON form.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeGuard
+from typing import Any
 
 from .. import components
-from ..errors import UsageError
-from ..settings import CONNECTIONS, LIGHT_PATHS
-from ..transport.plan import JOINED, MOST_GUIDED, EmissionTables, Plan
+from ..transport.plan import JOINED, EmissionTables, Plan
 
 
 @dataclass(frozen=True)
@@ -115,40 +112,28 @@ def not_worth(name: str, why: str) -> dict[str, str]:
 # of this share and this multiple of a sample's relative variance. It bounds the variance that roulette adds.
 MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 
-# Bound of recorded numbers, so that products fit into single precision.
-LARGEST = 1e30
-
-# Entries of a record, see `Decision.record`.
-ENTRIES = (
-    *("pass", "light_paths", "connections", "guided", "emission", "joined", "coefficients"),
-    *("cost", "variance", "mean"),
-)
-
 
 @dataclass(frozen=True)
 class Decision(Configuration):
-    """The configuration from pass ``first_pass`` on, with its predictions.
+    """The configuration of a render, with its predictions.
 
     ``cost`` of a sample (path tracing alone: 1); ``variance`` as in `choice.Prediction`; ``mean`` of the
     image, the scale of roulette.
     """
 
-    first_pass: int
     cost: float
     variance: float
     mean: float
 
     @classmethod
-    def of(
-        cls, chosen: Configuration, first_pass: int, *, cost: float, variance: float, mean: float
-    ) -> Decision:
+    def of(cls, chosen: Configuration, *, cost: float, variance: float, mean: float) -> Decision:
         """Return the decision for a configuration with these predictions.
 
         Rounds them to six digits: further digits depend on the order of a pilot's atomic additions.
         """
         cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
         what = {f.name: getattr(chosen, f.name) for f in fields(Configuration)}
-        return cls(**what, first_pass=first_pass, cost=cost, variance=variance, mean=mean)
+        return cls(**what, cost=cost, variance=variance, mean=mean)
 
     @property
     def threshold(self) -> float:
@@ -158,7 +143,6 @@ class Decision(Configuration):
     def record(self) -> dict[str, Any]:
         """Entry of ``statistics["decisions"]``."""
         return {
-            "pass": self.first_pass,
             "light_paths": self.light_paths,
             "connections": self.connections,
             "guided": self.guided,
@@ -170,92 +154,17 @@ class Decision(Configuration):
             "mean": self.mean,
         }
 
-
-def read_decisions(text: str) -> tuple[Decision, ...]:
-    """Parse the parameter ``decisions``: JSON as in ``statistics``.
-
-    An empty list means a render without a pilot. Raises `UsageError` naming the entry and the mistake.
-    """
-    where = ""
-    made: list[Decision] = []
-    try:
-        entries = json.loads(text)
-        if not _is_list(entries):
-            raise TypeError("a list of decisions is needed")
-        for number, entry in enumerate(entries):
-            where = f"entry {number}"
-            made.append(_read_decision(entry))
-        where = ""
-        passes = [decision.first_pass for decision in made]
-        if passes != sorted(set(passes)):
-            raise ValueError(f"passes {passes} must rise")
-        return tuple(made)
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        says = f"{where}: {error}" if where else error
-        what = f"{where} lacks {error}" if isinstance(error, KeyError) else says
-        raise UsageError(
-            f"decisions={text!r} is not what json.dumps(integrator.statistics['decisions']) writes: {what}"
-        ) from error
-
-
-def _is_list(value: Any) -> TypeGuard[list[Any]]:
-    return isinstance(value, list)
-
-
-def _is_object(value: Any) -> TypeGuard[dict[str, Any]]:
-    """Whether a JSON value is an object."""
-    return isinstance(value, dict)
-
-
-def _read_decision(entry: Any) -> Decision:
-    if not _is_object(entry) or not _is_object(entry.get("coefficients", {})):
-        raise TypeError(f"{entry!r} is no decision")
-    light_paths, connections = _number(entry, "light_paths"), entry["connections"]
-    if light_paths not in LIGHT_PATHS or connections not in CONNECTIONS[1:]:
-        raise ValueError(f"light_paths={light_paths!r}, connections={connections!r}")
-    if not light_paths and connections != "none":
-        raise ValueError(f"connections={connections!r} without light paths")
-    if unknown := set(entry) - set(ENTRIES):
-        raise ValueError(f"{min(unknown)} is no part of a decision")
-    first_pass = entry["pass"]
-    if isinstance(first_pass, bool) or not isinstance(first_pass, int):
-        raise TypeError(f"pass={first_pass!r}")
-    numbers = {
-        "kappa_light": _number(entry["coefficients"], "t<=1"),
-        "kappa_direct": _number(entry["coefficients"], "s=1"),
-        **{name: _number(entry, name) for name in ("cost", "variance", "mean")},
-    }
-    for name, value in {"first_pass": first_pass, **numbers}.items():
-        least = 0 if name in ("first_pass", "variance", "mean") else 2.0**-20
-        if not least <= value <= LARGEST:
-            raise ValueError(f"{name}={value!r}")
-    guided = entry.get("guided", 0)  # missing in records of older versions
-    if isinstance(guided, bool) or not isinstance(guided, int) or not 0 <= guided <= MOST_GUIDED:
-        raise ValueError(f"guided={guided!r}")
-    joined = entry.get("joined", 1)
-    if isinstance(joined, bool) or joined not in JOINED or (joined > 1 and connections != "one"):
-        raise ValueError(f"joined={joined!r}, connections={connections!r}")
-    emission = entry.get("emission")
-    return Decision(
-        light_paths=light_paths,
-        connections=connections,
-        first_pass=first_pass,
-        guided=guided,
-        joined=joined,
-        emission=None if emission is None else components.guided_emission.EmissionTables.read(emission),
-        **numbers,
-    )
-
-
-def _number(entry: dict[str, Any], name: str) -> float:
-    """Return a JSON number; booleans and numeric strings raise `TypeError`."""
-    value = entry[name]
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise TypeError(f"{name}={value!r} must be a number")
-    return float(value)
+    @staticmethod
+    def read(record: dict[str, Any]) -> Decision:
+        """Inverse of `record`."""
+        values = dict(record)
+        emission, coefficients = values.pop("emission", None), values.pop("coefficients")
+        if emission is not None:
+            values["emission"] = components.guided_emission.EmissionTables(**emission)
+        return Decision(kappa_light=coefficients["t<=1"], kappa_direct=coefficients["s=1"], **values)
 
 
 def replayed(decision: Decision) -> list[dict[str, str]]:
-    """What a replayed decision leaves out, as in ``statistics["skipped"]``."""
+    """What a decision that is handed over leaves out, as in ``statistics["skipped"]``."""
     names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
     return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]

@@ -70,7 +70,7 @@ def _cause(prepared: PreparedScene, plan: Plan, settings: Settings, strategy: st
         if strategy in skipped["class"]:
             remedy = "render the views one by one" if is_batch else "mend that, or use an area light"
             return skipped["why"], remedy
-    return "decisions leave out light subpaths", "leave decisions to the integrator"
+    return "the choice of strategies leaves out light subpaths", "set light_paths"
 
 
 def _arriving(prepared: PreparedScene, plan: Plan, settings: Settings, direct: bool) -> tuple[int, ...]:

@@ -11,19 +11,17 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import components
-from ..errors import UsageError
 from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.plan import JOINED, EmissionTables, Plan
+from ..transport.plan import JOINED, EmissionTables
 from . import budget, choice, pilot
 from .candidates import LEFT_OUT, candidates, without_pilot
 from .configuration import Decision, not_worth, replayed
-from .explain import words
 from .findings import SceneCache
 from .moments import Moments
-from .possible import plan, unsampled_paths, why_not_joined
+from .possible import plan, why_not_joined
 
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
@@ -84,7 +82,7 @@ class Planner:
     """The ``plan`` of one render of ``spp`` samples per pixel, and its decisions.
 
     ``full``: the plan before any decision; ``threshold`` of roulette in units of the image, None before a
-    decision; ``changes``: number of decisions that changed the plan; ``decided``: saved with the render.
+    decision; ``decided``: saved with the render.
     ``passes``: samples per pixel of each finished pass.
     """
 
@@ -97,17 +95,19 @@ class Planner:
         self.full = plan(prepared, settings)
         joined = JOINED[-1] if self._is_worth_joining(self._expected(())) else 1
         self.full = self.plan = budget.first_plan(self.full, prepared, settings, self._pixels, joined)
-        self.threshold, self.changes, self.decided = None, 0, PlannerState()
+        self.threshold, self.decided = None, PlannerState()
         # Moments of the newest pilot with tables of emission.
         self._with_tables: Moments | None = None
 
     def begin(self, passes: tuple[int, ...]) -> bool:
-        """Adopt what the scene alone decides, before the first pass.
+        """Adopt what is given or the scene alone decides, before the first pass.
 
         Returns whether a pilot is to run.
         """
+        for given in self._settings.internals.decisions or ():
+            self.adopt(given, replayed(given))
         settled, decision = self._settled(passes)
-        if not passes and self._settings.decisions is None:
+        if not passes and self._settings.internals.decisions is None:
             self.decided = replace(self.decided, no_pilot=settled)
         if decision and not passes:
             self.adopt(decision, LEFT_OUT)
@@ -123,7 +123,7 @@ class Planner:
             self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
             self._with_tables = result.with_tables
         if result.table:
-            self.adopt(result.table[0].decided(len(passes), result.moments.mean), result.left_out)
+            self.adopt(result.table[0].decided(result.moments.mean), result.left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
         return list(result.table)
 
@@ -197,32 +197,9 @@ class Planner:
         with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
             return pilot.measure(self._prepared, plan, self._settings, seed, count, samples / count, guiding)
 
-    def replay(self, passes: tuple[int, ...]):
-        """Adopt the decision that the parameters give for the next pass, if any."""
-        for decision in self._settings.decisions or ():
-            if decision.first_pass == len(passes):
-                self.adopt(decision, replayed(decision))
-                before = self._unsampled(self.full)
-                for unsampled in self._unsampled(self.plan):
-                    if unsampled not in before:
-                        mi.Log(mi.LogLevel.Warn, f"bdpt: by decisions, not sampled: {words(unsampled)}")
-
-    def _unsampled(self, p: Plan):
-        return unsampled_paths(self._prepared, p, self._settings)
-
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
-        """Plan as decided from now on.
-
-        A changed plan uses new points: its lanes would not complete the old sequence.
-        """
-        if decision.joined > 1 and (why := self._why_not_joined()):
-            raise UsageError(
-                f"decisions: joined={decision.joined} is not possible {why}; set it to 1, or leave it out"
-            )
+        """Plan as decided from now on."""
         adopted = replace(decision.plan(self.full), skipped=(*self.full.skipped, *left_out))
-        begun = self.decided.decisions or decision.first_pass
-        if begun and replace(adopted, skipped=()) != replace(self.plan, skipped=()):
-            self.changes += 1
         decisions = (*self.decided.decisions, decision)
         self.decided = replace(self.decided, decisions=decisions, left_out=tuple(left_out))
         self.threshold, self.plan = decision.threshold, adopted

@@ -71,17 +71,6 @@ def warn_of_unsampled_light(prepared, plan, text: str):
         warn_once(prepared.scene, prepared.camera.sensor, text, ("unsampled light", plan.splat, plan.direct))
 
 
-def warn_of_late_decisions(decisions, passes: int):
-    """Warn of ``decisions`` for passes beyond the render's ``passes``."""
-    late = [decision.first_pass for decision in decisions or () if decision.first_pass >= passes]
-    if late:
-        mi.Log(
-            mi.LogLevel.Warn,
-            f"bdpt: decisions from pass {', '.join(map(str, late))} on never began: the render had passes "
-            f"0 to {passes - 1}",
-        )
-
-
 def warn_of_non_finite(statistics: dict, scene):
     """Warn of non-finite values in a render, and name scene parameters that hold some."""
     lost, in_pilot = statistics["non_finite"], statistics["non_finite_in_pilot"]

@@ -226,7 +226,6 @@ class Render:
         if self.planner.begin(self.passes):
             with self.meter.pilot():
                 self.table = self.planner.run_pilot(self.passes)
-        self.planner.replay(self.passes)
         self._use_plan()
         return self.table
 
@@ -250,10 +249,8 @@ class Render:
         Under ``timeout``, a pass takes at most about a tenth of it.
         """
         if self._small_first is None:
-            decisions = self.settings.decisions
-            known = self.planner.threshold is not None or (decisions and decisions[0].first_pass == 0)
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
-            self._small_first = bool(long and not known and self._plays_roulette())
+            self._small_first = long and self.planner.threshold is None and self._plays_roulette()
         earlier = sum(self.passes)
         for step in schedule(self.spp, self._longest, self.settings, self._small_first):
             done, end = step.done, step.done + step.size
@@ -284,7 +281,7 @@ class Render:
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
-            drawn = self.points.of(step, self.planner.changes)
+            drawn = self.points.of(step)
             with gc_paused(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
                 with evaluated_mode(self.prepared.emitters.evaluated):
                     counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
@@ -298,9 +295,8 @@ class Render:
 
     def _photons(self, step: Step, merging: Passes) -> PhotonStrategy:
         """Trace the photons of a pass; returns their merging."""
-        done, changes = passes_since(self.passes, step.done), self.planner.changes
-        start = self.points.wavelengths(step, changes) if mi.is_spectral else None
-        points = self.points.of_photons(step, done, changes)
+        start = self.points.wavelengths(step) if mi.is_spectral else None
+        points = self.points.of_photons(step, passes_since(self.passes, step.done))
         earlier = self.part * len(schedule(self.spp, self._longest, self.settings, False)) + len(self.passes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             photons, counts = merging.trace(self.kernel, points, step.size, earlier, start)

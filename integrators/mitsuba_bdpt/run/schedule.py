@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points, sequential
-from ..sampling.sequences import CHANGED, GUIDE, PHOTONS, WAVELENGTHS, sequence_seed
+from ..sampling.sequences import GUIDE, PHOTONS, WAVELENGTHS, sequence_seed
 from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport.batch import STRIP, Batch
@@ -126,26 +126,22 @@ class PassPoints:
     def __init__(self, settings: Settings, seed):
         self._kind, self.seed = settings.points, seed
 
-    def of(self, step: Step, changes: int) -> Points:
-        """Return the points of the pass ``step``.
+    def of(self, step: Step) -> Points:
+        """Return the points of the pass ``step``."""
+        return Points(self._kind, self._seed_of(step, self.seed))
 
-        ``changes``: number of changes of the plan before, see `Planner.adopt`.
-        """
-        return Points(self._kind, self._seed_of(step, changes, self.seed))
-
-    def wavelengths(self, step: Step, changes: int) -> mi.Float:
+    def wavelengths(self, step: Step) -> mi.Float:
         """Return the number in [0, 1) from which the wavelengths of an image's merging passes follow."""
-        return sequential(self._seed_of(step, changes, sequence_seed(self.seed, WAVELENGTHS)))[0]
+        return sequential(self._seed_of(step, sequence_seed(self.seed, WAVELENGTHS)))[0]
 
-    def _seed_of(self, step: Step, changes: int, seed: mi.UInt32) -> mi.UInt32:
-        """Return a seed from ``seed`` that is distinct by replicate and change of plan."""
-        number = step.replicate + (CHANGED + changes if changes else 0)
-        return sequence_seed(seed, number) if number else seed
+    def _seed_of(self, step: Step, seed: mi.UInt32) -> mi.UInt32:
+        """Return a seed from ``seed`` that is distinct by replicate."""
+        return sequence_seed(seed, step.replicate) if step.replicate else seed
 
-    def of_photons(self, step: Step, done: int, changes: int) -> Points:
+    def of_photons(self, step: Step, done: int) -> Points:
         """Return the points of the photons of a pass, after ``done`` passes of its image."""
         seed = sequence_seed(self.seed, PHOTONS + done)
-        return Points(self._kind, self._seed_of(step, changes, seed))
+        return Points(self._kind, self._seed_of(step, seed))
 
     def of_guide(self) -> Points:
         """Return the points of the photons that guide BSDF sampling."""

@@ -15,7 +15,7 @@ from .._version import __version__
 from ..errors import CommandError, UsageError
 from ..image.accumulator import Accumulator
 from ..image.replicates import Spread
-from ..planning.configuration import read_decisions
+from ..planning.configuration import Decision
 from ..planning.moments import Moments
 from ..planning.planner import Pilots, PlannerState
 from ..settings import Settings
@@ -28,8 +28,8 @@ class Progress:
 
     ``decided``: decisions so far; ``work``: counts; ``halves``: those of the replicates, ``None`` without
     `variance` (see `image.replicates`); ``small_first``: whether the first pass has one sample per pixel,
-    ``None`` if not yet known; ``why_merged``: why vertices are merged, or empty; ``whole``: whether a render can continue from it; ``scene``: optional digest of
-    the scene's files.
+    ``None`` if not yet known; ``why_merged``: why vertices are merged, or empty; ``whole``: whether a render
+    can continue from it; ``scene``: optional digest of the scene's files.
     """
 
     decided: PlannerState = PlannerState()
@@ -73,7 +73,7 @@ class Progress:
     def restored(cls, values: dict, arrays: dict) -> Progress:
         """Inverse of `stored`; removes its arrays from ``arrays``."""
         values = dict(values)
-        decisions = read_decisions(json.dumps(values["decisions"]))
+        decisions = tuple(map(Decision.read, values["decisions"]))
         moments = _arrays(arrays, "moments")
         if moments:
             moments = Moments(**values["moments"], **moments)
@@ -119,6 +119,7 @@ def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, 
     """
     film, values = accumulator.film, asdict(settings)
     del values["timeout"]
+    del values["internals"]["decisions"]
     values["target_error"] = bool(settings.target_error)  # the passes depend on whether it is set
     values |= {
         "version": __version__,

@@ -136,10 +136,9 @@ class Statistics(TypedDict):
     skipped: list[dict]
     """The strategies that were skipped, and why."""
     decisions: list[dict]
-    """The decisions of a pilot, of the scene alone or of the parameter ``decisions``, whose value is their
-    JSON."""
+    """The decision of a pilot or of the scene alone, or none."""
     no_pilot: str
-    """Why no pilot ran, or none decided. Empty where one did, and where ``decisions`` were given."""
+    """Why no pilot ran, or none decided."""
     pilots: dict[str, int]
     """Number of pilots that were ``rendered``, and of results that were ``cached`` by earlier renders."""
     passes: list[int]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-# Numbers from 1 are the replicates of `variance`. Pilots use the numbers after `PILOT`, images after a change
-# of the decision the numbers after `CHANGED`.
-PILOT, CHANGED = 1 << 16, 1 << 17
+# Numbers from 1 are the replicates of `variance`. Pilots use the numbers after `PILOT`.
+PILOT = 1 << 16
 
 # Photons use `PHOTONS` plus the number of finished passes, or a sequence derived from it; wavelengths of
 # passes with merging use numbers from `WAVELENGTHS`.
