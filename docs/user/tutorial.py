@@ -95,7 +95,6 @@ print(bdpt.explain(box, spp=4096))
 
 # %%
 bdpt.render(box, spp=256, seed=1, develop=False)
-decisions = bdpt.statistics["decisions"]
 print({key: bdpt.statistics[key] for key in ("rays", "passes", "peak_memory")})
 
 # %% [markdown]

@@ -258,7 +258,7 @@ def test_short_renders_are_not_joined():
         ({"transmits": True}, False),
         ({"many": True}, False),
         ({"many": True, "samples": (1 << 16) + 40 * (1 << 11)}, True),
-        ({"why": "in scenes with media"}, False),
+        ({"space": "media"}, False),
     ],
     ids=str,
 )
@@ -266,48 +266,19 @@ def test_what_is_joined(change, joined):
     """Expected: four light subpaths are possible in a long render of many pixels, longer with many BSDFs
     (40), each of which guesses ask, and where guesses know the BSDFs.
     """
-    given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "why": "", "many": False} | change
+    given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "space": None, "many": False} | change
     asked = SimpleNamespace(
         _prepared=SimpleNamespace(
             traits=SimpleNamespace(
                 transmits=given["transmits"], dispatch=SimpleNamespace(many=given["many"], count=40)
-            )
+            ),
+            space=given["space"],
+            emitters=SimpleNamespace(shape_errors=SimpleNamespace(small=False)),
         ),
+        full=SimpleNamespace(merging=False),
         _pixels=given["pixels"],
-        _why_not_joined=lambda: given["why"],
     )
     assert planner.Planner._is_worth_joining(asked, given["samples"]) == joined
-
-
-def tiny():
-    return {"tiny": {"type": "sphere", "center": [0, 1.5, 0], "radius": 1e-4}}
-
-
-def fog():
-    medium = {"type": "homogeneous", "sigma_t": 0.5}
-    box = {"type": "cube", "to_world": T().translate([0, 1, 0]).scale(0.9), "bsdf": {"type": "null"}}
-    return {"fog": box | {"interior": medium}}
-
-
-@pytest.mark.parametrize(
-    "more, parameters, why",
-    [
-        (fog, {}, "in scenes with media"),
-        (tiny, {}, "in scenes with shapes so small"),
-        (
-            lambda: {"glass": {"type": "sphere", "radius": 0.2, "bsdf": {"type": "dielectric"}}},
-            {"merging": True},
-            "with merging",
-        ),
-    ],
-    ids=["media", "tiny shapes", "merging"],
-)
-def test_decisions_that_are_impossible(more, parameters, why):
-    """Expected: an error that names ``decisions`` and says why, before anything is rendered."""
-    scene = mi.load_dict(parts.open_scene(parts.perspective(), lamp=parts.EMITTERS["point"](), **more()))
-    method = internals.bdpt(decisions=decided(), **parameters)
-    with pytest.raises(ValueError, match=f"decisions: joined=4 is not possible {why}"):
-        method.render(scene, spp=1)
 
 
 def test_what_is_counted():

@@ -11,20 +11,20 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7690,
     "transport merging guided_emission": 7030,
-    "planning": 2917,
+    "planning": 2867,
     "emitters": 2680,
-    "cli": 1801,
+    "cli": 1811,
     "media": 1469,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1196,
+    "run": 1225,
     "scene sampling": 771,
     "host": 1077,
     "sensors": 934,
-    "": 1539,  # top files
+    "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 6130, "tests": 45491}
+OUTSIDE = {"scripts": 6131, "tests": 45490}
 MOST_WORDS = 70636
 
 

@@ -21,7 +21,7 @@ from .candidates import LEFT_OUT, candidates, without_pilot
 from .configuration import Decision, not_worth, replayed
 from .findings import SceneCache
 from .moments import Moments
-from .possible import plan, why_not_joined
+from .possible import may_join, plan
 
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
@@ -175,11 +175,8 @@ class Planner:
             and self._pixels >= JOINED_PIXELS
             and not self._prepared.traits.transmits
             and dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-            and not self._why_not_joined()
+            and may_join(self._prepared, self.full.merging)
         )
-
-    def _why_not_joined(self) -> str:
-        return why_not_joined(self._prepared, self.full.merging)
 
     def _fitted_emission(self, moments: Moments) -> Learnt:
         """Fit tables of emission."""

@@ -91,15 +91,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     )
 
 
-def why_not_joined(prepared: PreparedScene, merging: bool) -> str:
-    """Why camera subpaths cannot connect with several light subpaths, or empty."""
-    if prepared.space is not None:
-        return "in scenes with media"
-    if merging:
-        return "with merging"
-    if prepared.emitters.shape_errors.small:
-        return "in scenes with shapes so small that rays ask which shape they meet"
-    return ""
+def may_join(prepared: PreparedScene, merging: bool) -> bool:
+    """Whether camera subpaths may connect with several light subpaths: not where rays test small shapes."""
+    return prepared.space is None and not merging and not prepared.emitters.shape_errors.small
 
 
 def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:
