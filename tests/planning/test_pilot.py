@@ -747,8 +747,8 @@ def test_light_that_only_connections_find():
 
 
 def test_all_candidates_are_possible_in_a_plain_scene():
-    """Expected: in the box all of them, none twice; the last one weights strategies as the pilot's samples do,
-    by which their brightness is known."""
+    """Expected: in the box all of them, none twice; the last one weights strategies as the pilot's samples
+    do, by which their brightness is known."""
     render = of(cornell())
     assert candidates(render.prepared, render.plan, render.settings) == list(CANDIDATES)
     assert len(set(CANDIDATES)) == len(CANDIDATES)

@@ -10,21 +10,21 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 7030,
-    "planning": 2867,
+    "transport merging guided_emission": 7000,
+    "planning": 2780,
     "emitters": 2680,
     "cli": 1811,
     "media": 1469,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1225,
+    "run": 1241,
     "scene sampling": 771,
     "host": 1077,
     "sensors": 934,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 6131, "tests": 45490}
+OUTSIDE = {"scripts": 6131, "tests": 45350}
 MOST_WORDS = 70636
 
 

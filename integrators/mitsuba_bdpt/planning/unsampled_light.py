@@ -112,7 +112,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return True
     if plan.arrival:
         return False
-    # Light without a vertex in between is left to `missed_direct`.
+    # Light without a vertex in between: see `messages.warn_of_missing_direct`.
     unsampled = unsampled_paths(prepared, plan, settings)
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in unsampled)
 

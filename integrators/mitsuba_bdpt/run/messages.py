@@ -10,7 +10,10 @@ import mitsuba as mi
 from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.notices import warn_once
+from ..planning.explain import words
+from ..planning.possible import Rest, unsampled_paths
 from ..scene.diagnostics import NAMED, not_finite, spoilt
+from ..sensors.checks import called
 
 
 def log(statistics: dict):
@@ -69,6 +72,22 @@ def warn_of_unsampled_light(prepared, plan, text: str):
     """Warn once per scene and ``plan`` of unsampled light, unless ``text`` is empty."""
     if text:
         warn_once(prepared.scene, prepared.camera.sensor, text, ("unsampled light", plan.splat, plan.direct))
+
+
+def warn_of_missing_direct(prepared, plan, settings):
+    """Warn once of light that falls on a meter and that no strategy in use samples.
+
+    Cameras with a lens lack the image of the lamp alone.
+    """
+    if isinstance(prepared.camera.sensor, mi.ProjectiveCamera):
+        return
+    for paths in unsampled_paths(prepared, plan, settings):
+        if paths.rest is Rest.SENSOR:
+            text = (
+                f"bdpt: not sampled: {words(paths)}: light on {called(prepared.camera.sensor)} itself is "
+                "missing; leave light_paths at auto, render views of a batch one by one, or use an area light"
+            )
+            warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
 def warn_of_non_finite(statistics: dict, scene):

@@ -18,11 +18,10 @@ from ..emitters.light_groups import LightGroups
 from ..errors import UnsupportedError, UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
-from ..host.notices import warn_once
 from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
-from ..planning import missed_direct, unsampled_light
+from ..planning import unsampled_light
 from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE, NOT_WORTH
 from ..planning.findings import SceneCache
@@ -155,9 +154,7 @@ class Render:
                     break
                 if not number:
                     messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
-                    missed = missed_direct.warnings(self.prepared, self.plan, self.settings, self.findings)
-                    for text in filter(None, missed):
-                        warn_once(self.prepared.scene, self.sensor, text)
+                    messages.warn_of_missing_direct(self.prepared, self.plan, self.settings)
                 self._pass(step)
                 # Records the second pass while the first, a short one, runs.
                 if watched or number > 0:
