@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
+import views
 import welch as st
 from mitsuba_bdpt.planning import sds_light, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
@@ -175,6 +176,24 @@ def polished():
     }
 
 
+def test_paths_of_near_specular_events_alone():
+    """Rationale: light that a jar of rough glass reflects within is found by subpaths that choose a rare
+    reflection several times, each of them a firefly, though no event is diffuse. Expected: guided at each
+    event, it has a tenth of the variance of pixels at most (1/27 was measured, and 1/3.5 without).
+    """
+    glass = {"type": "roughdielectric", "alpha": 0.02}
+    lamp = {"type": "sphere", "center": [0.4, 2.2, 0.6], "radius": 0.1}
+    described = {
+        "type": "scene",
+        "sensor": views.camera("perspective", origin=(0, 2, 4), target=(0, 0, 0), fov=22, size=24),
+        "outer": {"type": "sphere", "radius": 0.75, "bsdf": glass},
+        "inner": {"type": "sphere", "radius": 0.65, "flip_normals": True, "bsdf": glass},
+        "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
+    }
+    a, b = (images(described, 64, 8, max_depth=8, guiding=guiding) for guiding in ("always", "never"))
+    assert a.var(axis=0).mean() < 0.1 * b.var(axis=0).mean()
+
+
 def test_an_unrelated_ball_changes_no_variance():
     """Rationale: the static test is one of the scene: a polished ball out of view makes the floor's lobes
     near-specular, and no other event of its paths is diffuse. They are SDS paths by their delta events alone,
@@ -255,8 +274,8 @@ def test_scenes_without_near_specular_lobes_have_no_flags(monkeypatch):
 
 def test_stored_vertices_keep_their_flags():
     """Expected: the flags of every combination are read as they were written."""
-    bits = dr.arange(mi.UInt32, 8)
+    bits = dr.arange(mi.UInt32, 4)
     written = light_path._of_flags(bits)
-    np.testing.assert_array_equal(light_path._flags(written).numpy(), np.arange(8))
-    flags = (written.isolated, written.specular, written.diffuse)
-    assert len({tuple(row) for row in np.stack([flag.numpy() for flag in flags], axis=1)}) == 8
+    np.testing.assert_array_equal(light_path._flags(written).numpy(), np.arange(4))
+    flags = (written.isolated, written.specular)
+    assert len({tuple(row) for row in np.stack([flag.numpy() for flag in flags], axis=1)}) == 4

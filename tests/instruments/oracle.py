@@ -266,13 +266,12 @@ class Hard(Explicit):
 class Guided(Explicit):
     """All strategies of ``paths``, with photon guiding through near-specular events, see `sds`.
 
-    Events with at least the density ``least`` from both sides count as specular beside delta ones. An SDS
-    path has no edge between two other vertices whose connection is in use. ``sds``: mask of those with
-    another vertex, from emitters that can be hit: s = 0 and s = 1, and the same two (further columns) with a
-    guided direction at the first vertex that is not specular, seen from the emitter. Also those without such
-    a vertex (``narrow``) that are SDS paths with delta events alone as specular ones: their guided direction
-    is at the first vertex that is not delta. ``guide`` (n, k + 1): density of that direction at each vertex,
-    as an attribute at the one that guides.
+    Events with at least the density ``least`` from both sides count as specular beside delta ones. ``sds``:
+    mask of the paths of three or more edges, not only of delta events, of which no edge is between two other
+    vertices whose connection is in use. They have s = 0 and s = 1, and the same two, in further columns, for
+    each vertex x_2 ... x_{k-1} with a guided direction: that of the first vertex that is not specular, seen
+    from the emitter; without one (``pure``) those of all that are not delta, behind a specular event or an
+    edge that no strategy connects. ``guide`` (n, k + 1): density of that direction at each vertex.
     """
 
     def __init__(self, paths: Paths, coefficients: Coefficients, guide, least: float):
@@ -281,19 +280,16 @@ class Guided(Explicit):
         specular = paths.delta | (np.minimum(paths.to_camera, paths.to_light) >= least)
         specular[:, [0, k]] = False
         used = np.array([coefficients.of(e + 1, k) > 0 for e in range(k)])  # s = e + 1 connects edge e
-        by_specular, by_delta = (
-            ~(~events[:, :-1] & ~events[:, 1:] & used).any(1) & ~paths.delta_emitter
-            for events in (specular, paths.delta)
-        )
-        diffuse, lobes = ~specular[:, 1:k], ~paths.delta[:, 1:k]
-        self.narrow = by_delta & lobes.any(1) & ~diffuse.any(1)
-        self.sds = self.narrow | (by_specular & diffuse.any(1))
-        guides = np.where(self.narrow[:, None], lobes, diffuse)
-        last = guides.argmax(1) + 1 if k > 1 else np.zeros(n, dtype=int)
-        rows = np.arange(n)
-        self.guide = guide[rows, last].astype(np.float64)
-        ratio = np.log(self.guide / paths.to_light[rows, last])
-        guided = np.where(self.sds[:, None], size[:, :2] + ratio[:, None], -np.inf)
-        size = np.concatenate([size, guided], axis=1)
+        isolated = ~(~specular[:, :-1] & ~specular[:, 1:] & used).any(1)
+        self.sds = isolated & ~paths.delta_emitter & ~paths.delta[:, 1:k].all(1) & (k > 2)
+        diffuse = ~specular[:, 1:k]
+        self.pure = self.sds & ~diffuse.any(1)
+        guides = ~paths.delta[:, 1:k] & (specular[:, 2:] | ~used[1:]) & self.pure[:, None]
+        rows = np.flatnonzero(self.sds & ~self.pure)
+        guides[rows, diffuse[rows].argmax(1)] = True
         size[self.sds, 2 : k + 2] = -np.inf
-        self._take(size)
+        with np.errstate(divide="ignore"):
+            ratio = np.log(guide[:, 1:k] / paths.to_light[:, 1:k])
+        ratio = np.where(guides, ratio, -np.inf)[:, 1:]
+        guided = (size[:, None, :2] + ratio[..., None]).reshape(n, -1)
+        self._take(np.concatenate([size, guided], axis=1))

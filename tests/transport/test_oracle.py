@@ -614,10 +614,12 @@ class Guide(guided_hits.Guiding):
     def __init__(self, world, density):
         super().__init__(self, True)
         self.world, self.script, self.at, self.active = world, density, 0, mi.Bool(False)
+        self.start = 0  # the vertex that guides
 
     def _evaluated(self, kernel_, vertex, d, active):
         self.at = self.world.k - int(vertex.edges[0])
-        return sds.Advice(active, mi.UInt32(0), self.density(kernel_, vertex.si.p, 0, d))
+        density = dr.select(active, self.density(kernel_, vertex.si.p, 0, d), 0)
+        return sds.Advice(active, mi.UInt32(0), density)
 
     def density(self, kernel_, p, found, d):
         return self.world.f(self.script[:, self.at])
@@ -625,6 +627,7 @@ class Guide(guided_hits.Guiding):
     def visit(self, kernel_, z, walk, stream, shared, add, state):
         scene, at = self.world.scene, self.world.scene.at
         self.at, self.active = self.world.k - int(z.edges[0]), z.advice.active
+        self.start = self.at
         if self.at:
             total, counters = state
             given = total, counters.non_finite, counters.aimed, counters.guided
@@ -644,7 +647,8 @@ def kernel_weights(
     """Weights of all strategies of the world's paths, by the unchanged kernel.
 
     With ``merges``, a `merging.Merging` without photons, those of the k - 1 merges follow, and `World.merged`
-    has what was merged. With a ``guide`` those of guided s = 0 and s = 1 follow; all are 0 where inactive.
+    has what was merged. With a ``guide`` those of guided s = 0 and s = 1 follow, see `oracle.Guided`; all are
+    0 where inactive.
     """
     k, scene = world.k, world.scene
     u32, f = mi.UInt32, mi.Float
@@ -708,7 +712,7 @@ def kernel_weights(
     if merges is not None:
         k_.sds = traced_photons(world, k_, merges, shared, monkeypatch)
         (record_hard_merges if merges.hard else record_merges)(world, monkeypatch)
-    result = [f(0)] * (k + (2 if guide is None else 4))
+    result = [f(0)] * (k + 2 + (0 if guide is None else 2 * (k - 2)))
     stored = []
     if guide is not None:
         k_.sds = guide
@@ -724,10 +728,10 @@ def kernel_weights(
                 weight, value, row = out.weight, out.value, s
                 if guide is not None:
                     weight, value = dr.select(out.active, weight, 0), dr.select(out.active, value, 0)
-                if isinstance(arguments[-1], guided_hits._Guided):  # one of the vertices guides
-                    row += k + 2
-                    weight, value = weight + result[row], value + world.values.get(row, 0)
-                result[row], world.values[row] = weight, value
+                if isinstance(arguments[-1], guided_hits._Guided):
+                    row += k + 2 + 2 * (guide.start - 2)
+                if row >= k + 2 or not isinstance(arguments[-1], guided_hits._Guided):
+                    result[row], world.values[row] = weight, value
                 world.demands.append((out.s == s) & (out.t == k + 1 - s))
             return out
 
@@ -1072,6 +1076,15 @@ def test_strategies_agree_on_path_layers(kind, monkeypatch):
     assert (met[:, 0] > 20).all() and (met[merged, 1] > 20).all()
 
 
+def guided_estimates(world: World, weights) -> np.ndarray:
+    """Estimates times ``weights`` of guided s = 0 and s = 1, over the estimates without the guide."""
+    first, found = world.k + 2, []
+    for s in range(first, weights.shape[1]):
+        value, plain = (np.array(world.values.get(i, [0])[0]) for i in (s, (s - first) % 2))
+        found.append(weights[:, s] * value / np.where(plain > 0, plain, 1))
+    return np.array(found).reshape(-1, len(weights)).T
+
+
 @pytest.mark.parametrize(
     "name, classes, lens",
     [
@@ -1089,11 +1102,11 @@ def test_kernel_guides_through_near_specular_events(name, classes, lens, monkeyp
     edges, a tenth of the vertices delta, half of the others specular by their densities; of 300 more than
     half are delta, and all others specular.
 
-    Expected: every weight, guided ones too, is the oracle's to 1e-3 of its own size and 0 where the oracle
-    has none; the weights of each path sum to 1 within 1e-4. The estimate of guided s = 0 is the BSDF over the
-    guide's density, to 1e-3.
+    Expected: every weight is the oracle's to 1e-3 of its own size and 0 where the oracle has none. Guided
+    estimates times weights are the oracle's weights over the guide's density (stand-ins of BSDFs have value
+    1, and weight 1 where they are sampled), to 1e-3, and 0 on other paths.
     """
-    kappa, rng, total, narrow = COEFFICIENTS[classes], np.random.default_rng(12), 0, 0
+    kappa, rng, total, pure = COEFFICIENTS[classes], np.random.default_rng(12), 0, 0
     for k in (3, 4, 5):
         world = World(rng, 1000, k, lens, delta=0.1)
         world.mixed[:] = False  # the guide would follow the other lobes of these
@@ -1107,19 +1120,17 @@ def test_kernel_guides_through_near_specular_events(name, classes, lens, monkeyp
             weights = kernel_weights(world, kappa, name, patch, guide=Guide(world, density))
         explicit = oracle.Guided(world.paths, kappa, density, near_specular.GUIDED)
         expected, used = explicit.weights(name), explicit.used
+        own = slice(None), slice(k + 2)
+        weights[:, k + 2 :] = guided_estimates(world, weights)
+        expected[:, k + 2 :] /= np.repeat(density[:, 2:k], 2, axis=1)
         np.testing.assert_allclose(
             np.where(used, weights, 0), expected, rtol=1e-3, atol=1e-30, err_msg=f"k={k}"
         )
         possible = oracle.Explicit(world.paths, kappa).used  # others end at delta events
-        assert not weights[:, : k + 2][possible & ~used[:, : k + 2]].any()
-        others, hittable = ~explicit.sds, ~world.paths.delta_emitter
-        assert not weights[others, k + 3].any() and not weights[others & hittable, k + 2].any()
-        np.testing.assert_allclose(np.where(used, weights, 0)[used.any(1)].sum(1), 1, atol=1e-4)
-        value, plain = (np.array(world.values[s][0])[explicit.sds] for s in (k + 2, 0))
-        # Stand-ins have value 1, and weight 1 where they are sampled.
-        np.testing.assert_allclose(value, plain / explicit.guide[explicit.sds], rtol=1e-3)
-        total, narrow = total + explicit.sds.sum(), narrow + explicit.narrow.sum()
-    assert total > 100 and narrow > 30
+        assert not weights[own][possible & ~used[own]].any()
+        assert not weights[:, k + 2 :][~used[:, k + 2 :] & ~world.paths.delta_emitter[:, None]].any()
+        total, pure = total + explicit.sds.sum(), pure + explicit.pure.sum()
+    assert total > 100 and pure > 30
 
 
 # -- layer 3: densities of real scenes ---------------------------------------------------------------

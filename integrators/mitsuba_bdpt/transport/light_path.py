@@ -152,14 +152,14 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
 
 def _flags(sds: State) -> mi.UInt32:
     """The flags of a light vertex, as bits."""
-    bits = enumerate((sds.isolated, sds.specular, sds.diffuse))
+    bits = enumerate((sds.isolated, sds.specular))
     return sum((dr.select(flag, mi.UInt32(1 << i), 0) for i, flag in bits), mi.UInt32(0))
 
 
 def _of_flags(bits: mi.UInt32) -> State:
     """The inverse of `_flags`."""
-    isolated, specular, diffuse = ((bits & (1 << i)) != 0 for i in range(3))
-    return State(isolated=isolated, specular=specular, diffuse=diffuse)
+    isolated, specular = ((bits & (1 << i)) != 0 for i in range(2))
+    return State(isolated=isolated, specular=specular)
 
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):

@@ -139,6 +139,13 @@ class Heuristic:
         """Partial sum of one strategy of ratio ``inverse_pdf``, 1 / density (any measure)."""
         return dr.minimum(inverse_pdf, SATURATION)
 
+    def equal_weight(self, ratio: mi.Float) -> mi.Float:
+        """Factor of an estimate f / p if its own weight, of a density ``ratio`` times p, is to be that of p.
+
+        Estimates times weights are w f / (ratio p), with w proportional to ratio or ratio^2.
+        """
+        return ratio if self.name == "power" else mi.Float(1)
+
     def weigh(
         self,
         coefficient: Coefficient,

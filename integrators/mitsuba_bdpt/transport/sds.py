@@ -10,10 +10,10 @@ too rarely. Which these are is decided by densities, without a `State`.
 
 In such scenes photon-guided BSDF sampling takes for specular every event that is delta or near-specular from
 both sides (`is_specular`), a function of the path on which all strategies agree. Unlike delta events, these
-could be connected. On SDS paths with a diffuse vertex from emitters that rays can hit, all strategies but
-s = 0 and s = 1, guided or not, are left out: they rarely sample them, and need not know the guide's density.
-So is t = 0 on paths whose events are all specular, some of them not delta, and that are SDS paths by their
-delta events alone: they are guided at the last vertex whose event is not delta.
+could be connected. On SDS paths from emitters that rays can hit, but those of delta events alone and those of
+one vertex, all strategies but s = 0 and s = 1, guided or not, are left out: they rarely sample them, and need
+not know the guide's density. Of a path with diffuse events the last diffuse vertex guides, else all vertices
+that are not delta, but the last one.
 """
 
 from __future__ import annotations
@@ -26,17 +26,20 @@ import mitsuba as mi
 from . import mis
 from .near_specular import GUIDED, is_narrow
 
+# Edges of the shortest guided path: no photon directly from the emitter guides.
+FEWEST_EDGES = 3
+
 
 @dataclass
 class State:
     """What a walk knows of an SDS path; None where it is not needed.
 
-    ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were
-    delta; ``guided``, on camera subpaths with guiding: the other density of the last non-delta direction
-    (s = 0 by the guide, or by the BSDF) over its own; ``survived``, on photon subpaths of hard paths: the
-    probability with which `PhotonStrategy.survival` let it go on. Where near-specular events count as
-    specular ``specular``: the last event was; ``diffuse``: one before the next vertex was not; ``narrow``:
-    all were, some of them not delta, and no edge is connectible with delta events alone as specular ones.
+    ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were delta;
+    ``guided``, on camera subpaths with guiding: the densities of guided directions over those of the BSDF;
+    ``survived``, on photon subpaths of hard paths: the probability with which `PhotonStrategy.survival` let
+    it go on. Where near-specular events count as specular ``specular``: the last event was; on camera
+    subpaths ``diffuse``: one was not; ``newest``: as ``guided``, of the last vertex, which is not in that: it
+    does not guide if the next vertex is the end.
     """
 
     isolated: mi.Bool | None = None
@@ -45,48 +48,47 @@ class State:
     survived: mi.Float | None = None
     specular: Any = None
     diffuse: Any = None
-    narrow: Any = None
+    newest: Any = None
 
     def scattered(self, specular: mi.Bool, coefficient: mis.Coefficient) -> State:
         """The state after an event; ``coefficient`` of the connection of the edge to it."""
         isolated = ~self.is_connectible(specular, coefficient) & self.isolated
-        return replace(self, isolated=isolated, specular=specular, diffuse=self.diffuse | ~specular)
+        return replace(self, isolated=isolated, specular=specular)
+
+    def guided_before_last(self, heuristic: mis.Heuristic) -> mi.Float:
+        """The densities of the guide, over those of the path, at all vertices before the next one."""
+        return heuristic.combine(self.guided, self.newest)
 
     def is_connectible(self, specular: mi.Bool | bool, coefficient: mis.Coefficient) -> mi.Bool:
         """Mask: a strategy connects the edge to the next vertex, whose event is ``specular``."""
         return ~(self.specular | specular) & mis.is_used(coefficient)
 
-    def may_narrow(self, partial: mis.Partial, coefficient: mis.Coefficient) -> mi.Bool:
-        """Mask: ``narrow`` after a near-specular event at the next vertex, of this ``partial``."""
-        return (self.only_delta | self.narrow) & ~mis.is_connectible(partial, coefficient)
-
-    def ends(self, partial: mis.Partial, coefficient: mis.Coefficient) -> mi.Bool:
-        """Mask: a path that is guided if the next vertex, of this ``partial``, is its end.
+    def ends(self, edges: mi.UInt32, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: a guided path if the next vertex, after ``edges`` edges, is its end.
 
         ``coefficient`` of the class that connects the last edge.
         """
-        guided = self.isolated & self.diffuse & ~self.is_connectible(False, coefficient)
-        return guided | (self.narrow & ~mis.is_connectible(partial, coefficient))
+        possible = self.isolated & ~self.only_delta & (edges >= FEWEST_EDGES)
+        return possible & ~self.is_connectible(False, coefficient)
 
-    def meets_end(self, f) -> mi.Bool:
-        """Mask: an SDS path with a diffuse vertex if the next one, with BSDF ``f``, is connected to the end.
+    def meets_end(self, edges: mi.UInt32, f) -> mi.Bool:
+        """Mask: a guided path if the next vertex, with BSDF ``f``, is connected to the end.
 
         The strategy is in use, so that the path is no other that is guided.
         """
-        return self.isolated & self.diffuse & is_specular(f)
+        return self.isolated & is_specular(f) & (edges + 1 >= FEWEST_EDGES)
 
 
 def meets(a: tuple, b: tuple) -> mi.Bool:
-    """Mask: an SDS path with a diffuse vertex if two subpaths are connected, by a strategy in use.
+    """Mask: a guided path if two subpaths are connected, by a strategy in use.
 
     Of each its `State`, BSDF at the vertex, and coefficient of the connection of the last edge.
     """
-    possible, specular, diffuse = mi.Bool(True), mi.Bool(False), mi.Bool(False)
+    possible, specular = mi.Bool(True), mi.Bool(False)
     for state, f, coefficient in (a, b):
         event = is_specular(f)
-        after = state.scattered(event, coefficient)
-        possible, specular, diffuse = possible & after.isolated, specular | event, diffuse | after.diffuse
-    return possible & specular & diffuse
+        possible, specular = possible & state.scattered(event, coefficient).isolated, specular | event
+    return possible & specular
 
 
 def is_specular(f) -> mi.Bool:
@@ -188,8 +190,9 @@ def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **mor
     no, possible = mi.Bool(False), mi.Bool(True)
     if light:  # s = 0 is its only alternative so far
         possible = mis.is_used(walk.partial.d_vc)
-    events = State(specular=no, diffuse=no, narrow=no)
-    return begun(walk, replace(events, isolated=possible, only_delta=possible, guided=guided), **more)
+    diffuse = None if guided is None else no
+    state = State(isolated=possible, only_delta=possible, specular=no, diffuse=diffuse)
+    return begun(walk, replace(state, guided=guided, newest=guided), **more)
 
 
 def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vm_newest: mis.PartialSum = 0):

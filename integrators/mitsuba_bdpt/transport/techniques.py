@@ -68,9 +68,9 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
     )
     sides = 0, camera_side
     if sds is not None and sds.near_specular:
-        on_sds_path = z.sds.ends(z.partial, mis.choose(directly, kernel.kappa.endpoints, direct))
+        on_sds_path = z.sds.ends(z.edges, mis.choose(directly, kernel.kappa.endpoints, direct))
         alone = h.scale(z.partial.d_vcm, newest)
-        sides = _beside_guided(kernel, z, on_sds_path, sides, alone, kernel.kappa.hit)
+        sides = _beside_guided(kernel, z.sds.guided, on_sds_path, sides, alone, kernel.kappa.hit)
         active = sds.counts(active, on_sds_path)
     elif sds is not None:
         connectible = mis.is_connectible(z.partial, newest)
@@ -88,17 +88,15 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
     return c
 
 
-def _beside_guided(
-    kernel: Kernel, z: Vertex, on_sds_path, sides: tuple, alone, own: mis.Coefficient
-) -> tuple:
+def _beside_guided(kernel: Kernel, guided, on_sds_path, sides: tuple, alone, own: mis.Coefficient) -> tuple:
     """Light and camera ``sides`` of s = 0 or s = 1, where near-specular events count as specular.
 
-    On an SDS path the only alternatives are the other of the two, ``alone``, and both from a direction at the
-    diffuse vertex by the guide (on guided subpaths: by the BSDF). ``own``: coefficient of the strategy.
+    On an SDS path the only alternatives are the other of the two, ``alone``, and both from a direction by the
+    guide, ``guided`` times as dense. ``own``: coefficient of the strategy.
     """
     h = kernel.heuristic
-    if z.guided is not None:
-        alone = h.combine(alone, h.scale(h.combine(alone, own), z.guided))
+    if guided is not None:
+        alone = h.combine(alone, h.scale(h.combine(alone, own), guided))
     return mis.choose(on_sds_path, alone, sides[0]), mis.choose(on_sds_path, 0, sides[1])
 
 
@@ -145,8 +143,9 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     camera_side = mis.alternatives(h, mis.Partial(z.partial.d_vcm, older), newest, *densities)
     ends = light_side, camera_side
     if sds is not None and sds.near_specular:
-        on_sds_path = z.sds.meets_end(f) & ~e.delta
-        ends = _beside_guided(kernel, z, on_sds_path, ends, light_side, kernel.kappa.direct)
+        on_sds_path = z.sds.meets_end(z.edges, f) & ~e.delta
+        guided = None if z.sds.guided is None else z.sds.guided_before_last(h)
+        ends = _beside_guided(kernel, guided, on_sds_path, ends, light_side, kernel.kappa.direct)
         active = sds.counts(active, on_sds_path)
     sides = kernel.kappa.direct, *ends
     weight, shares = h.weigh(*sides, merges=merges)
@@ -248,7 +247,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
         camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     if kernel.guides_near_specular:
-        active &= ~y.sds.meets_end(f)
+        active &= ~y.sds.meets_end(y.edges, f)
     merges = hard_merges(kernel, y, newest, *densities, kernel.kappa.splat)
     weight, shares = h.weigh(*sides, merges=merges)
 
@@ -300,7 +299,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     hard = h.scale(hard_merges_before_end(kernel, partial, newest, z.pdf_w), z.pdf_a)
     if kernel.guides_near_specular:
-        active &= ~walk.sds.ends(partial, newest)
+        active &= ~walk.sds.ends(walk.edges, newest)
     elif kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
         merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
         # The last edge is not connected either.

@@ -402,10 +402,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     if side.only_delta:
         active &= step.delta
     if side.only_specular:
-        specular = is_narrow(step, side.only_specular)
-        if sds is not None and sds.guided is not None:  # else another vertex guides
-            specular &= sds.diffuse
-        specular |= step.delta
+        specular = is_narrow(step, side.only_specular) | step.delta
         active &= specular if vertex.volume is None else specular & ~vertex.volume
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
     throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, stream, useful)
@@ -465,7 +462,7 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
         isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
     if only_delta is not None:
         only_delta = only_delta & step.delta
-    guided = _guided(kernel, guided, vertex, step, step.delta)
+    guided = _guided(kernel, guided, vertex, step)
     merge = None
     if side.sds is not None and not mis.is_absent(walk.partial.d_vm):
         merge = side.sds.merge(kernel, vertex, isolated)
@@ -475,27 +472,28 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
 def _near_specular(kernel: Kernel, side: Side, before: State, vertex: Vertex, coefficient, step):
     """`_sds` where near-specular events count as specular."""
     specular = step.delta | is_specular(step)
-    narrow = specular & before.may_narrow(vertex.partial, coefficient)
-    state = replace(
-        before.scattered(specular, coefficient),
-        only_delta=before.only_delta & step.delta,
-        narrow=dr.select(step.delta, before.narrow, narrow),
-        guided=_guided(kernel, before.guided, vertex, step, step.delta | (specular & before.diffuse)),
-    )
+    state = before.scattered(specular, coefficient)
+    state = replace(state, only_delta=before.only_delta & step.delta)
+    if before.guided is not None:
+        # A diffuse vertex guides alone: guided subpaths end at others.
+        guides = ~step.delta & ~(specular & before.diffuse) & (vertex.advice.other > 0)
+        newest = kernel.heuristic.start(dr.select(guides, vertex.advice.other / step.pdf_fwd_w, 0))
+        guided = dr.select(specular, before.guided_before_last(kernel.heuristic), 0)
+        state = replace(state, diffuse=before.diffuse | ~specular, guided=guided, newest=newest)
     if side.sds is None or mis.is_absent(vertex.partial.d_vm):
         return state, None
     return state, side.sds.merge(kernel, vertex, state.isolated)
 
 
-def _guided(kernel: Kernel, guided: mi.Float | None, vertex: Vertex, step, kept: mi.Bool):
-    """`State.guided` after an event; ``kept``: as before, another vertex guides.
+def _guided(kernel: Kernel, guided: mi.Float | None, vertex: Vertex, step):
+    """`State.guided` after an event; a delta event keeps it.
 
     Without advice it is kept too: guided subpaths end at other events.
     """
     if guided is None or vertex.advice is None:
         return guided
     other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
-    return dr.select(kept, guided, kernel.heuristic.start(other))
+    return dr.select(step.delta, guided, kernel.heuristic.start(other))
 
 
 def has_lobe(kernel: Kernel, vertex: Vertex) -> mi.Bool:

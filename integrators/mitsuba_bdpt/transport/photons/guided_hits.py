@@ -11,9 +11,11 @@ The weights of both contain that ratio, and so does that of t = 0, which evaluat
 first of the light subpath that is not delta.
 
 In scenes with near-specular lobes guided subpaths follow near-specular events too, and sample s = 1 as well:
-their lobes may be wider than the emitter is. Paths without a diffuse vertex are guided at the last one whose
-event is not delta, if delta events isolate it. The other strategies, t = 0 included, leave these paths out,
-see `sds`.
+their lobes may be wider than the emitter is. Paths without a diffuse vertex are guided at each one whose
+event is not delta, see `sds`. The other strategies, t = 0 included, leave these paths out.
+
+Estimates times weights are f over a sum of densities, the same for all techniques of a path (with the balance
+heuristic). So guided subpaths carry the throughput and the weight of s = 0 by the BSDF.
 """
 
 from __future__ import annotations
@@ -106,16 +108,23 @@ class Guiding(PhotonStrategy):
 
 
 class _Guided(PhotonStrategy):
-    """The same at the end of a guided subpath, whose alternative is s = 0 by the BSDF."""
+    """The same at the end of a guided subpath, which counts on SDS paths alone."""
 
-    def __init__(self, near_specular: bool):
-        self.near_specular = near_specular
+    def __init__(self, guiding: Guiding):
+        self.guiding, self.near_specular = guiding, guiding.near_specular
+
+    def advise(self, kernel, adjoint, vertex, walk, step) -> Advice:
+        """Only further vertices of a path of specular events guide too."""
+        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
+        possible &= is_specular(step) & ~walk.sds.diffuse
+        return self.guiding._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
 
     def counts(self, active, on_sds_path):
         return active & on_sds_path
 
     def hit(self, kernel, z, connectible, densities, sides, active):
-        return (_other(kernel, z, connectible), sides[1]), active & ~connectible
+        sides, active = self.guiding.hit(kernel, z, connectible, densities, sides, active)
+        return sides, active & ~connectible
 
 
 class Unguided(Guiding):
@@ -176,7 +185,7 @@ def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, sha
 
 
 def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared, add, state):
-    near_specular, guided = guiding.near_specular, _Guided(guiding.near_specular)
+    near_specular, guided = guiding.near_specular, _Guided(guiding)
     connects = near_specular and kernel.plan.direct
 
     def visit(vertex, state, walk):
@@ -186,7 +195,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
             (total, lost), rays = add(c, total, lost), [rays[0] + c.counted.shadow_s1]
         total, lost = dr.if_stmt(
             (vertex, total, lost),
-            techniques.sees_emitter(kernel, vertex),
+            techniques.sees_emitter(kernel, vertex) & (vertex.edges > first),
             lambda v, total, lost: add(techniques.hit_emitter(kernel, v, guided), total, lost),
             lambda v, total, lost: (total, lost),
             label="guided s = 0",
@@ -195,6 +204,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
 
     total, lost, aimed, traced = state
     walk = _begun(kernel, guiding, z, numbers, shared)
+    first = walk.edges
     side = Side(
         "camera",
         shared,
@@ -205,8 +215,9 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         connect=(lambda z: techniques.choose_emitter(kernel, z, numbers)) if connects else None,
         only_delta=not near_specular,
         only_specular=GUIDED if near_specular else 0,
+        sds=guided if near_specular else None,
     )
-    first, begun = walk.edges, walk.active
+    begun = walk.active
     state = (total, lost, traced) if connects else (total, lost)
     (total, lost, *rays), walk = random_walk(kernel, side, walk, numbers, visit, state)
     traced = rays[0] if connects else traced
@@ -222,11 +233,14 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     d, active = photon_guide.draw(guiding.guide, p, z.advice.found, u1, u2)
     pdf, local = guiding.density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
-    newest, specular = newest_coefficient(kernel, kernel.kappa.splat, z.edges), mi.Bool(False)
-    if guiding.near_specular:  # else another vertex is the last diffuse one
+    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    active &= f.pdf_fwd_w > 0
+    if guiding.near_specular:  # of a diffuse vertex and those after it the former guides
         specular = is_specular(f)
-        active &= ~specular | z.sds.may_narrow(z.partial, newest)
-    throughput = dr.select(active, z.throughput * f.value / pdf, 0)
+        active &= ~(specular & z.sds.diffuse)
+    ratio = h.start(dr.select(active, pdf / f.pdf_fwd_w, 0))
+    estimate = z.throughput * f.value / f.pdf_fwd_w * h.equal_weight(ratio)
+    throughput = dr.select(active, estimate, 0)
     broken = not_finite(active, throughput)
     active &= (spectra.brightest(throughput) > 0) & ~broken
     no, unit = mi.Bool(False), mi.Float(1)
@@ -235,11 +249,11 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
-    guided = h.start(dr.select(active, f.pdf_fwd_w / pdf, 0))
-    state = State(guided=guided)
+    state = State(guided=ratio)
     if guiding.near_specular:
-        state = replace(state, isolated=mi.Bool(True), only_delta=mi.Bool(False))
-        state = replace(state, specular=specular, diffuse=~specular, narrow=specular)
+        older = dr.select(specular, z.sds.guided_before_last(h), 0)
+        state = State(isolated=mi.Bool(True), only_delta=mi.Bool(False), specular=specular)
+        state = replace(state, diffuse=~specular, guided=older, newest=ratio)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
     if kernel.path_layers:
         walk = replace(walk, layer=path_layers.evaluated(z.layer, f, z.volume, adjoint=False))

@@ -29,7 +29,7 @@ from ..contribution import size_of
 from ..inputs import Kernel, Observer
 from ..plan import GUIDED
 from ..sds import is_specular
-from ..walk import Vertex, Walk, is_sds_vertex, newest_coefficient, newest_connection, random_walk
+from ..walk import Vertex, Walk, is_sds_vertex, newest_connection, random_walk
 from . import photon_guide
 from .photon import same_surface
 from .photon_guide import WINDOW, Guide
@@ -108,8 +108,7 @@ def estimate(kernel: Kernel, estimator: Estimator, z: Vertex, walk: Walk, stream
         value = _mean(z.throughput * f.value * y.flux) / cos
         active &= (value > 0) & (f.pdf_fwd_w > 0) & dr.isfinite(value)
         if kernel.near_specular:
-            newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-            active &= ~is_specular(f) | (z.sds.may_narrow(z.partial, newest) & y.only_delta)
+            active &= ~is_specular(f) | (z.sds.only_delta & y.only_delta)
         # All photons in the disc, represented by the drawn one. Double precision: radiance is squared.
         arriving = mi.Float64(value / size_of(y.flux) * total / (estimator.count * dr.pi * dr.square(radius)))
         found = [
