@@ -1251,11 +1251,11 @@ MUTANTS = (
         ("tests/images/test_guided_hits.py::test_the_guide_is_the_same_in_any_order",),
     ),
     Mutant(
-        "guided s = 0: connectible paths too",
+        "guided s = 0: connectible paths in place of the others",
         "transport/photons/guided_hits.py",
         "return sides, active & ~connectible",
-        "return sides, active",
-        ("tests/images/test_guided_hits.py::test_a_lamp_below_the_plate",),
+        "return sides, active & connectible",
+        ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
     ),
     Mutant(
         "near-specular guiding: events are judged from one side",
@@ -1317,7 +1317,7 @@ MUTANTS = (
         "active &= ~(specular & z.sds.diffuse)",
         "active &= mi.Bool(True)",
         (
-            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
+            "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n0c0-False]",
         ),
     ),
     Mutant(
