@@ -14,7 +14,7 @@ MOST = {
     "planning": 2780,
     "emitters": 2680,
     "cli": 1811,
-    "media": 1469,
+    "media": 1430,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,

@@ -6,9 +6,8 @@ declares a medium.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from functools import cache
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -24,72 +23,36 @@ def representatives(media: list[mi.Medium], answers: Callable[[mi.Medium], np.nd
 
     ``answers(medium)``: extinction, scattering and phase function at random points and directions.
 
-    Equal media have the same structure (`_structure`), the same values, and the same answers up to rounding.
-    Constants count by the answers alone, since only their product matters. Varying volumes equal only
+    Equal media have the same classes and parameters, and the same answers up to rounding. Constants count by
+    the answers alone, since only their product matters. Varying volumes and plugins in Python equal only
     themselves: Mitsuba exposes neither a grid's filter nor its wrap mode.
     """
-    structures = [_structure(medium) for medium in media]
+    keys = [(medium.use_emitter_sampling(), *_key(medium)) for medium in media]
     answered = cache(lambda index: answers(media[index]))
     found: list[int] = []
-    for index, medium in enumerate(media):
-        alike = (i for i in range(index) if found[i] == i and _same(structures[i], structures[index]))
+    for index, key in enumerate(keys):
         equal = (
             i
-            for i in alike
-            if _have_same_values(media[i], medium)
+            for i in range(index)
+            if keys[i] == key
             and np.allclose(answered(i), answered(index), rtol=_ROUNDING, atol=0, equal_nan=True)
         )
         found.append(next(equal, index))
     return found
 
 
-def _same(structure: tuple | None, other: tuple | None) -> bool:
-    return structure is not None and structure == other
-
-
-def _structure(medium: mi.Medium) -> tuple | None:
-    """Classes and volumes of a medium and its descendants; None with Python plugins."""
-    parts = list(_held(medium, "medium"))
+def _key(owner: mi.Object) -> Iterator[Hashable]:
+    """Yield what an equal object has in common with ``owner``, its descendants included."""
+    varies = isinstance(owner, mi.Volume) and owner.class_name() != "ConstVolume"
     # Objects of Mitsuba's own plugins have exactly these types, Python plugins derived ones.
-    if any(type(owner) not in (mi.Medium, mi.Volume, mi.PhaseFunction) for _, owner in parts):
-        return None
-    of_parts = (
-        (path, owner.class_name(), owner if _varies(owner) else None, *_shapes(owner))
-        for path, owner in parts
-    )
-    return (medium.use_emitter_sampling(), *of_parts)
-
-
-def _held(owner: mi.Object, path: str) -> Iterator[tuple[str, mi.Object]]:
-    """Yield ``owner`` and its descendants with paths; volumes are not descended into."""
-    yield path, owner
+    of_python = type(owner) not in (mi.Medium, mi.Volume, mi.PhaseFunction)
+    yield owner if varies or of_python else owner.class_name()
     if isinstance(owner, mi.Volume):
         return
-    for name, value in children(owner).items():
+    product = isinstance(owner, mi.Medium) and owner.is_homogeneous()
+    for name, value in own_parameters(owner).items():
+        if not (product and name == "scale"):
+            yield name, np.array(value).tobytes()
+    for value in children(owner).values():
         if isinstance(value, mi.Object):
-            yield from _held(value, f"{path}.{name}")
-
-
-def _varies(owner: mi.Object) -> bool:
-    return isinstance(owner, mi.Volume) and owner.class_name() != "ConstVolume"
-
-
-def _values(owner: mi.Object) -> dict[str, Any]:
-    """Parameters of ``owner`` in which it may differ from an equal structure."""
-    if isinstance(owner, mi.Volume):
-        return {}
-    skipped = "scale" if isinstance(owner, mi.Medium) and owner.is_homogeneous() else ""
-    return {name: value for name, value in own_parameters(owner).items() if name != skipped}
-
-
-def _shapes(owner: mi.Object) -> list[tuple]:
-    return [(name, np.shape(value)) for name, value in _values(owner).items()]
-
-
-def _have_same_values(a: mi.Medium, b: mi.Medium) -> bool:
-    """Whether two media of one structure have the same values, volumes aside."""
-    return all(
-        np.array_equal(np.array(ours), np.array(theirs), equal_nan=True)
-        for (_, one), (_, other) in zip(_held(a, ""), _held(b, ""), strict=True)
-        for ours, theirs in zip(_values(one).values(), _values(other).values(), strict=True)
-    )
+            yield from _key(value)
