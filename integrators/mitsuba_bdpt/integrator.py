@@ -205,8 +205,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         if spp:
             render = render.decided()
         planner, table = render.planner, render.table
-        confidence = planner.confidence(render.passes) if table else 0.0
-        invalid = planner.lost_by_pilots()
+        confidence, invalid = planner.confidence(), planner.decided.non_finite
         warning = render.explained_warning(spp is not None).removeprefix(UsageError.prefix)
         plan = replace(render.plan, skipped=(*render.plan.skipped, *render.skipped))
         if plan.merging:

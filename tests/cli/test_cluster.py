@@ -22,7 +22,7 @@ from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.loading import load
-from mitsuba_bdpt.planning.planner import Planner
+from mitsuba_bdpt.planning.moments import Moments
 from mitsuba_bdpt.workers import connected, results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
@@ -112,10 +112,7 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
     values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
     pilot that the client asked; with decisions by hand there are none."""
-    lost = Planner.lost_by_pilots
-    monkeypatch.setattr(
-        Planner, "lost_by_pilots", lambda self: lost(self) + 7 * (self.decided.pilots.requested > 0)
-    )
+    monkeypatch.setattr(Moments, "non_finite", 7)
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
     statistics = rendered.image(tmp_path / "a.exr", "RGB")[1]
     seconds = statistics["seconds"]

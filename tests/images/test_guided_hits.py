@@ -297,7 +297,7 @@ def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
     def parts(guidable, guiding):
         plan, seed = replace(render.plan, guidable=guidable), mi.UInt32(1)
         found = pilot.measure(render.prepared, plan, render.settings, seed, 1 << 14, guiding=guiding)
-        return np.count_nonzero(found.base[:, 0])
+        return np.count_nonzero(found.variance[:, 0])
 
     assert max(parts(True, True), parts(True, False)) <= parts(False, True) / 2
 
@@ -311,21 +311,18 @@ def test_a_gain_has_to_pay_in_most_of_a_pilot(guided, groups, chosen):
     else, is chosen, which gains 5, and guiding that leaves 8 is not, in words; nor the former if fewer than
     three quarters of the pilot's groups gain it.
     """
-    none, sds = np.zeros((GROUPS, len(CANDIDATES))), np.zeros((GROUPS, 2))
+    ones, sds = np.ones((GROUPS, len(CANDIDATES))), np.zeros((GROUPS, 2))
     sds[:groups] = [9.0, guided]
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0)
     rays |= {"guidable": 0.05}
-    others = dict.fromkeys(("rare", "light", "draw"), none) | {"missing": none[0]}
-    others["hidden"] = np.zeros((GROUPS, 3, len(CANDIDATES)))
-    ones = np.ones(len(CANDIDATES))
-    moments = Moments(base=none + 1, **others, sds=sds, gain=ones, mean=1.0, rays=rays, lanes=4096)
+    moments = Moments(ones, ones, sds, mean=1.0, rays=rays, lanes=4096)
     possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]
-    alternatives = Alternatives(possible, True, guidable=True)
+    alternatives = Alternatives(possible, guidable=True)
     table = choice.choose(moments, alternatives)
     assert table[0].candidate.guided == (GUIDED if chosen else 0)
     skipped = choice.left_out(table, choice.guided_gain(moments, alternatives, table))
     assert bool(skipped) == (not chosen) and all("gains" in row["why"] for row in skipped)
-    assert not choice.choose(moments, Alternatives(possible, True))[0].candidate.guided
+    assert not choice.choose(moments, Alternatives(possible))[0].candidate.guided
 
 
 def test_each_part_of_a_pilot_sees_the_whole_film():

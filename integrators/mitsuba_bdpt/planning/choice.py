@@ -1,7 +1,7 @@
 """Chooses the most efficient configuration from a pilot's statistics.
 
-Minimises cost times error. The error is the larger of two, relative to path tracing alone: that of the mean
-render and of a typical one (`Moments.variance`, `Moments.typical`): most renders lack the rarest outliers.
+Minimises cost times error. The error is the geometric mean of that of the mean render and of a typical one
+(`Moments.variance`, `Moments.typical`): most renders lack the rarest outliers.
 Costs are counted, not timed (see `COSTS`): equal seeds give equal decisions on all machines.
 """
 
@@ -10,12 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..transport.plan import GUIDED, EmissionTables
-from .configuration import Configuration, Decision, not_worth
+from ..transport.plan import GUIDED
+from .configuration import PATH_TRACING, Configuration, Decision, not_worth
 from .moments import GROUPS, Moments
+
+if TYPE_CHECKING:
+    from ..guided_emission import Learnt
 
 # Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
 # experiments, "Costs".
@@ -53,9 +57,13 @@ def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = m
     return total / camera
 
 
-# Factor by which light subpaths have to shorten the time, since predictions are inexact; see experiments,
-# "Choice of strategies".
+# Factor by which all but `PATH_TRACING` have to shorten the time, since predictions are inexact; see
+# experiments, "Choice of strategies".
 REQUIRED_GAIN = 1.1
+
+# Tables of emission leave this power of `Learnt.whole`, which is that of all strategies together, without
+# inner connections; see experiments, "Choice of strategies".
+TABLES_ALONE = 0.7
 
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
@@ -78,15 +86,15 @@ LEAST_VARIANCE = 1e-4
 class Alternatives:
     """The ``candidates`` for a render with ``samples`` samples still to come.
 
-    ``stratified``: whether its points are stratified, see `moments.Moments.variance`; ``guidable``: whether
-    photon-guided BSDF sampling is possible; ``near_specular``: the scene has near-specular lobes.
+    ``guidable``: whether photon-guided BSDF sampling is possible; ``near_specular``: the scene has
+    near-specular lobes; ``learnt``: tables of emission, with which light subpaths are traced.
     """
 
     candidates: list[Configuration]
-    stratified: bool
     samples: float = math.inf
     guidable: bool = False
     near_specular: bool = False
+    learnt: Learnt | None = None
 
     @property
     def guide_gain(self) -> float:
@@ -96,11 +104,10 @@ class Alternatives:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The predicted efficiency of a candidate.
+    """The predicted efficiency of a candidate, guided emission included.
 
-    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample including the
-    stratification gain, without SDS paths where s = 0 can be guided; ``gain``: see `guided_gain`;
-    ``without_tables``: the figures do not include guided emission.
+    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample, without SDS
+    paths where s = 0 can be guided; ``gain``: see `guided_gain`.
     """
 
     candidate: Configuration
@@ -108,7 +115,6 @@ class Prediction:
     error: float
     variance: float
     gain: float = 1.0
-    without_tables: bool = False
 
     @property
     def time(self) -> float:
@@ -117,15 +123,8 @@ class Prediction:
 
     @property
     def score(self) -> float:
-        """The quantity that the choice minimises: `time`, with light subpaths times `REQUIRED_GAIN`."""
-        return self.time * (REQUIRED_GAIN if self.candidate.light_paths else 1)
-
-    def with_emission(self, tables: EmissionTables, without_tables: bool) -> Prediction:
-        """The same with emission guided by ``tables``, if it has light subpaths."""
-        if not self.candidate.light_paths:
-            return self
-        candidate = replace(self.candidate, emission=tables)
-        return replace(self, candidate=candidate, without_tables=without_tables)
+        """The quantity that the choice minimises: `time`, but for `PATH_TRACING` times `REQUIRED_GAIN`."""
+        return self.time * (REQUIRED_GAIN if self.candidate != PATH_TRACING else 1)
 
     def decided(self, mean: float) -> Decision:
         """The candidate's decision; ``mean`` of the image."""
@@ -163,7 +162,7 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
         return None
     candidate = replace(lit.candidate, guided=GUIDED)
     each = cost(candidate, moments.rays, alternatives.samples)
-    others = _by_group(moments.variance(alternatives.stratified), [table[0].candidate, lit.candidate])
+    others = _by_group(moments.variance, [table[0].candidate, lit.candidate], alternatives.learnt)
     best, variance = np.maximum(others, LEAST_VARIANCE).T
     best = np.minimum(best, variance * table[0].error / lit.error)  # not what light subpaths do without it
     unguided, guided = moments.sds.T
@@ -174,42 +173,37 @@ def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction
 
 def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first."""
-    variances = moments.variance(alternatives.stratified), moments.typical(alternatives.stratified)
-    both = [_by_group(values, alternatives.candidates).mean(axis=0) for values in variances]
-    possible = np.flatnonzero(np.isfinite(both[0])).tolist()
-    if not possible:
-        return []
-    candidates = [alternatives.candidates[i] for i in possible]
-    both = np.maximum(np.stack(both)[:, possible], LEAST_VARIANCE)
-    costs = np.array([cost(candidate, moments.rays, alternatives.samples) for candidate in candidates])
-    light = np.array([candidate.light_paths > 0 for candidate in candidates])
-    errors = _errors(both, costs, light)
-    rows = zip(candidates, costs.tolist(), errors.tolist(), both[0].tolist(), strict=True)
-    return sorted((Prediction(*row) for row in rows), key=lambda row: row.score)
+    candidates, learnt = alternatives.candidates, alternatives.learnt
+    both = (
+        np.maximum(_by_group(values, candidates, learnt).mean(axis=0), LEAST_VARIANCE)
+        for values in (moments.variance, moments.typical)
+    )
+    rows = [
+        Prediction(_with_tables(c, learnt), cost(c, moments.rays, alternatives.samples), (v * t) ** 0.5, v)
+        for c, v, t in zip(candidates, *(values.tolist() for values in both), strict=True)
+        if math.isfinite(v)
+    ]
+    alone = [row.error for row in rows if not row.candidate.light_paths]
+    unit = min(alone or [row.error for row in rows], default=1.0)
+    return sorted((replace(row, error=row.error / unit) for row in rows), key=lambda row: row.score)
 
 
-def _errors(both: np.ndarray, costs: np.ndarray, light: np.ndarray) -> np.ndarray:
-    """The larger error of each candidate, relative to path tracing alone; ``both`` errors, shape (2, n).
-
-    Of candidates with ``light`` subpaths, which are ranked by the ratios to the least errors among them, the
-    best has that error: where path tracing alone has next to no chance, its ratios would not tell them apart.
-    """
-    if light.all() or not light.any():
-        return (both / both.min(axis=1, keepdims=True)).max(axis=0)
-    alone = both[:, ~light][:, [both[:, ~light].prod(axis=0).argmin()]]
-    errors = (both / alone).max(axis=0)
-    ranks = (both[:, light] / both[:, light].min(axis=1, keepdims=True)).max(axis=0)
-    best = (costs[light] * ranks).argmin()
-    errors[light] = ranks * (errors[light][best] / ranks[best])
-    return errors
+def _with_tables(candidate: Configuration, learnt: Learnt | None) -> Configuration:
+    """The candidate with tables of emission, if there are any and it has light subpaths."""
+    return replace(candidate, emission=learnt.tables) if learnt and candidate.light_paths else candidate
 
 
-def _by_group(variances: np.ndarray, candidates: list[Configuration]) -> np.ndarray:
+def _by_group(variances: np.ndarray, candidates: list[Configuration], learnt: Learnt | None) -> np.ndarray:
     """Those of ``candidates`` of all ``variances`` by group of the pilot, shape (`GROUPS`, candidates).
 
-    At least 0: an estimate may be negative, and one such group would make a candidate the best.
+    At least 0: an estimate may be negative, and one such group would make a candidate the best. Times what
+    tables of emission leave.
     """
-    return np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)
+    found = np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)
+    if learnt is None or learnt.tables is None:
+        return found
+    powers = [(1 if c.connections != "none" else TABLES_ALONE) if c.light_paths else 0 for c in candidates]
+    return found * learnt.whole ** np.array(powers)
 
 
 def confidence(moments: Moments, alternatives: Alternatives) -> float:
@@ -237,7 +231,8 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
         return ""
     if chosen.candidate.guided and not row.candidate.guided:
         return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
-    return f"light subpaths have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
+    what = "light subpaths" if row.candidate.light_paths else "other weights"
+    return f"{what} have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
 
 
 def left_out(

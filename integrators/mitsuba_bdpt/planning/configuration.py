@@ -81,11 +81,13 @@ class Configuration:
         return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)
 
 
+PATH_TRACING = Configuration(0.0, "none", 1.0, 1.0)
+
 # Configurations of which a pilot estimates variances. Each class of strategies, once in use, stays in use; in
 # the last one strategies have the pilot's own weights. See experiments, "Choice of strategies".
 CANDIDATES = (
     Configuration(0.0, "none", 1.0, 1 / 2),
-    Configuration(0.0, "none", 1.0, 1.0),
+    PATH_TRACING,
     Configuration(1 / 2, "none", 1 / 8, 1.0),
     Configuration(1 / 2, "none", 1 / 2, 1.0),
     Configuration(1.0, "none", 1 / 4, 1.0),

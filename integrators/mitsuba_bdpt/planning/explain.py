@@ -138,7 +138,8 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         "pilot: predictions, the chosen configuration first (time to the same error; cost and error relative "
     )
     lines = [
-        head + "to path tracing alone; error: the larger relMSE, of the mean render or of a typical one)",
+        head
+        + "to path tracing alone; error: geometric mean of the relMSE of the mean render and a typical one)",
         "  relative time  cost per sample     error  configuration",
     ]
     for row in table:
@@ -150,8 +151,6 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
             f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of SDS paths, which none of "
             "these figures has"
         )
-    if table[0].without_tables:
-        lines.append("  guided emission is in none of these figures")
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
     lines.append(

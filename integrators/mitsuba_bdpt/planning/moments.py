@@ -1,4 +1,4 @@
-"""Statistics of a pilot: variances of all candidates, and stratification gains.
+"""Statistics of a pilot: variances of all candidates.
 
 NumPy arithmetic on the arrays of a `pilot.Pilot`, whose module has the equations. `SAMPLE` and `SPLAT` are
 the rows that a pilot stores.
@@ -15,7 +15,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..transport import mis
-from ..transport.batch import NET, NETS
 from .configuration import CANDIDATES
 
 if TYPE_CHECKING:
@@ -60,8 +59,8 @@ _SEVERAL = [number for number, candidate in enumerate(CANDIDATES) if candidate.j
 # Per camera sample, for each candidate: estimate, and second moments of contributions without t<=1, less
 # their squares; for each candidate with t<=1 the second moments due to t<=1; for each candidate with inner
 # connections the variance of drawing one; fourth moments of the contributions of all classes, less their
-# fourth powers; for each of `_SEVERAL` the sum of the inner connections. Then the tile; in scenes with media
-# the number of evaluated pairs, else 0.
+# fourth powers; for each of `_SEVERAL` the sum of the inner connections. Then the light that the last
+# candidate finds, and the tile; in scenes with media the number of evaluated pairs, else 0.
 SAMPLE = Layout(
     {
         "estimate": len(CANDIDATES),
@@ -70,21 +69,20 @@ SAMPLE = Layout(
         "draw": _USERS["inner"],
         "peak": len(CANDIDATES),
         "several": len(_SEVERAL),
+        "brightness": 1,
         "tile": 1,
         "evaluated": 1,
     }
 )
 
 # Parts of `SAMPLE` that are sums over contributions.
-SUMS = ("estimate", "moment", "light", "draw", "peak", "several")
+SUMS = ("estimate", "moment", "light", "draw", "peak", "several", "brightness")
 
-# Size of splats, their second moments without t <= 1, the rare part of these (see `pilot.SELDOM`), their
-# second moments due to t <= 1, and fourth powers.
+# Size of splats, their second moments without t <= 1, those due to t <= 1, and fourth powers.
 SPLAT = Layout(
     {
         "size": 1,
         "moment": len(CANDIDATES),
-        "rare": len(CANDIDATES),
         "light": _USERS["light"],
         "peak": len(CANDIDATES),
     }
@@ -100,9 +98,6 @@ EMISSION_TILES = 4
 # Independent parts of the pilot, for resampling.
 GROUPS = 16
 
-# Least stratification gain that this number of nets can resolve.
-LEAST_GAIN = 1e-3
-
 # Least number of camera samples per pixel; their products estimate the squared mean.
 PER_PIXEL = 2
 
@@ -114,66 +109,36 @@ TRIMMED = 1e-3
 RULED_OUT = 1e15
 
 # Fields of `Moments` with a row per group.
-_OF_GROUPS = ("base", "rare", "light", "draw", "hidden", "sds")
+_OF_GROUPS = ("variance", "typical", "sds")
 
 
 @dataclass(frozen=True)
 class Moments:
     """What a pilot measured: relative squared error per sample and pixel.
 
-    Variance with independent numbers: ``base`` + ``light`` + ``draw``.
-
-    * ``base``, ``rare``, ``light``, ``draw``: shape (`GROUPS`, candidates). ``rare``: the part of ``base`` on
-      paths too rare for stratification; ``light``: of splats; ``draw``: by drawing one inner connection.
-    * ``hidden``, shape (`GROUPS`, 3, candidates): parts of ``base``, ``rare`` and ``light`` in contributions
-      that fewer than `TRIMMED` of the pixels receive; ``missing`` by candidate: the squared error of a render
-      without them, per sample.
-    * ``gain`` by candidate: the factor that the points of a net leave of ``base`` - ``rare``.
+    * ``variance``, shape (`GROUPS`, candidates): the mean of the squared errors of many renders.
+    * ``typical``: the same of a typical render, in which contributions that fewer than `TRIMMED` of the
+      pixels receive are missing.
     * ``sds``, shape (`GROUPS`, 2): variance of SDS paths on which s = 0 can be guided, excluded from all
       others: unguided and guided (no columns: not measured).
-    * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
     * ``rays``: rays and connections per camera sample by kind, with one light subpath each.
     * ``lanes``: number of camera samples.
+    * ``emission``: emission statistics, see `_of_tiles` (no cells: none).
     """
 
-    base: np.ndarray
-    rare: np.ndarray
-    light: np.ndarray
-    draw: np.ndarray
-    hidden: np.ndarray
-    missing: np.ndarray
+    variance: np.ndarray
+    typical: np.ndarray
     sds: np.ndarray
-    gain: np.ndarray
     mean: float
     rays: dict[str, float]
     lanes: int
     emission: np.ndarray = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
-    def variance(self, stratified: bool = False) -> np.ndarray:
-        """Relative variance per sample, shape (`GROUPS`, candidates); with the stratification gain or not.
-
-        It is the mean of the squared errors of many renders.
-        """
-        # Not of splats, which land in pixels by chance; see experiments, "Choice of strategies".
-        gain = self._left_by_points() if stratified else 1.0
-        return self.rare + gain * (self.base - self.rare) + self.draw + self.light
-
-    def typical(self, stratified: bool = False) -> np.ndarray:
-        """Like `variance`, of a typical render: trimmed, in which rare contributions are missing."""
-        base, rare, light = self.hidden.swapaxes(0, 1)
-        shown = replace(self, base=self.base - base, rare=self.rare - rare, light=self.light - light)
-        return shown.variance(stratified) + self.missing
-
-    def _left_by_points(self) -> float:
-        """Stratification gain of the points of a pixel.
-
-        Extrapolates that of nets of `NET` points, mean over the candidates, to 64; see experiments, "Choice
-        of strategies".
-        """
-        possible = np.isfinite(self.base).all(axis=0)
-        gain = float(self.gain[possible].mean()) if possible.any() else 1.0
-        return gain ** (1.35 + gain)
+    @property
+    def non_finite(self) -> int:
+        """Number of non-finite values, counted as zero."""
+        return round(self.rays["non_finite"] * self.lanes)
 
     def of(self, groups: np.ndarray) -> Moments:
         """The moments of the groups with these indices."""
@@ -186,8 +151,8 @@ class Samples:
 
     ``estimate`` by candidate; sums of second moments (``moment`` without t <= 1, less the squares that are in
     the estimate, ``light`` due to t <= 1); ``draw``: variance of drawing one connection; ``peak``: fourth
-    moments, less the powers in the estimate; ``several``: inner connections of `_SEVERAL`; fine ``tile``.
-    Each `PER_PIXEL` consecutive samples are of one pixel; in nets each `NETS` times `NET`.
+    moments, less the powers in the estimate; ``several``: inner connections of `_SEVERAL`; ``brightness``:
+    the last candidate's light; fine ``tile``. Each `PER_PIXEL` consecutive samples are of one pixel.
     """
 
     estimate: np.ndarray
@@ -196,13 +161,15 @@ class Samples:
     draw: np.ndarray
     peak: np.ndarray
     several: np.ndarray
+    brightness: np.ndarray
     tile: np.ndarray
 
     @staticmethod
     def of_rows(rows: np.ndarray) -> Samples:
         """Parse rows of `SAMPLE`."""
         found = {f.name: SAMPLE.of(rows, f.name) for f in fields(Samples)}
-        return Samples(**found | {"tile": found["tile"][:, 0].astype(int)})
+        single = {"brightness": found["brightness"][:, 0], "tile": found["tile"][:, 0].astype(int)}
+        return Samples(**found | single)
 
 
 @dataclass(frozen=True)
@@ -253,14 +220,13 @@ class SDSLight:
 
 def moments(
     samples: Samples,
-    nets: Samples | None,
     splats: Splats,
     rays: dict[str, float],
     spp: float,
     sds: SDSLight | None = None,
     emission: np.ndarray | None = None,
 ) -> Moments:
-    """The moments of a pilot of independent ``samples`` and ``nets`` for a render of ``spp`` per pixel.
+    """The moments of a pilot for a render of ``spp`` samples per pixel.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
     ``sds`` light is in no sample; ``emission``: see `guided_emission.EmissionStatistics`.
@@ -276,13 +242,10 @@ def moments(
     weighted = np.matmul(of_group, splats.sums)[:, 0] * (GROUPS / splats.lanes)
     of_sample = inverse[groups % 2, samples.tile][:, None]
 
-    def summed(values: np.ndarray | None, of_splats: str | None = None) -> np.ndarray:
+    def summed(values: np.ndarray, of_splats: str | None = None) -> np.ndarray:
         """Sums by group and candidate; candidates without ``values`` come first."""
-        total = SPLAT.of(weighted, of_splats) if of_splats else weighted[:, :0]
-        if values is not None:
-            of_samples = _by_group(values * of_sample) * (GROUPS / count)
-            total = of_samples + (total if total.shape[1] else 0)
-        return _padded(total, width)
+        total = _by_group(values * of_sample) * (GROUPS / count)
+        return _padded(total + SPLAT.of(weighted, of_splats) if of_splats else total, width)
 
     of_sds = np.zeros((GROUPS, 2))
     if sds is not None:
@@ -293,22 +256,18 @@ def moments(
         # As if all of their variance were that of the light subpaths.
         own, several = samples.several[:, i : i + 1], CANDIDATES[candidate].counts["inner"]
         squares[:, [candidate]] += (1 - 1 / several) * own * _other(own)
-    base = summed(squares, "moment")
+    variance = summed(squares, "moment") + summed(samples.light, "light") + summed(samples.draw)
+    variance = np.where(variance < RULED_OUT, variance, np.inf)
     hidden, missing = _hidden(samples, squares, splats, inverse, spp)
-    by_group = _by_group(estimate[:, -1:])[:, 0] / count + sizes.sum(axis=1)
+    by_group = _by_group(samples.brightness[:, None])[:, 0] / count + sizes.sum(axis=1)
     return Moments(
-        base=np.where(base < RULED_OUT, base, np.inf),
-        rare=summed(None, "rare"),
-        light=summed(samples.light, "light"),
-        draw=summed(samples.draw),
-        hidden=hidden,
-        missing=missing,
+        variance=variance,
+        typical=variance - hidden + missing,
         sds=of_sds,
         emission=_of_tiles(emission, samples, sizes.sum(axis=0)),
-        gain=_gain(nets.estimate, inverse[0, nets.tile]) if nets else np.ones(width),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
-        lanes=count + (len(nets.tile) if nets else 0),
+        lanes=count,
     )
 
 
@@ -327,8 +286,9 @@ def _second(samples: Samples, power: int = 2) -> np.ndarray:
 def _hidden(
     samples: Samples, squares: np.ndarray, splats: Splats, inverse: np.ndarray, spp: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`Moments.hidden` and `Moments.missing`; ``squares`` of the camera samples as in ``base``.
+    """The variance in contributions that a typical render lacks, and the squared error of lacking them.
 
+    By group and candidate, and by candidate; ``squares`` of the camera samples as in `Moments.variance`.
     Camera samples and cells of splats count as contributions of one size each: of second moment m and fourth
     p they have the squared size p / m and the rate m^2 / p. Those of the largest squared error, up to a rate
     of `TRIMMED` per pixel, are hidden. Their light is taken to lie in the fine tiles that the pilot met.
@@ -346,18 +306,17 @@ def _hidden(
     light = contributions(samples.light, "light")
     second = contributions(_second(samples), "moment") + light
     fourth = contributions(_second(samples, 4), "peak", 2)
-    parts = contributions(squares, "moment"), contributions(np.zeros_like(squares), "rare"), light
+    part = contributions(squares, "moment") + light
     tile = np.concatenate((samples.tile, np.tile(np.arange(FINE**2), GROUPS)))
     of_group = np.concatenate((groups, np.repeat(np.arange(GROUPS), FINE**2)))
-    hidden, missing = np.zeros((GROUPS, len(parts), width)), np.zeros(width)
+    hidden, missing = np.zeros((GROUPS, width)), np.zeros(width)
     for c in range(width):
         real = np.flatnonzero((second[:, c] > 0) & (fourth[:, c] > 0) & np.isfinite(fourth[:, c]))
         m, p = second[real, c], fourth[real, c]
         order = np.argsort(-p / m, kind="stable")
         rare = order[np.cumsum((m**2 / p)[order]) * spp < TRIMMED]
         where = real[rare]
-        for i, part in enumerate(parts):
-            hidden[:, i, c] = np.bincount(of_group[where], part[where, c], GROUPS) * GROUPS
+        hidden[:, c] = np.bincount(of_group[where], part[where, c], GROUPS) * GROUPS
         missed = np.bincount(tile[where], m[rare] * np.sqrt(m[rare] / p[rare]), FINE**2) * FINE**2
         missing[c] = spp * np.mean(missed**2)
     return hidden, missing
@@ -380,7 +339,7 @@ def _of_tiles(emission: np.ndarray | None, samples: Samples, splats: np.ndarray)
     def over_tiles(values: np.ndarray) -> np.ndarray:
         return _sums_of_blocks(values, EMISSION_TILES).ravel()
 
-    last = samples.estimate[:, -1]
+    last = samples.brightness
     counts = over_tiles(np.bincount(samples.tile, minlength=FINE**2).astype(float))
     brightness = over_tiles(np.bincount(samples.tile, last, FINE**2)) / np.maximum(counts, 1)
     brightness += over_tiles(splats) * EMISSION_TILES**2
@@ -409,7 +368,7 @@ def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray
     samples, given by ``half`` (0 or 1), the brightness is that of the other half: an outlier would hide
     itself. ``splats``: shares of the halves in the image, shape (2, tiles).
     """
-    last = samples.estimate[:, -1]
+    last = samples.brightness
     place = half * FINE**2 + samples.tile
     counts = np.bincount(place, minlength=2 * FINE**2).reshape(2, FINE, FINE).astype(float)
     sums = np.bincount(place, last, 2 * FINE**2).reshape(2, FINE, FINE)
@@ -418,7 +377,7 @@ def _norms(samples: Samples, half: np.ndarray, splats: np.ndarray) -> np.ndarray
     coarse += _over_blocks(splats.sum(axis=0)) / (FINE // TILES) ** 2
     floor = 0.01 * coarse.mean() ** 2
     # Weight of the larger tile against a tile's own samples: their noise.
-    square = last**2 + samples.moment[:, -1] - last * _other(samples.estimate)[:, -1]
+    square = last**2 + samples.moment[:, -1] - last * _other(last[:, None])[:, 0]
     first = (coarse**2 + floor).ravel()[samples.tile]
     noise = np.sum(square / np.where(first > 0, first, np.inf)) / len(last)
     least = 2 * max(noise, 1e-3)
@@ -450,20 +409,3 @@ def _with_neighbours(values: np.ndarray) -> np.ndarray:
     padded = np.pad(values, 1)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]
-
-
-def _gain(estimate: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Variance of a sample in a net over that of an independent one, at most 1.
-
-    By candidate. ``estimate`` of the samples in nets, ``inverse`` of their norms. Unbiased: the squared
-    difference of two nets' means is twice the variance of a mean; the mean square less the product of the two
-    means is the variance of a sample.
-    """
-    width = estimate.shape[1]
-    nets = estimate.reshape(-1, NETS, NET, width)
-    first, second = nets.mean(axis=2).transpose(1, 0, 2)
-    inverse = inverse.reshape(len(nets), -1)[:, :1]
-    alone = ((nets**2).mean(axis=(1, 2)) - first * second) * inverse
-    within = NET * (first - second) ** 2 / 2 * inverse
-    alone, within = alone.sum(axis=0), within.sum(axis=0)
-    return np.clip(np.where(alone > 0, within / np.where(alone > 0, alone, 1), 1), LEAST_GAIN, 1)

@@ -3,8 +3,7 @@
 docs/method/skipping.md derives the second moment of a candidate of `CANDIDATES` from samples that use all
 strategies (S = 1, all inner connections, balance heuristic with kappa = 1); symbols are as there. The
 candidate's own estimate of a path is (w f / p) kappa_own / (n_own sum_i kappa_i s_i). The samples use neither
-roulette nor a drawn connection; unshadowed contributions give the variance of the draw. Half of the samples
-lie in pairs of nets of one pixel, which measure the stratification gain (`moments.Moments.gain`).
+roulette nor a drawn connection; unshadowed contributions give the variance of the draw.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from ..sampling.points import Points
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import connections, mis
-from ..transport.batch import NET, NETS, Batch
+from ..transport.batch import Batch
 from ..transport.contribution import COUNTERS, Counters
 from ..transport.inputs import Kernel
 from ..transport.kernel import trace
@@ -68,16 +67,12 @@ RAREST = 1024
 # 1e-20 between points of one plane, and densities that are 0 in single precision.
 LOST = 1e30
 
-# One in NET_SHARE of a pilot's camera samples is in a net.
-NET_SHARE = 2
-
 # Light subpaths per camera sample, most without one: they are cheap, and few hit a small caster of a caustic.
 LIGHT_TIMES = 4
 
-# Paths of light tracing that camera subpaths sample less than once in SELDOM times as often as the pilot do
-# not gain from stratification: fewer than one falls into a net.
-SELDOM = 16
-
+# What Sobol' points leave of the variance of direct illumination (paths of two edges) due to camera samples:
+# they stratify few dimensions well. See experiments, "Choice of strategies".
+DIRECT = 1 / 64
 
 # Lanes that run a loop together.
 PACKET = 16
@@ -95,8 +90,8 @@ _OF_LIGHT = ("light", "shadow_t1")
 class Pilot:
     """Sink (see `image.sink`) of a pilot's contributions, with or without ``media``.
 
-    In a ``batch`` each `PER_PIXEL` consecutive camera samples are of one pixel, in nets each `batch.NETS`
-    times `batch.NET`. ``emission`` accumulates emission statistics.
+    In a ``batch`` each `PER_PIXEL` consecutive camera samples are of one pixel. ``direct``: see `DIRECT`;
+    ``emission`` accumulates emission statistics.
     """
 
     alpha = False
@@ -106,6 +101,7 @@ class Pilot:
         region: Region,
         batch: Batch,
         rarest: float,
+        direct: float = 1.0,
         media: bool = False,
         emission: EmissionStatistics | None = None,
     ):
@@ -113,7 +109,7 @@ class Pilot:
         # Weight of a splat relative to a camera sample.
         self._weight = batch.size / batch.lanes
         self._region, self._lanes, self._media = region, batch.lanes, media
-        self._first_net = batch.pixels * batch.samples
+        self._direct = direct
         self._least = dr.opaque(mi.Float64, 1 / rarest)
         self._samples = dr.zeros(mi.Float64, batch.size * SAMPLE.width)
         self._splats = dr.zeros(mi.Float64, GROUPS * FINE**2 * SPLAT.width)
@@ -129,7 +125,7 @@ class Pilot:
         size = self._size(c)
         self._add_emission(c, size, start.position, c.active)
         own, squares = self._parts(size, c)
-        new = {"estimate": own, **squares}
+        new = {"estimate": own, **squares, "brightness": [size]}
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
     def connect(
@@ -167,6 +163,7 @@ class Pilot:
         # In the order of `begin`, as the state of a loop requires.
         found |= {"estimate": _sums(total["estimate"], seen), "draw": draw}
         found["several"] = _sums(total["several"], several)
+        found["brightness"] = _sums(total["brightness"], seen[-1:])
         if self._media:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
@@ -176,7 +173,7 @@ class Pilot:
         size = self._size(c)
         row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + tile_of(self._region, c.position)
         _, found = self._parts(size, c)
-        found = {"size": [size], "rare": self._rare(size, c, found["moment"]), **found}
+        found = {"size": [size], **found}
         _add(self._splats, SPLAT, found, row, size > 0)
         self._add_emission(c, size * np.sqrt(self._weight), c.position, c.active)
         return Counters()
@@ -193,9 +190,7 @@ class Pilot:
     def _add_emission(self, c: Contribution, size: mi.Float64, position: mi.Point2f, active: mi.Bool):
         if self._emission is not None:
             lane = dr.arange(mi.UInt32, self._lanes)
-            # Samples of a pixel are in one half.
-            pair = (lane - self._first_net) // (NETS * NET)
-            half = dr.select(lane < self._first_net, moments.group(lane), pair) % 2
+            half = moments.group(lane) % 2  # samples of a pixel are in one
             tile = tile_of(self._region, position, EMISSION_TILES)
             square, active = dr.square(size), active & (size > 0)
             self._emission.accumulate(c.shares, c.emission, tile, half, square, active)
@@ -210,8 +205,6 @@ class Pilot:
         ``counts`` of the lanes' counters; ``sds`` light is in no sample.
         """
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
-        parts = slice(self._first_net), slice(self._first_net, None)
-        independent, nets = (moments.Samples.of_rows(rows[part]) for part in parts)
         sums = np.array(self._splats).reshape(GROUPS, FINE**2, SPLAT.width)
         splats = moments.Splats(sums, self._lanes)
         rays = {
@@ -222,8 +215,7 @@ class Pilot:
             rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean())
         rays["guidable"] = sds.vertices if sds else 0.0
         emission = self._emission.evaluated() if self._emission is not None else None
-        nets = nets if len(nets.tile) else None
-        return moments.moments(independent, nets, splats, rays, spp, sds, emission)
+        return moments.moments(moments.Samples.of_rows(rows), splats, rays, spp, sds, emission)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
@@ -233,6 +225,8 @@ class Pilot:
         """
         shares = _shares(size, c)
         lost = LOST * dr.square(size)
+        # Direct illumination by other strategies than light tracing.
+        gain = 1 if c.kind == "inner" else dr.select(c.s + c.t == 3, mi.Float64(self._direct), 1)
         own, squares, lights, peaks = [], [], [], []
         for candidate in CANDIDATES:
             weights, counts = candidate.weights, candidate.counts
@@ -245,32 +239,23 @@ class Pilot:
             seldom = dr.maximum(1, self._least / _rate(weights, shares))
             scale = size / (total * seldom)
             square = dr.square(scale) * seldom
-            moment = dr.select(possible, square * _dot(second, shares | {"light": 0}), lost)
-            peak = dr.select(possible, square * dr.square(scale) * _dot(fourth, shares), 0)
+            moment = dr.select(possible, square * gain * _dot(second, shares | {"light": 0}), lost)
+            peak = dr.square(gain) * _dot(fourth, shares | {"light": 0})
+            if light := fourth["light"]:
+                peak += light * shares["light"]
+            peak = dr.select(possible, square * dr.square(scale) * peak, 0)
             if weight := weights[c.kind]:
                 estimate = scale if weight == 1 else weight * scale
-                own.append(estimate)
                 if c.kind != "light":
+                    estimate *= dr.sqrt(gain)
                     moment -= dr.square(estimate) / counts[c.kind]
                     peak -= dr.square(dr.square(estimate)) / counts[c.kind] ** 3
+                own.append(estimate)
             squares.append(moment)
             peaks.append(peak)
             if light := second["light"]:
                 lights.append(dr.select(possible, square * (light * shares["light"]), 0))
         return own, {"moment": squares, "light": lights, "peak": peaks}
-
-    def _rare(self, size: mi.Float64, c: Contribution, squares: Row) -> Row:
-        """The part of ``squares`` of a splat that does not gain from stratification.
-
-        It is on paths that camera subpaths sample too rarely, see `SELDOM`. Excludes light directly from a
-        lamp, which every camera sample finds with s = 1 if that is possible.
-        """
-        shares = _shares(size, c) | {"light": 0}
-        often = (c.s == 2) & (shares["direct"] > 0)
-        return [
-            dr.select(often, 0, square * (1 - dr.minimum(1, SELDOM * _rate(candidate.weights, shares))))
-            for candidate, square in zip(CANDIDATES, squares, strict=True)
-        ]
 
     def _size(self, c: Contribution) -> mi.Float64:
         """Weighted size of a contribution that counts, in double precision.
@@ -326,14 +311,12 @@ def measure(
         kernel.emitters = kernel.cells.emitters
         emission = components.guided_emission.EmissionStatistics(EMISSION_TILES**2, kernel.cells.count)
     pixels = int(region.size.prod())
-    stratified = settings.points == "sobol"
-    nets = lanes // (NET_SHARE * NETS * NET) if stratified else 0
-    lanes -= nets * NETS * NET
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)
-    batch = Batch(0, chosen, 0, samples, spread=pixels, nets=nets, light=LIGHT_TIMES)
-    pilot = Pilot(region, batch, max(stands_for, RAREST), prepared.space is not None, emission)
-    # Samples outside nets use independent numbers: products of samples give the squared mean.
+    batch = Batch(0, chosen, 0, samples, spread=pixels, light=LIGHT_TIMES)
+    direct = DIRECT if settings.points == "sobol" else 1.0
+    pilot = Pilot(region, batch, max(stands_for, RAREST), direct, prepared.space is not None, emission)
+    # Independent numbers in each sample: products of samples give the squared mean.
     points = Points(settings.points, seed)
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)

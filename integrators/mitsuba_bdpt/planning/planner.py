@@ -1,11 +1,10 @@
-"""Decides how a render proceeds: by parameters, by the scene alone, or by pilots."""
+"""Decides how a render proceeds: by parameters, by the scene alone, or by a pilot."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +14,7 @@ from ..host.jit import evaluated_mode, gc_paused
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.plan import JOINED, EmissionTables
+from ..transport.plan import JOINED
 from . import budget, choice, pilot
 from .candidates import LEFT_OUT, candidates, without_pilot
 from .configuration import Decision, not_worth, replayed
@@ -41,41 +40,34 @@ SAW_NOTHING = "the pilot found no light but that of emitters which the sensor se
 NOT_FINITE = "the pilot found only invalid samples (NaN or infinite)"
 
 
-class Pilots(NamedTuple):
-    """Number of pilots that were requested; ``cached``: those with cached results."""
-
-    requested: int = 0
-    cached: int = 0
-
-
 @dataclass(frozen=True)
 class PlannerState:
     """Decisions of a render so far; part of its progress.
 
     ``left_out``: what the last of ``decisions`` leaves out, as in ``statistics["skipped"]``; ``no_pilot``:
-    why no pilot ran or decided; ``moments`` of the pilot.
+    why no pilot ran or decided; ``pilot``: ``rendered``, ``cached`` or empty; ``non_finite``: number of its
+    non-finite values, counted as zero.
     """
 
     decisions: tuple[Decision, ...] = ()
     left_out: tuple[dict[str, str], ...] = ()
     no_pilot: str = ""
-    moments: Moments | None = None
-    pilots: Pilots = Pilots()
+    pilot: str = ""
+    non_finite: int = 0
 
 
 @dataclass(frozen=True)
 class _Result:
     """Result of a pilot.
 
-    ``table`` of predictions, the best first, and what the best leaves out; ``moments`` that they follow from,
-    and those of the pilot ``with_tables`` of emission, if one ran; number of pilots ``requested``.
+    ``table`` of predictions for the ``alternatives``, the best first, what the best leaves out, and the
+    ``moments`` from which they follow.
     """
 
     table: tuple[choice.Prediction, ...]
     left_out: tuple[dict[str, str], ...]
     moments: Moments
-    with_tables: Moments | None
-    requested: int
+    alternatives: choice.Alternatives
 
 
 class Planner:
@@ -86,7 +78,7 @@ class Planner:
     ``passes``: samples per pixel of each finished pass.
     """
 
-    # The same for all seeds of a render, so that all decide alike. The most efficient of 32.
+    # The same for all seeds of a render, so that all decide alike.
     pilot_seed = 30
 
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: SceneCache):
@@ -96,8 +88,7 @@ class Planner:
         joined = JOINED[-1] if self._is_worth_joining(self._expected(())) else 1
         self.full = self.plan = budget.first_plan(self.full, prepared, settings, self._pixels, joined)
         self.threshold, self.decided = None, PlannerState()
-        # Moments of the newest pilot with tables of emission.
-        self._with_tables: Moments | None = None
+        self._result: _Result | None = None
 
     def begin(self, passes: tuple[int, ...]) -> bool:
         """Adopt what is given or the scene alone decides, before the first pass.
@@ -117,26 +108,23 @@ class Planner:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
         samples = self._expected(passes)
         key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
-        result, is_known = self._findings.find("results", key, lambda: self._result(samples))
-        if is_known:
-            pilots = Pilots(result.requested, cached=result.requested)
-            self.decided = replace(self.decided, pilots=pilots, moments=result.moments)
-            self._with_tables = result.with_tables
+        result, is_known = self._findings.find("results", key, lambda: self._piloted(samples))
+        self._result, pilot = result, "cached" if is_known else "rendered"
+        self.decided = replace(self.decided, pilot=pilot, non_finite=result.moments.non_finite)
         if result.table:
             self.adopt(result.table[0].decided(result.moments.mean), result.left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
         return list(result.table)
 
-    def _result(self, samples: int) -> _Result:
+    def _piloted(self, samples: int) -> _Result:
         """Result of a pilot."""
         moments = self._measured(samples)
-        self.decided = replace(self.decided, moments=moments)
-        alternatives, left_out = self._alternatives(samples), ()
-        table = choice.choose(moments, alternatives)
+        learnt = self._learnt(moments)
+        alternatives = self._alternatives(samples, learnt)
+        table, left_out = choice.choose(moments, alternatives), ()
         if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
         if table:
-            table, learnt = self._with_guided_emission(table, moments, samples)
             gain = choice.guided_gain(moments, alternatives, table)
             name = "merging" if self.full.merging else "guided s=0"
             unguided = table[0].candidate.emission is None
@@ -145,27 +133,7 @@ class Planner:
                 *[UNMEASURED] * (self.full.guidable and not moments.sds.size),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
-        return _Result(tuple(table), left_out, moments, self._with_tables, self.decided.pilots.requested)
-
-    def _with_guided_emission(
-        self, table: list[choice.Prediction], moments: Moments, samples: int
-    ) -> tuple[list[choice.Prediction], Learnt | None]:
-        """Add guided emission to ``table`` where it pays; also returns what was learnt."""
-        self._with_tables = None
-        if not moments.emission.size:
-            return table, None
-        learnt = self._fitted_emission(moments)
-        lit = min((row.score for row in table if row.candidate.light_paths), default=math.inf)
-        has_light_paths = table[0].candidate.light_paths > 0
-        if learnt.tables is None or (not has_light_paths and lit * learnt.whole > table[0].score):
-            return table, learnt
-        if not has_light_paths:
-            found = self._measured(samples, learnt.tables)
-            guided = choice.choose(found, self._alternatives(samples))
-            if not found.mean > 0 or not guided or not guided[0].candidate.light_paths:
-                return table, learnt
-            self._with_tables, table = found, guided
-        return [row.with_emission(learnt.tables, has_light_paths) for row in table], learnt
+        return _Result(tuple(table), left_out, moments, alternatives)
 
     def _is_worth_joining(self, samples: int) -> bool:
         """Whether several light subpaths per lane pay in a render of ``samples`` samples, if they are few."""
@@ -178,21 +146,23 @@ class Planner:
             and may_join(self._prepared, self.full.merging)
         )
 
-    def _fitted_emission(self, moments: Moments) -> Learnt:
-        """Fit tables of emission."""
+    def _learnt(self, moments: Moments) -> Learnt | None:
+        """Tables of emission fitted to a pilot; None without emission statistics."""
+        if not moments.emission.size:
+            return None
         counts, component = self._prepared.emitters.tables, components.guided_emission
         return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
-    def _measured(self, samples: int, tables: EmissionTables | None = None) -> Moments:
-        """Moments of a pilot (`pilot.measure`) for ``samples`` samples with these tables."""
-        count, number = budget.lanes(samples), self.decided.pilots.requested + 1
-        self.decided = replace(self.decided, pilots=Pilots(number))
-        plan = replace(self.full, emission=tables)
+    def _measured(self, samples: int) -> Moments:
+        """Moments of a pilot (`pilot.measure`) for ``samples`` samples."""
+        count = budget.lanes(samples)
         guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
-        seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT + number)
+        seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT)
         flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
         with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
-            return pilot.measure(self._prepared, plan, self._settings, seed, count, samples / count, guiding)
+            return pilot.measure(
+                self._prepared, self.full, self._settings, seed, count, samples / count, guiding
+            )
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on."""
@@ -207,23 +177,18 @@ class Planner:
             self.adopt(decision, decided.left_out)
         self.decided = decided
 
-    def confidence(self, passes: tuple[int, ...]) -> float:
-        """`choice.confidence` of the pilots' decision."""
-        moments = self._with_tables or self.decided.moments
-        return choice.confidence(moments, self._alternatives(self._expected(passes)))
-
-    def lost_by_pilots(self) -> int:
-        """Number of non-finite values of the pilots, counted as zero."""
-        moments = self.decided.moments
-        return 0 if moments is None else round(moments.rays["non_finite"] * moments.lanes)
+    def confidence(self) -> float:
+        """`choice.confidence` of the pilot's decision; 0 without one."""
+        result = self._result
+        return choice.confidence(result.moments, result.alternatives) if result and result.table else 0.0
 
     def why_no_pilot(self, passes: tuple[int, ...] = ()) -> str:
         """Sentence: why there are no predictions of a pilot."""
         return f"no pilot: {self._settled(passes)[0] or self._why_undecided()}"
 
     def _why_undecided(self) -> str:
-        """Why the pilots that ran decided nothing."""
-        return NOT_FINITE if self.lost_by_pilots() else SAW_NOTHING
+        """Why a pilot decided nothing."""
+        return NOT_FINITE if self.decided.non_finite else SAW_NOTHING
 
     def _settled(self, passes: tuple[int, ...]) -> tuple[str, Decision | None]:
         """Why no pilot runs for the rest of the render, and the decision without one.
@@ -245,14 +210,13 @@ class Planner:
             return f"the render has {samples} samples, a pilot needs {least}", None
         return "", None
 
-    def _alternatives(self, samples: int) -> choice.Alternatives:
+    def _alternatives(self, samples: int, learnt: Learnt | None) -> choice.Alternatives:
         """The alternatives for ``samples`` samples still to come."""
         joins = self._is_worth_joining(samples)
         possible = candidates(self._prepared, self.full, self._settings)
         possible = [candidate for candidate in possible if candidate.joined == 1 or joins]
         near_specular = bool(self._prepared.near_specular)
-        stratified = self._settings.points == "sobol"
-        return choice.Alternatives(possible, stratified, samples, self.full.guidable, near_specular)
+        return choice.Alternatives(possible, samples, self.full.guidable, near_specular, learnt)
 
     def _expected(self, passes: tuple[int, ...]) -> int:
         """Expected number of samples still to come."""

@@ -16,8 +16,7 @@ from ..errors import CommandError, UsageError
 from ..image.accumulator import Accumulator
 from ..image.replicates import Spread
 from ..planning.configuration import Decision
-from ..planning.moments import Moments
-from ..planning.planner import Pilots, PlannerState
+from ..planning.planner import PlannerState
 from ..settings import Settings
 from .statistics import Work
 
@@ -51,7 +50,7 @@ class Progress:
 
     def image_only(self) -> Progress:
         """Return a copy without the state that only a continued render needs."""
-        return replace(self, whole=False, decided=replace(self.decided, moments=None))
+        return replace(self, whole=False)
 
     def stored(self) -> tuple[dict, dict]:
         """Return the fields of all parts: JSON values, and arrays by name."""
@@ -60,8 +59,6 @@ class Progress:
             values |= {f.name: getattr(part, f.name) for f in fields(part)}
         del values["decided"], values["work"]
         values["decisions"] = [decision.record() for decision in self.decided.decisions]
-        if self.decided.moments is not None:
-            values["moments"], arrays = _split(self.decided.moments, "moments")
         values["replicates"] = halves = values.pop("halves")
         if halves is not None:
             values["replicates"] = {"halves": [[half.count, half.spp] for half in halves]}
@@ -73,11 +70,7 @@ class Progress:
     def restored(cls, values: dict, arrays: dict) -> Progress:
         """Inverse of `stored`; removes its arrays from ``arrays``."""
         values = dict(values)
-        decisions = tuple(map(Decision.read, values["decisions"]))
-        moments = _arrays(arrays, "moments")
-        if moments:
-            moments = Moments(**values["moments"], **moments)
-        values |= {"decisions": decisions, "moments": moments or None, "pilots": Pilots(*values["pilots"])}
+        values["decisions"] = tuple(map(Decision.read, values["decisions"]))
         values["left_out"] = tuple(values["left_out"])
         replicates, values["halves"] = values.pop("replicates"), None
         if replicates is not None:

@@ -140,13 +140,13 @@ class Statistics(TypedDict):
     no_pilot: str
     """Why no pilot ran, or none decided."""
     pilots: dict[str, int]
-    """Number of pilots that were ``rendered``, and of results that were ``cached`` by earlier renders."""
+    """Whether a pilot was ``rendered``, or its results were ``cached`` by an earlier render: 0 or 1."""
     passes: list[int]
     """Samples per pixel of each pass."""
     non_finite: int
     """Contributions that were NaN or infinite and count as zero."""
     non_finite_in_pilot: int
-    """The same in the pilots."""
+    """The same in the pilot."""
     unsampled_light: NotRequired[dict[int, float]]
     """Estimated share of the image's light that no strategy samples, by index in ``scene.emitters()``."""
     light_groups: NotRequired[dict[str, list[list[str]]]]
@@ -177,7 +177,6 @@ def statistics(render) -> Statistics:
     """Return the statistics of a `Render` so far, without ``unsampled_light``."""
     work, planner, accumulator = render.meter.work, render.planner, render.accumulator
     decided, counts = planner.decided, work.counts
-    pilots = decided.pilots
     connections = {name: counts[name] for name in ("evaluated", "zero", "rouletted")}
     connections["traced"] = counts["shadow_inner"]
     found: Statistics = {
@@ -193,10 +192,10 @@ def statistics(render) -> Statistics:
         "skipped": [dict(left_out) for left_out in (*render.plan.skipped, *render.skipped)],
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,
-        "pilots": {"rendered": pilots.requested - pilots.cached, "cached": pilots.cached},
+        "pilots": {name: int(decided.pilot == name) for name in ("rendered", "cached")},
         "passes": list(accumulator.passes),
         "non_finite": counts["non_finite"],
-        "non_finite_in_pilot": planner.lost_by_pilots(),
+        "non_finite_in_pilot": decided.non_finite,
         "kernels": {"compiled": work.compiled, "cached": work.cached},
         "peak_memory": int(dr.detail.malloc_watermark(dr.backend_v(mi.Float))),
     }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-# Numbers from 1 are the replicates of `variance`. Pilots use the numbers after `PILOT`.
+# Numbers from 1 are the replicates of `variance`; a pilot uses `PILOT`.
 PILOT = 1 << 16
 
 # Photons use `PHOTONS` plus the number of finished passes, or a sequence derived from it; wavelengths of

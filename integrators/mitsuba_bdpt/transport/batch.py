@@ -25,10 +25,6 @@ import mitsuba as mi
 from ..sampling import sobol
 from .inputs import Kernel
 
-# Points of a net of one pixel, and nets per pixel: the difference of their means measures the stratification
-# gain. Longer nets gain more, but fewer of them measure it less precisely.
-NET, NETS = 8, 2
-
 # Samples of a pixel that a launch sums in single precision; further ones have sums of their own (strips).
 # Bounds the rounding error, which is systematic (relative error 4e-6 at 2^12, 5e-5 at 2^16).
 STRIP = 1 << 12
@@ -47,8 +43,7 @@ class Batch:
     each from ``first_sample`` on.
 
     For pilots, ``spread`` > 0: one random pixel in each of ``pixels`` equal parts of the first ``spread``,
-    with independent samples; then ``nets`` further pixels, with `NETS` nets of `NET` samples each, every net
-    with its own sequence; ``light``: light subpaths per camera sample.
+    with independent samples; ``light``: light subpaths per camera sample.
     """
 
     first_pixel: int
@@ -56,7 +51,6 @@ class Batch:
     first_sample: int
     samples: int
     spread: int = 0
-    nets: int = 0
     light: int = 1
 
     @property
@@ -67,7 +61,7 @@ class Batch:
     @property
     def size(self) -> int:
         """Number of camera samples."""
-        return self.pixels * self.samples + self.nets * NETS * NET
+        return self.pixels * self.samples
 
 
 class Places:
@@ -79,35 +73,23 @@ class Places:
         self._pilot = batch.spread > 0
         if self._pilot:
             self._spread = dr.opaque(mi.UInt64, batch.spread)
-            self._first_net = dr.opaque(mi.UInt32, batch.pixels * batch.samples)
-            self._nets = dr.opaque(mi.UInt64, max(batch.nets, 1))
         self._pixels = dr.opaque(mi.UInt64, batch.pixels)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
         self._spp = dr.opaque(mi.UInt64, spp)
 
     def _split(self, slot):
-        if self._pilot:
-            return self._split_of_pilot(slot)
         pixel = slot // self._samples
-        return pixel + self._first_pixel, slot - pixel * self._samples + self._first_sample
-
-    def _split_of_pilot(self, slot):
-        in_net = slot >= self._first_net
-        after = slot - self._first_net
-        pixel = dr.select(in_net, after // (NETS * NET), slot // self._samples)
-        sample = dr.select(in_net, after % (NETS * NET), slot % self._samples)
-        parts = dr.select(in_net, self._nets, self._pixels)
-        # Random: a regular stride would miss columns of films of that width.
-        hashed = sobol.mix(dr.select(in_net, ~pixel, pixel + 1))
-        within = mi.UInt64(hashed) % self._spread
-        pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // parts)
-        return pixel + self._first_pixel, sample
+        sample = slot - pixel * self._samples
+        if self._pilot:
+            # Random: a regular stride would miss columns of films of that width.
+            within = mi.UInt64(sobol.mix(pixel + 1)) % self._spread
+            pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // self._pixels)
+        return pixel + self._first_pixel, sample + self._first_sample
 
     def index(self, slot: mi.UInt32) -> mi.UInt64:
-        if self._pilot:  # each sample, or net, has its own sequence
-            within = dr.select(slot >= self._first_net, (slot - self._first_net) % NET, 0)
-            return (mi.UInt64(slot - within) << 32) | mi.UInt64(within)
+        if self._pilot:  # each sample has its own sequence
+            return mi.UInt64(slot) << 32
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)
 
