@@ -764,13 +764,6 @@ MUTANTS = (
         ("tests/planning/test_pilot.py::test_both_errors_count_alike",),
     ),
     Mutant(
-        "pilots: tables are as good without connections",
-        "planning/choice.py",
-        '(1 if c.connections != "none" else TABLES_ALONE)',
-        "1",
-        ("tests/images/test_guided_emission.py::test_tables_count_in_the_choice",),
-    ),
-    Mutant(
         "pilot: points stratify the mean of direct illumination too",
         "planning/pilot.py",
         "                    estimate *= dr.sqrt(gain)\n",

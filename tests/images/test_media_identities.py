@@ -5,8 +5,6 @@ differ by rounding, and by the few paths that rounding sends elsewhere. Where th
 Welch's t-test of tile means with Sidak's correction (`welch`). Seeds are fixed.
 """
 
-import json
-
 import media_parts as parts
 import mitsuba as mi
 import numpy as np
@@ -35,7 +33,7 @@ def assert_same(a, b, share=0.98, factor=1.0):
     brighter = [d | {"mean": d["mean"] / factor} for d in decided]
     for mine, parameters in (
         ({"skip": "none"}, {"skip": "none"}),
-        ({"decisions": json.dumps(brighter)}, {"decisions": json.dumps(decided)}),
+        ({"decisions": brighter}, {"decisions": decided}),
     ):
         x, y = image(a, **mine) * factor, image(b, **parameters)
         near = np.abs(x - y) <= 1e-3 * np.abs(y) + 1e-4 * y.mean()

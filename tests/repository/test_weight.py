@@ -10,22 +10,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 7000,
-    "planning": 2780,
+    "transport merging guided_emission": 6970,
+    "planning": 2600,
     "emitters": 2680,
     "cli": 1811,
-    "media": 1430,
+    "media": 1431,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1241,
+    "run": 1233,
     "scene sampling": 771,
     "host": 1077,
     "sensors": 934,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 6131, "tests": 45350}
-MOST_WORDS = 70636
+OUTSIDE = {"scripts": 6124, "tests": 45150}
+MOST_WORDS = 70600
 
 
 def _lines(files):

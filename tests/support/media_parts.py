@@ -5,6 +5,7 @@ Objects of one variant are of no use in another: everything is made on demand.
 
 from __future__ import annotations
 
+import internals
 import mitsuba as mi
 import numpy as np
 import views
@@ -136,6 +137,8 @@ def sun():
 
 
 def integrator(kind="bdpt", **parameters):
+    if kind == "bdpt":
+        return internals.bdpt(rr_depth=100, **parameters)
     return mi.load_dict({"type": kind, "rr_depth": 100, **parameters})
 
 

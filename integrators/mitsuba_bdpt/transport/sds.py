@@ -42,8 +42,8 @@ class State:
     does not guide if the next vertex is the end.
     """
 
-    isolated: mi.Bool | None = None
-    only_delta: mi.Bool | None = None
+    isolated: Any = None
+    only_delta: Any = None
     guided: mi.Float | None = None
     survived: mi.Float | None = None
     specular: Any = None
@@ -55,7 +55,7 @@ class State:
         isolated = ~self.is_connectible(specular, coefficient) & self.isolated
         return replace(self, isolated=isolated, specular=specular)
 
-    def guided_before_last(self, heuristic: mis.Heuristic) -> mi.Float:
+    def guided_before_last(self, heuristic: mis.Heuristic) -> Any:
         """The densities of the guide, over those of the path, at all vertices before the next one."""
         return heuristic.combine(self.guided, self.newest)
 
