@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -94,7 +94,7 @@ class Alternatives:
     samples: float = math.inf
     guidable: bool = False
     near_specular: bool = False
-    learnt: Learnt | None = None
+    learnt: Any = None  # a `guided_emission.Learnt`
 
     @property
     def guide_gain(self) -> float:
