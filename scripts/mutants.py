@@ -1497,8 +1497,8 @@ MUTANTS = (
     Mutant(
         "merging: the radius begins anew in each part of an average",
         "run/rendering.py",
-        "earlier = self.part * len(schedule",
-        "earlier = 0 * len(schedule",
+        "self._passes_before = self.part * len(steps)",
+        "self._passes_before = 0",
         ("tests/images/test_merging.py::test_the_radius_goes_on_from_part_to_part[]",),
     ),
     Mutant(

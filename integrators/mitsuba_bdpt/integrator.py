@@ -175,13 +175,19 @@ class BDPTIntegrator(metaclass=ABCMeta):
     ) -> Render:
         """Check the arguments and prepare a render, with the ``merging`` of the snapshot ``start``."""
         check_made_for(self, scene)
-        sensor, settings = resolve_sensor(scene, sensor), self.settings
-        if start is None or start.identity["spp"] != spp:
-            spp = samples_per_pixel(sensor, spp, settings)
-        if start is not None and settings.merging == "auto":
-            settings = replace(settings, merging=start.identity.get("merging") is True)
-        render = Render(scene, sensor, settings, seed, spp)
+        sensor = resolve_sensor(scene, sensor)
+        spp = samples_per_pixel(sensor, spp, self.settings)
+        render = self._made(Render(scene, sensor, self._settings_of(start), seed, spp))
         render.part = integer(self.part, "part", 0)
+        return render
+
+    def _settings_of(self, start: Snapshot | None) -> Settings:
+        """The parameters, with the ``merging`` of the snapshot ``start`` where it is ``auto``."""
+        if start is None or self.settings.merging != "auto":
+            return self.settings
+        return replace(self.settings, merging=start.identity.get("merging") is True)
+
+    def _made(self, render: Render) -> Render:
         self._colours = render.accumulator.colour.names
         if render.light_groups is not None:
             self._light_groups = render.light_groups.names
@@ -245,10 +251,12 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
         The snapshot may be merged from several (`Snapshot.joined`) of integrators with equal parameters.
         """
+        check_made_for(self, scene)
         if not isinstance(snapshot, Snapshot):
             raise UsageTypeError(f"snapshot={type(snapshot).__name__} must be one from a PassReport")
-        render = self._new_render(scene, sensor, 0, snapshot.identity["spp"], snapshot)
-        render.resume(snapshot, apart_from=("seed", "part"))
+        sensor = resolve_sensor(scene, sensor)
+        render = self._made(Render(scene, sensor, self._settings_of(snapshot), 0, 1))
+        render.resume(snapshot, apart_from=("seed", "spp", "part"))
         render.accumulator.finish()
         self.statistics = statistics(render)
         messages.warn_of_non_finite(self.statistics, scene)

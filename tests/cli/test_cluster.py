@@ -95,17 +95,22 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
 
 
 @pytest.mark.parametrize(
-    ("properties", "decided"), [([], True), ([("skip", "none")], False), ([("light_paths", 0)], False)]
+    ("properties", "decided"),
+    [([], True), ([("skip", "none")], False), ([("light_paths", 0)], False), ([("merging", True)], True)],
 )
 def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
     """Expected: parts of a render whose strategies parameters fix have these alone, since decisions beside
-    them are contradictory; parts of others have the client's decisions, none of a render without a pilot."""
+    them are contradictory; parts of others have the client's decisions, none of a render without a pilot.
+    They merge if the client does: a snapshot with another parameter is that of another render, also where the
+    scene has nothing to merge."""
     arguments = ["render", str(SCENE), "--spp", "1", "-D", "resolution=8"]
     options = build_parser().parse_args(arguments)
     options.properties = properties
     scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 1)
-    assert cluster._loaded(job)[2].settings.internals.decisions == (() if decided else None)
+    settings = cluster._loaded(job)[2].settings
+    assert settings.internals.decisions == (() if decided else None)
+    assert settings.merging == dict(properties).get("merging", False)
 
 
 def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):

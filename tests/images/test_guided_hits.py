@@ -416,7 +416,7 @@ def test_pilots_of_any_seed_decide_alike(described, guides, monkeypatch):
         for seed in range(5):
             monkeypatch.setattr(Planner, "pilot_seed", seed)
             render = rendering.Render(scene, scene.sensors()[0], settings, 0, spp)
-            assert bool(render.planner.run_pilot(())[0].candidate.guided) == guides
+            assert bool(render.planner.run_pilot()[0].candidate.guided) == guides
 
 
 @pytest.mark.parametrize("light, needed", [(ball, False), (point, True)])

@@ -37,11 +37,11 @@ def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
     which the others are black traces the same paths with the same weights. Expected: each layer is that
     image, of a crop window, with every strategy. Tolerance: order of atomic additions."""
     window = {"crop_offset_x": 1, "crop_offset_y": 2, "crop_width": 6, "crop_height": 5}
-    method = integrator(skip="none", **parameters)
+    method = integrator(skip="none", merging=False, **parameters)
     image, groups = layers(method, scene(**window))
     assert image.shape == (5, 6, 3) and list(groups) == list(OF_GROUPS)
     check_sum(image, groups)
-    alone = bdpt(max_depth=4, skip="none", **parameters)
+    alone = bdpt(max_depth=4, skip="none", merging=False, **parameters)
     for name, lit in OF_GROUPS.items():
         expected, _ = layers(alone, scene(lit, **window))
         np.testing.assert_allclose(groups[name], expected, rtol=1e-4, atol=2e-5 * image.max())

@@ -221,7 +221,7 @@ def test_an_unrelated_ball_changes_no_prediction(monkeypatch):
     for more in ({}, {"ball": polished()}):
         scene = mi.load_dict(lit_metal(**more))
         settings = mi.load_dict({"type": "bdpt", "max_depth": 8}).settings
-        Render(scene, scene.sensors()[0], settings, 0, 256).planner.run_pilot(())
+        Render(scene, scene.sensors()[0], settings, 0, 256).planner.run_pilot()
     (light, gain), (expected, without) = (
         (each.sums[..., 0].sum(), each.reduction) for each in reversed(found)
     )
@@ -251,7 +251,7 @@ def test_pilots_of_any_seed_decide_alike(alpha, guides, monkeypatch):
 
     def chosen(guiding):
         settings = mi.load_dict({"type": "bdpt", "max_depth": 8, "guiding": guiding}).settings
-        return Render(scene, scene.sensors()[0], settings, 0, 64).planner.run_pilot(())[0]
+        return Render(scene, scene.sensors()[0], settings, 0, 64).planner.run_pilot()[0]
 
     for seed in range(3):
         monkeypatch.setattr(Planner, "pilot_seed", seed)

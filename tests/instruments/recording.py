@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from unittest import mock
 
@@ -153,13 +153,14 @@ def render(scene, integrator, least, spp: int, seed: int):
     """The image of a render, and the `Outlier` objects in it, largest first.
 
     They are all samples larger than ``least`` (of the image's shape) in one of the colours. Lanes keep one
-    light subpath each (`Plan.joined`). Raises ``CommandError`` for a film of other colours, for `merging`,
-    where s = 0 or emission is guided, and for decisions that join more.
+    light subpath each (`Plan.joined`), and ``merging=auto`` does not merge. Raises ``CommandError`` for a
+    film of other colours, for ``merging=true``, where s = 0 or emission is guided, and for decisions that
+    join more.
     """
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
-    if integrator.settings.merging:
+    if integrator.settings.merging is True:
         raise CommandError("merging=true: paths that are merged are not looked at; leave out merging")
     outliers = []
 
@@ -181,7 +182,8 @@ def render(scene, integrator, least, spp: int, seed: int):
 
     one = mock.patch.object(planner, "JOINED", (1,))  # of which cached results know
     each = mock.patch.object(planner.Planner, "_is_worth_joining", return_value=False)
-    with one, each, mock.patch.object(rendering, "trace", trace):
+    unmerged = mock.patch.object(integrator, "settings", replace(integrator.settings, merging=False))
+    with one, each, unmerged, mock.patch.object(rendering, "trace", trace):
         image = np.array(integrator.render(scene, spp=spp, seed=seed))[..., :3]
     outliers.sort(key=lambda found: -(found.value / least[found.y, found.x]).max())
     return image, outliers

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import internals
@@ -450,6 +451,7 @@ def test_what_the_committed_scenes_lack(name, share, said, monkeypatch):
     monkeypatch.setattr(unsampled_light, "SUBPATHS", 1 << 15)
     scene = mi.load_file(str(SCENES / f"{name}.xml"), resolution=24, integrator="bdpt")
     integrator = scene.integrator()
+    integrator.settings = replace(integrator.settings, merging=False)
     with Warned() as warnings:
         integrator.render(scene, spp=16)
     found = [text.partition(": ")[2].partition(" on what")[0] for text in warnings]

@@ -105,7 +105,7 @@ def test_lit_rooms_are_decided(light):
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 8})
     render = Render(scene, scene.sensors()[0], integrator.settings, 0, 64)
     assert render.prepared.traits.dispatch.count > 54
-    assert render.planner.begin(()) == (light != "window")
+    assert render.planner.begin() == (light != "window")
     if light == "window":
         assert not render.plan.light
 
@@ -145,7 +145,7 @@ def test_an_edit_of_a_small_render_asks_no_pilot(monkeypatch, more, least):
     scene, integrator = mi.load_dict(scene), mi.load_dict({"type": "bdpt"})
     for spp, asked in ((least - 1, False), (least, True)):
         render = Render(scene, scene.sensors()[0], integrator.settings, 0, spp)
-        assert render.planner.begin(()) == asked
+        assert render.planner.begin() == asked
 
 
 LAMPS = {f"lamp{i}": {"type": "point", "position": [0.1 * i, 0, 0]} for i in range(budget.MANY_EMITTERS)}

@@ -5,9 +5,10 @@ Same seed, same random numbers, so that the images are the same up to the order 
 
 from __future__ import annotations
 
-import internals
+import mitsuba as mi
 import numpy as np
 from mitsuba_bdpt.planning import budget
+from mitsuba_bdpt.planning.configuration import Decision
 
 from .agreement import WAYS
 from .case import Outcome
@@ -25,9 +26,11 @@ SPP = 16
 RENDERS = {"all strategies": (EVERYTHING, SPP), "default parameters": (DEFAULTS, PILOTED)}
 
 
-def rendered(scene, parameters, spp, seed=1):
-    """Image, statistics and warnings of a render."""
-    bdpt = internals.bdpt(**parameters)
+def rendered(scene, parameters, spp, seed=1, decisions=None):
+    """Image, statistics and warnings of a render; ``decisions`` of another one in place of its own."""
+    bdpt = mi.load_dict({"type": "bdpt", **parameters})
+    if decisions is not None:
+        bdpt.settings = bdpt.settings.varied(decisions=tuple(map(Decision.read, decisions)))
     with Warned() as warnings:
         image = np.array(bdpt.render(scene, spp=spp, seed=seed), dtype=np.float64)
     return image, bdpt.statistics, warnings
@@ -54,8 +57,7 @@ def compared(make, bad, parameters, count=None, spp=16) -> Outcome:
     same = decided(statistics) == decided(of_twin)
     if not same and means(statistics) == means(of_twin):
         # Rays that are traced for the bad number alone turned the scale: the twin does the same.
-        made = statistics["decisions"]
-        twin, replayed, _ = rendered(make(0.0), parameters | {"decisions": made}, spp)
+        twin, replayed, _ = rendered(make(0.0), parameters, spp, decisions=statistics["decisions"])
         same = decided(replayed) == decided(statistics)
     found = statistics["non_finite"]
     # An image of features may be all that there is.

@@ -138,7 +138,7 @@ def sun():
 
 def integrator(kind="bdpt", **parameters):
     if kind == "bdpt":
-        return internals.bdpt(rr_depth=100, **parameters)
+        return internals.bdpt(**{"rr_depth": 100} | parameters)
     return mi.load_dict({"type": kind, "rr_depth": 100, **parameters})
 
 

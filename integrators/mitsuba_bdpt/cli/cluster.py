@@ -147,6 +147,7 @@ def _job(scene, integrator, options: Namespace, spp: int) -> str:
     fixed = fixed_by(settings)
     if not fixed or settings.merging == "auto":
         decided = integrator.decide(scene, options.sensor, options.seed, spp)
+    if settings.merging == "auto":
         properties["merging"] = not integrator.statistics["unbiased"]
     names = ("variant", "defines", "integrator", "sensor", "time", "target_error", "denoise", "size", "crop")
     kept = {name: getattr(options, name) for name in names}

@@ -43,13 +43,10 @@ FEW_PIXELS = 64
 UNFOCUSED, MANY_EMITTERS = 16, 16
 
 
-def expected_samples(settings: Settings, left: int, done: int = 0) -> int:
-    """Number of samples still to come in a render with at most ``left`` more.
-
-    Unknown under ``timeout`` and ``target_error``: then as many as are ``done``, or `PROVISIONAL_SAMPLES`.
-    """
+def expected_samples(settings: Settings, most: int) -> int:
+    """Number of samples of a render of at most ``most``; under ``timeout`` and ``target_error`` assumed."""
     open_end = settings.target_error > 0 or 0 <= settings.timeout < math.inf
-    return min(left, max(PROVISIONAL_SAMPLES, done)) if open_end else left
+    return min(most, PROVISIONAL_SAMPLES) if open_end else most
 
 
 def focuses(prepared: PreparedScene) -> bool:

@@ -75,52 +75,51 @@ class Planner:
 
     ``full``: the plan before any decision; ``threshold`` of roulette in units of the image, None before a
     decision; ``decided``: saved with the render.
-    ``passes``: samples per pixel of each finished pass.
     """
 
     # The same for all seeds of a render, so that all decide alike.
     pilot_seed = 30
 
     def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: SceneCache):
-        self._prepared, self._settings, self._spp, self._findings = prepared, settings, spp, findings
+        self._prepared, self._settings, self._findings = prepared, settings, findings
         self._pixels = int(prepared.camera.region.size.prod())
+        self._samples = budget.expected_samples(settings, spp * self._pixels)
         self.full = plan(prepared, settings)
-        joined = JOINED[-1] if self._is_worth_joining(self._expected(())) else 1
+        joined = JOINED[-1] if self._is_worth_joining(self._samples) else 1
         self.full = self.plan = budget.first_plan(self.full, prepared, settings, self._pixels, joined)
         self.threshold, self.decided = None, PlannerState()
         self._result: _Result | None = None
 
-    def begin(self, passes: tuple[int, ...]) -> bool:
+    def begin(self) -> bool:
         """Adopt what is given or the scene alone decides, before the first pass.
 
         Returns whether a pilot is to run.
         """
         for given in self._settings.internals.decisions or ():
             self.adopt(given, replayed(given))
-        settled, decision = self._settled(passes)
-        if not passes and self._settings.internals.decisions is None:
+        settled, decision = self._settled()
+        if self._settings.internals.decisions is None:
             self.decided = replace(self.decided, no_pilot=settled)
-        if decision and not passes:
+        if decision:
             self.adopt(decision, LEFT_OUT)
         return not settled
 
-    def run_pilot(self, passes: tuple[int, ...]) -> list[choice.Prediction]:
+    def run_pilot(self) -> list[choice.Prediction]:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
-        samples = self._expected(passes)
-        key = self._settings, self.pilot_seed, samples, self._pixels, JOINED
-        result, is_known = self._findings.find("results", key, lambda: self._piloted(samples))
-        self._result, pilot = result, "cached" if is_known else "rendered"
-        self.decided = replace(self.decided, pilot=pilot, non_finite=result.moments.non_finite)
+        key = self._settings, self.pilot_seed, self._samples, self._pixels, JOINED
+        result, is_known = self._findings.find("results", key, self._piloted)
+        self._result, ran = result, "cached" if is_known else "rendered"
+        self.decided = replace(self.decided, pilot=ran, non_finite=result.moments.non_finite)
         if result.table:
             self.adopt(result.table[0].decided(result.moments.mean), result.left_out)
         self.decided = replace(self.decided, no_pilot="" if self.decided.decisions else self._why_undecided())
         return list(result.table)
 
-    def _piloted(self, samples: int) -> _Result:
+    def _piloted(self) -> _Result:
         """Result of a pilot."""
-        moments = self._measured(samples)
+        moments = self._measured()
         learnt = self._learnt(moments)
-        alternatives = self._alternatives(samples, learnt)
+        alternatives = self._alternatives(learnt)
         table, left_out = choice.choose(moments, alternatives), ()
         if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
@@ -153,9 +152,9 @@ class Planner:
         counts, component = self._prepared.emitters.tables, components.guided_emission
         return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
-    def _measured(self, samples: int) -> Moments:
-        """Moments of a pilot (`pilot.measure`) for ``samples`` samples."""
-        count = budget.lanes(samples)
+    def _measured(self) -> Moments:
+        """Moments of a pilot, see `pilot.measure`."""
+        samples, count = self._samples, budget.lanes(self._samples)
         guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
         seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT)
         flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
@@ -182,16 +181,16 @@ class Planner:
         result = self._result
         return choice.confidence(result.moments, result.alternatives) if result and result.table else 0.0
 
-    def why_no_pilot(self, passes: tuple[int, ...] = ()) -> str:
+    def why_no_pilot(self) -> str:
         """Sentence: why there are no predictions of a pilot."""
-        return f"no pilot: {self._settled(passes)[0] or self._why_undecided()}"
+        return f"no pilot: {self._settled()[0] or self._why_undecided()}"
 
     def _why_undecided(self) -> str:
         """Why a pilot decided nothing."""
         return NOT_FINITE if self.decided.non_finite else SAW_NOTHING
 
-    def _settled(self, passes: tuple[int, ...]) -> tuple[str, Decision | None]:
-        """Why no pilot runs for the rest of the render, and the decision without one.
+    def _settled(self) -> tuple[str, Decision | None]:
+        """Why no pilot runs, and the decision without one.
 
         An empty reason means that one runs.
         """
@@ -200,26 +199,18 @@ class Planner:
             return f"nothing to choose with {fixed}" if fixed else "no light subpaths are possible", None
         if self._pixels < budget.FEW_PIXELS:
             return f"the film has fewer than {budget.FEW_PIXELS} pixels", None
-        samples = self._expected(passes)
-        whole = sum(passes) * self._pixels + samples
+        samples = self._samples
         least = budget.least_samples(self._prepared)
         of_kernel = budget.samples_of_kernel(self._prepared.traits)
-        if decision := without_pilot(self._prepared, self.full, self._settings, whole, of_kernel):
+        if decision := without_pilot(self._prepared, self.full, self._settings, samples, of_kernel):
             return "the scene alone decides in a render as short as this", decision
         if samples < least:
             return f"the render has {samples} samples, a pilot needs {least}", None
         return "", None
 
-    def _alternatives(self, samples: int, learnt: Learnt | None) -> choice.Alternatives:
-        """The alternatives for ``samples`` samples still to come."""
-        joins = self._is_worth_joining(samples)
+    def _alternatives(self, learnt: Learnt | None) -> choice.Alternatives:
+        joins = self._is_worth_joining(self._samples)
         possible = candidates(self._prepared, self.full, self._settings)
         possible = [candidate for candidate in possible if candidate.joined == 1 or joins]
         near_specular = bool(self._prepared.near_specular)
-        return choice.Alternatives(possible, samples, self.full.guidable, near_specular, learnt)
-
-    def _expected(self, passes: tuple[int, ...]) -> int:
-        """Expected number of samples still to come."""
-        done = sum(passes)
-        left = (self._spp - done) * self._pixels
-        return budget.expected_samples(self._settings, left, done * self._pixels)
+        return choice.Alternatives(possible, self._samples, self.full.guidable, near_specular, learnt)

@@ -266,24 +266,20 @@ def in_words(
     all_of_it = sum(shares.values())
     if all_of_it < WARN_SHARE:
         return ""
-    cause, remedy = _in_words(prepared, plan, shares, unsampled, samples)
-    return f"bdpt: {_kind(unsampled)}, {_share(all_of_it)}: {cause}; {remedy}"
+    cause, remedy = _in_words(prepared, plan, shares, unsampled, samples, _share(all_of_it))
+    return f"bdpt: {cause}; {remedy}"
 
 
 def _share(share: float) -> str:
     return ("nearly all" if share > 0.99 else f"about {100 * share:.0f} %") + " of the image's light"
 
 
-def _kind(unsampled: UnsampledLight) -> str:
-    return "undersampled" if unsampled.is_undersampled else "not sampled"
-
-
 def reason(
     prepared: PreparedScene, plan: Plan, shares: dict[int, float], unsampled: UnsampledLight, samples: int
 ) -> str:
     """Why light with these ``shares`` is merged; arguments as of `in_words`."""
-    cause, _ = _in_words(prepared, plan, shares, unsampled, samples)
-    return f"without it {_kind(unsampled)}, {_share(sum(shares.values()))}: {cause}"
+    cause, _ = _in_words(prepared, plan, shares, unsampled, samples, _share(sum(shares.values())))
+    return f"without it {cause}"
 
 
 def explained(
@@ -299,8 +295,8 @@ def explained(
     share = f"light of mean radiance {all_of_it:.2g}"
     if shares is not None:
         share = f"{max(100 * all_of_it, 0.01):.2g} % of the image's light"
-    cause, remedy = _in_words(prepared, plan, parts, unsampled, samples)
-    return f"bdpt: {_kind(unsampled)}, {share}: {cause}; {remedy}"
+    cause, remedy = _in_words(prepared, plan, parts, unsampled, samples, share)
+    return f"bdpt: {cause}; {remedy}"
 
 
 def _in_words(
@@ -309,8 +305,9 @@ def _in_words(
     parts: dict[int, float],
     unsampled: UnsampledLight,
     samples: int,
+    share: str,
 ) -> tuple[str, str]:
-    """Cause and remedy of unsampled light; its ``parts`` by emitter index."""
+    """What is lacking of this ``share`` and why, and the remedy; ``parts`` of it by emitter index."""
     emitters = prepared.emitters.objects
     order = sorted(parts, key=parts.__getitem__, reverse=True)
     least = WARN_SHARE * sum(parts.values())
@@ -320,7 +317,8 @@ def _in_words(
         remedy = _remedy(prepared, lamps)
         if not plan.splat and prepared.camera.connectible:
             remedy = f"leave light_paths to the integrator, {remedy}"
-        return _undersampled(what, unsampled, samples, remedy)
+        cause, remedy = _undersampled(what, unsampled, samples, remedy)
+        return f"undersampled, {share}: {cause}", remedy
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
     if plan.splat:
@@ -330,7 +328,7 @@ def _in_words(
     else:
         why = "the render does without light tracing (t=1)"
         remedy = f"leave light_paths to the integrator, or {remedy}"
-    return f"{what} ({why})", remedy
+    return f"not sampled, {share}: {what} ({why})", remedy
 
 
 def _undersampled(what: str, unsampled: UnsampledLight, samples: int, remedy: str) -> tuple[str, str]:

@@ -76,10 +76,18 @@ class Render:
     ``prepared``: the scene; ``planner``: decides the ``plan`` of the ``kernel``; ``points``: random numbers
     of the passes; ``accumulator``: sums of the image; ``meter``: counts of work and times; ``why_merged``:
     why it merges, or empty; ``skipped``: what it leaves out beside its plan. Renders with ``merging=auto`` do
-    not merge, see `decided`. ``part``: see `BDPTIntegrator.part`.
+    not merge, see `decided`. ``part``: see `BDPTIntegrator.part`; ``like``: see `_like`.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, seed, spp: int):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        settings: Settings,
+        seed,
+        spp: int,
+        like: Render | None = None,
+    ):
         check_variant()
         check_not_frozen()
         self.light_groups = LightGroups.of(scene, settings.light_groups)
@@ -90,11 +98,11 @@ class Render:
         settings = replace(settings, merging=settings.merging is True)
         self.why_merged, self.skipped = "merging=true" if settings.merging else "", ()
         self.sensor, self.settings, self.spp = sensor, settings, spp
-        self.prepared = PreparedScene(scene, sensor)
+        self.prepared = like.prepared if like else PreparedScene(scene, sensor)
         messages.warn_of_light_groups(scene, sensor, self.light_groups)
         if settings.merging and (why := components.merging.why_not(sensor, self.prepared.space is not None)):
             raise UnsupportedError(f"{why}; leave out merging")
-        self.findings = SceneCache(self.prepared, sensor)
+        self.findings = like.findings if like else SceneCache(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
@@ -124,6 +132,8 @@ class Render:
         self._guides: tuple[Guide | None] | None = None
         # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette.
         self._small_first: bool | None = None
+        # Passes of the parts before, see `BDPTIntegrator.part`.
+        self._passes_before = 0
         self._error: float | None = None
         # State of the newest report, see `_freeze`.
         self._state: tuple[tuple[int, ...], Progress, dict] | None = None
@@ -150,9 +160,9 @@ class Render:
         watched = on_pass is not None or timeout >= 0
         with self._finished():
             for number, step in enumerate(self._steps()):
-                if not number and self._is_exact_enough():  # the snapshot is exact enough already
-                    break
                 if not number:
+                    if self._is_exact_enough():  # the snapshot is exact enough already
+                        break
                     messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
                     messages.warn_of_missing_direct(self.prepared, self.plan, self.settings)
                 self._pass(step)
@@ -170,18 +180,18 @@ class Render:
 
     def decided(self) -> Render:
         """Decide how to render; returns this render, or where ``merging=auto`` demands it one that merges."""
-        try:
+        with interruptible():
             self.decide()
             if not self._is_open or not (why := self._why_to_merge()):
                 return self
-            settings = replace(self.settings, merging=True)
-            merged = Render(self.prepared.scene, self.sensor, settings, self.points.seed, self.spp)
+            merged = self._like(replace(self.settings, merging=True), self.points.seed, self.spp)
             merged.meter, merged.why_merged, merged.part = self.meter, why, self.part
             merged.decide()
             return merged
-        except RuntimeError as error:
-            raise_interrupt(error)
-            raise
+
+    def _like(self, settings: Settings, seed, spp: int) -> Render:
+        """Another render of the same scene, whose preparation and cache it shares."""
+        return Render(self.prepared.scene, self.sensor, settings, seed, spp, self)
 
     def _why_to_merge(self) -> str:
         """Why this render has to merge; empty, with an entry of `skipped`, if it does not."""
@@ -204,10 +214,8 @@ class Render:
     def _finished(self):
         """At exit, also by an exception, store the finished passes in the film."""
         try:
-            yield
-        except RuntimeError as error:
-            raise_interrupt(error)
-            raise
+            with interruptible():
+                yield
         finally:
             try:
                 self.meter.wait()
@@ -220,9 +228,9 @@ class Render:
         Does nothing without alternatives, or if the render is too short for a pilot. Returns all predictions
         of the pilot, the best first.
         """
-        if self.planner.begin(self.passes):
+        if self.planner.begin():
             with self.meter.pilot():
-                self.table = self.planner.run_pilot(self.passes)
+                self.table = self.planner.run_pilot()
         self._use_plan()
         return self.table
 
@@ -248,8 +256,10 @@ class Render:
         if self._small_first is None:
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
             self._small_first = long and self.planner.threshold is None and self._plays_roulette()
+        steps = schedule(self.spp, self._longest, self.settings, self._small_first)
+        self._passes_before = self.part * len(steps)
         earlier = sum(self.passes)
-        for step in schedule(self.spp, self._longest, self.settings, self._small_first):
+        for step in steps:
             done, end = step.done, step.done + step.size
             skipped = min(earlier, step.size)
             done, earlier = done + skipped, earlier - skipped
@@ -294,7 +304,7 @@ class Render:
         """Trace the photons of a pass; returns their merging."""
         start = self.points.wavelengths(step) if mi.is_spectral else None
         points = self.points.of_photons(step, passes_since(self.passes, step.done))
-        earlier = self.part * len(schedule(self.spp, self._longest, self.settings, False)) + len(self.passes)
+        earlier = self._passes_before + len(self.passes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             photons, counts = merging.trace(self.kernel, points, step.size, earlier, start)
         self.meter.launched(counts)
@@ -442,7 +452,7 @@ class Render:
     def _first_mean(self) -> float:
         """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
         spp = -(-LEAST_OF_MEAN // int(self.prepared.camera.region.size.prod()))
-        other = Render(self.prepared.scene, self.sensor, self.settings, 0, spp)
+        other = self._like(self.settings, 0, spp)
         other._pass(Step(0, 0, spp, spp, True))
         return number(other.accumulator.mean())
 
@@ -456,6 +466,16 @@ class Render:
             return max(self.spp, done)
         predicted = max(self.meter.rate(done) * timeout, done, 1)
         return min(self.spp, 2 ** round(math.log2(predicted)))
+
+
+@contextmanager
+def interruptible():
+    """Raise the ``KeyboardInterrupt`` that an error of the body wraps, see `raise_interrupt`."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise_interrupt(error)
+        raise
 
 
 def raise_interrupt(error: BaseException):

@@ -10,8 +10,8 @@ from ..emitters.emitters import Emitters
 # Numbers of light subpaths with which a camera subpath can be connected.
 JOINED = (1, 4)
 
-# Guided samples per vertex where s = 0 is guided; the most that a replayed decision may have.
-GUIDED, MOST_GUIDED = 4, 16
+# Guided samples per vertex where s = 0 is guided.
+GUIDED = 4
 
 
 class EmissionTables(Protocol):
