@@ -185,11 +185,12 @@ def test_in_fog_it_is_missing_too():
 
 @pytest.mark.parametrize("variant", ["mono", "spectral"])
 def test_in_other_variants(variant):
-    """Expected: what is missing in an RGB variant, within 15 % (spectral variants merge photons and camera
-    subpaths of one set of wavelengths, an eighth of the photons)."""
-    expected = share_of(lost_in(slab(frosted(0.005))))
+    """Rationale: spectral variants merge photons and camera subpaths of one set of wavelengths, an eighth of
+    the photons; few in a disc make samples look more frequent. Expected: what is missing in an RGB variant,
+    within 20 % at a roughness where that decides (wider discs)."""
+    expected = share_of(lost_in(slab(frosted(0.03))))
     mi.set_variant(variants.of(variant))
-    assert share_of(lost_in(slab(frosted(0.005)))) == pytest.approx(expected, rel=0.15)
+    assert share_of(lost_in(slab(frosted(0.03)))) == pytest.approx(expected, rel=0.2)
 
 
 PLATE = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])}

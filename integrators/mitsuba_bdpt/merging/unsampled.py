@@ -32,8 +32,8 @@ from .radius import Footprints
 from .undersampled import Undersampled
 from .wavelength_sets import SETS, WavelengthSets
 
-# Merging radius in distances between camera samples on the film: discs overlap, and remain small relative to
-# the image.
+# Merging radius in distances between camera samples (of a set of wavelengths) on the film: discs overlap, and
+# remain small relative to the image.
 RADIUS = 1.5
 
 # Merging radius in pixels of `Footprints` where these cannot be measured: 1/64 of the scene's diagonal.
@@ -71,12 +71,12 @@ def estimate(
     ``kernel``: samples delta lobes only. With ``samples`` per pixel of the render it samples all lobes, and
     undersampled light is included.
     """
-    footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
-    of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() / count)
-    discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     sets, wavelengths = 1, None
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
+    footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
+    of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
+    discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
     undersampled = None if samples is None else Undersampled.of(samples)
