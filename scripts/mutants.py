@@ -1564,8 +1564,8 @@ MUTANTS = (
     Mutant(
         "merging: what merging finds is called lost",
         "planning/unsampled_light.py",
-        "    if plan.merging:  # which",
-        "    if False:  # which",
+        "    if plan.merging or ",
+        "    if ",
         (
             "tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[perspective]",
             "tests/images/test_merging.py::test_no_light_is_called_lost_that_merging_finds[thinlens]",

@@ -375,15 +375,6 @@ def test_what_is_not_finite_out_of_view_is_not_said():
     assert not [text for text in warnings if "is unknown, since" in text]
 
 
-def test_a_lens_finds_it():
-    """Rationale: with a lens, light subpaths arrive at the sensor (t = 0). Expected: nothing is said."""
-    eye = camera("thinlens", aperture_radius=0.05, focus_distance=4.0)
-    scene, integrator = scene_of(LAMPS["point"], eye, block=BLOCK), bdpt()
-    with Warned() as warnings:
-        integrator.render(scene, spp=4)
-    assert not warnings and integrator.statistics["unsampled_light"] == {}
-
-
 def test_another_share_is_not_said_anew(monkeypatch):
     """Rationale: the share in the text is of the image's mean, which has noise. Expected: one warning for two
     renders of a scene that find different shares."""

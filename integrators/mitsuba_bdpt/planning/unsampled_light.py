@@ -104,29 +104,31 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if prepared.light_media is not None and prepared.light_media.contradiction:  # it would see another scene
         return False
-    if plan.merging:  # which samples these paths
+    if plan.merging or components.why_absent("merging"):  # which samples or estimates it
         return False
-    if components.why_absent("merging"):  # which estimates their light
-        return False
-    if is_undersampling_possible(prepared, settings):
+    if is_undersampling_possible(prepared, plan, settings):
         return True
-    if plan.arrival:
-        return False
     # Light without a vertex in between: see `messages.warn_of_missing_direct`.
-    unsampled = unsampled_paths(prepared, plan, settings)
+    unsampled = () if plan.arrival else unsampled_paths(prepared, plan, settings)
     return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in unsampled)
 
 
-def is_undersampling_possible(prepared: PreparedScene, settings: Settings) -> bool:
-    """Whether near-specular lobes may leave light undersampled."""
-    narrow = prepared.narrowest >= NARROW and settings.max_depth >= SHORTEST
-    return narrow and prepared.has_small_emitter
+def is_undersampling_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
+    """Whether near-specular lobes, or a sensor that light subpaths must hit, may leave light undersampled."""
+    narrow = prepared.narrowest >= NARROW and prepared.has_small_emitter
+    return settings.max_depth >= SHORTEST and (narrow or _is_left_to_arrival(prepared, plan))
+
+
+def _is_left_to_arrival(prepared: PreparedScene, plan: Plan) -> bool:
+    """Whether t = 0 alone samples SDS paths."""
+    emitters = prepared.emitters
+    return plan.arrival and prepared.delta and bool(emitters.unhittable or emitters.beams)
 
 
 def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:
     """All that the estimate for a render of ``samples`` per pixel depends on besides the scene."""
     known = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters, _subpaths(prepared, samples)
-    if not is_undersampling_possible(prepared, settings):
+    if not is_undersampling_possible(prepared, plan, settings):
         return known
     strategies = plan.arrival, plan.endpoints, plan.connections, plan.joined, plan.camera_paths_per_light_path
     return *known, *strategies, plan.emission is None, plan.guided > 0, max(samples, PREVIEW)
@@ -144,7 +146,7 @@ def estimate(
     chosen = min(count, pixels)
     batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
-        undersampled = is_undersampling_possible(prepared, settings)
+        undersampled = is_undersampling_possible(prepared, plan, settings)
         kernel = (counting_kernel if undersampled else delta_kernel)(prepared, plan, settings)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if undersampled else ())
         drawn = points("sobol"), points("independent")
@@ -169,9 +171,8 @@ def estimate(
     size = max(never + rare, np.finfo(np.float32).tiny)
     meant = {id(bsdf) for bsdf in prepared.near_specular}
     seen, others = ([s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene)))
-    return UnsampledLight(
-        colours, through, float(never / size), float(few / size), _names(seen or others)[:NAMED]
-    )
+    sharp = seen if _is_left_to_arrival(prepared, plan) else seen or others
+    return UnsampledLight(colours, through, float(never / size), float(few / size), _names(sharp)[:NAMED])
 
 
 def _subpaths(prepared: PreparedScene, samples: int) -> int:
@@ -317,7 +318,8 @@ def _in_words(
         remedy = _remedy(prepared, lamps)
         if not plan.splat and prepared.camera.connectible:
             remedy = f"leave light_paths to the integrator, {remedy}"
-        cause, remedy = _undersampled(what, unsampled, samples, remedy)
+        by_arrival = _is_left_to_arrival(prepared, plan)
+        cause, remedy = _undersampled(what, unsampled, samples, remedy, by_arrival)
         return f"undersampled, {share}: {cause}", remedy
     what += " through glass or mirrors" if prepared.delta else " on what is seen"
     why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
@@ -331,11 +333,16 @@ def _in_words(
     return f"not sampled, {share}: {what} ({why})", remedy
 
 
-def _undersampled(what: str, unsampled: UnsampledLight, samples: int, remedy: str) -> tuple[str, str]:
-    """Cause and remedy of light of which a few samples are expected."""
-    objects = " and ".join(unsampled.sharp)
-    off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
+def _undersampled(
+    what: str, unsampled: UnsampledLight, samples: int, remedy: str, by_arrival: bool
+) -> tuple[str, str]:
+    """Cause and remedy of light of which a few samples are expected; ``by_arrival``: by t = 0 alone."""
     why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
+    objects = " and ".join(unsampled.sharp)
+    if by_arrival and not objects:
+        through = " and ".join(unsampled.through) or "glass or mirrors"
+        return f"{what} on what is seen through {through}; few light subpaths hit the sensor ({why})", remedy
+    off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
     rougher = f"or make the {'surface' if len(unsampled.sharp) == 1 else 'surfaces'} rougher"
     return f"{what} through or {off} connections rarely sample ({why})", f"{remedy}, {rougher}"
 
