@@ -511,10 +511,13 @@ def test_no_photon_is_dropped(monkeypatch):
 # -- renders -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("parameters", [{}, {"layers": "variance"}], ids=str)
+LEFT_OUT = {"layers": "strategies", "merging": "auto"}
+
+
+@pytest.mark.parametrize("parameters", [{}, {"layers": "variance"}, LEFT_OUT], ids=str)
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     """Rationale: radius and photons of a pass follow from the passes done (of the replicate). Expected: the
-    image of a render that went on is that of the one that never stopped.
+    image of a render that went on is that of the one that never stopped, and so is what it leaves out.
     """
 
     def bdpt():
@@ -522,13 +525,13 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
         return mi.load_dict(given | parameters)
 
     scene = mi.load_dict(under_glass(point()))
-    expected = np.array(bdpt().render(scene, seed=3, spp=64))
+    whole, again = bdpt(), bdpt()
+    expected = np.array(whole.render(scene, seed=3, spp=64))
     start = stopped(bdpt(), scene, 3, seed=3, spp=64)
-    again = bdpt()
-    np.testing.assert_allclose(
-        np.array(again.render(scene, seed=3, spp=64, start=start)), expected, **ROUNDING
-    )
-    assert expected.any()
+    found = np.array(again.render(scene, seed=3, spp=64, start=start))
+    np.testing.assert_allclose(found, expected, **ROUNDING)
+    assert again.statistics["skipped"] == whole.statistics["skipped"]
+    assert expected.any() == (parameters != LEFT_OUT)
 
 
 @pytest.mark.parametrize("layers", ["", "variance"])

@@ -342,8 +342,8 @@ class Render:
         The state is consistent even if an interruption comes while the next pass is recorded.
         """
         passes, arrays = self.accumulator.store()
-        decided, halves = self.planner.decided, self.accumulator.halves
-        progress = Progress(decided, self.meter.work, halves, self._small_first, self.why_merged)
+        state = self._small_first, self.why_merged, self.skipped
+        progress = Progress(self.planner.decided, self.meter.work, self.accumulator.halves, *state)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
@@ -387,7 +387,8 @@ class Render:
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
         self.accumulator.restore(snapshot.passes, arrays, progress.halves)
         self.meter.resume(progress.work, snapshot.spp)
-        self._small_first, self.why_merged = progress.small_first, progress.why_merged
+        self._small_first = progress.small_first
+        self.why_merged, self.skipped = progress.why_merged, progress.skipped
 
     def unsampled_light(self) -> dict[int, float]:
         """Return shares of the image's light that are not sampled, by index in ``scene.emitters()``.
