@@ -296,7 +296,7 @@ class Recursion:
         return h.weigh(1, mi.Float(0), camera_side, merges=merges)[0]
 
     def _joined(self, kappa, light_side, camera_side, edge, merges=0):
-        """The weight of a strategy that joins this edge (visibility.seen)."""
+        """The weight of a strategy that joins this edge (Vacuum.seen)."""
         return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge], merges)[0]
 
     def endpoints(self):

@@ -53,6 +53,7 @@ from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer, Shared
 from mitsuba_bdpt.transport.path_layers import CAUSTIC, DIRECT, INDIRECT, NAMES
 from mitsuba_bdpt.transport.photons import guided_hits, photon_guide, photon_pass
+from mitsuba_bdpt.transport.vacuum import Vacuum
 
 from instruments import oracle
 from instruments.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
@@ -698,7 +699,8 @@ def kernel_weights(
         within_store=lambda edges: mi.Bool(edges <= k),
         shape_errors=Flat(),
         hits=Hits(scene, None),
-        space=None,
+        has_media=False,
+        space=Vacuum(scene, Flat()),
         light_media=None,
         sds=None,
         cells=None,

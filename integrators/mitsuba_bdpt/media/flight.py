@@ -9,11 +9,15 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import polarization, rays
+from ..sampling.points import Purpose
+from ..transport.vacuum import Arrival
 from . import tracking
 from .media import Media, coefficients, depth_of, interaction, of_depth
 
 if TYPE_CHECKING:
-    from ..transport.walk import Walk
+    from ..sampling.points import Stream
+    from ..transport.inputs import Kernel
+    from ..transport.walk import Side, Vertex, Walk
     from .space import Space
 
 
@@ -41,23 +45,6 @@ class Edge:
     ratio: mi.UnpolarizedSpectrum | None = None
     lit: mi.Bool | None = None
 
-    def onwards(self, null: mi.Bool, length: mi.Float, medium: mi.UInt32, lit, u: mi.Float) -> Edge:
-        """Return the edge after an event at distance ``length`` from the ray's origin.
-
-        After a ``null`` event it continues, else a new one begins in ``medium``, from a vertex that is
-        ``lit``. ``u`` samples its flight.
-        """
-        return replace(
-            self,
-            medium=medium,
-            maxt=dr.select(null, self.maxt - length, dr.inf),
-            depth=dr.select(null, self.depth, 0),
-            rest=dr.select(null, self.rest, tracking.exponential(u)),
-            event=self.event + 1,
-            lit=None if lit is None else dr.select(null, self.lit, lit),
-            rays=self.rays + 1,
-        )
-
     def weight_transmittance(self, further: mi.Float | mi.UnpolarizedSpectrum | int = 0):
         """T~ of the edge so far, and of a ``further`` optical depth."""
         return of_depth(self.depth if isinstance(further, int) else self.depth + further)
@@ -72,7 +59,7 @@ class Edge:
 
 @dataclass
 class Landing:
-    """End of an edge.
+    """End of a segment of an edge.
 
     The hit ``pi`` of the ray from ``o``, or (``collided``) a collision at distance ``t``; ``edge`` and
     ``throughput`` at the end.
@@ -91,17 +78,18 @@ def choose_channel(u: mi.Float) -> mi.UInt32:
     return dr.minimum(mi.UInt32(u * count), count - 1)
 
 
-def begin(space: Space, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channel) -> Edge:
-    """First edge of a subpath; ``u`` samples its flight, ``u_channel()`` the channel."""
-    media = space.media
+def begin(space: Space, kernel: Kernel, side: str, stream: Stream, medium: mi.UInt32, ray: mi.Ray3f) -> Edge:
+    """First edge of a subpath along ``ray`` from ``medium``; ``side`` and ``stream``: its random numbers."""
+    media, points = space.media, kernel.points
     channel = ratio = None
     if not media.gray:
-        channel, ratio = choose_channel(u_channel()), mi.UnpolarizedSpectrum(1)
+        channel = choose_channel(points.draw_1d(side, stream, Purpose.CHANNEL))
+        ratio = mi.UnpolarizedSpectrum(1)
     return Edge(
         medium=mi.UInt32(medium),
-        maxt=mi.Float(maxt),
+        maxt=mi.Float(ray.maxt),
         depth=mi.Float(0) if media.gray else mi.UnpolarizedSpectrum(0),
-        rest=tracking.exponential(u),
+        rest=tracking.exponential(points.draw_1d(side, stream, Purpose.FLIGHT, 1)),
         event=mi.UInt32(1),
         rays=mi.UInt32(1),
         collisions=mi.UInt32(0) if media.grids else None,
@@ -111,18 +99,48 @@ def begin(space: Space, medium: mi.UInt32, maxt: mi.Float, u: mi.Float, u_channe
     )
 
 
-def advance(space: Space, ray: mi.Ray3f, walk: Walk, word, hidden) -> Landing:
-    """Follow the edge of a ``walk`` along ``ray`` to its end.
-
-    Random numbers of tracking follow ``word``; ``hidden``: see `_passes`.
-    """
+def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> Arrival:
+    """Follow the edge of a ``walk`` to its end, a surface or a collision."""
     active = walk.active
+    ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
+    word = kernel.points.series(side.stream, Purpose.TRACKING, walk.event)
+    hidden = None
+    if kernel.plan.hide_emitters and not side.adjoint:
+        hidden = walk.edges == 1
     landing = Landing(walk.o, walk.pi, mi.Float(0), mi.Bool(False), walk.edge, walk.throughput)
     if not space.media.see_through and hidden is None:  # no surface to pass
         landing = _segment(space.media, ray, landing, word, active)[1]
     else:
         landing = _through_surfaces(space, ray, landing, word, active, hidden)
-    return _swallowed(space.media, ray, landing, active) if space.clipped else landing
+    if space.clipped:
+        landing = _swallowed(space.media, ray, landing, active)
+    ray.o = landing.o
+    si = kernel.hits.at(landing.pi, ray, active & ~landing.collided)
+    point = dr.zeros(mi.SurfaceInteraction3f)
+    point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
+    point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
+    si, edge = dr.select(landing.collided, point, si), landing.edge
+    edge = replace(edge, maxt=edge.maxt - landing.t)
+    return Arrival(si, ray, landing.collided, landing.throughput, edge)
+
+
+def depart(
+    space: Space, kernel: Kernel, side: Side, vertex: Vertex, passes: mi.Bool, ray: mi.Ray3f
+) -> tuple[Edge, mi.Ray3f]:
+    """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
+    before, lit = vertex.edge, space.allows_next_event(vertex)
+    u = kernel.points.draw_1d(side.name, side.stream, Purpose.FLIGHT, vertex.event + 1)
+    edge = replace(
+        before,
+        medium=space.medium_towards(vertex, ray.d),
+        maxt=dr.select(passes, before.maxt, dr.inf),
+        depth=dr.select(passes, before.depth, 0),
+        rest=dr.select(passes, before.rest, tracking.exponential(u)),
+        event=before.event + 1,
+        lit=None if lit is None else dr.select(passes, before.lit, lit),
+        rays=before.rays + 1,
+    )
+    return edge, mi.Ray3f(ray.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
 
 
 def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:

@@ -74,7 +74,7 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
 def evaluate(space: Space, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
     """Evaluate the phase function of ``medium`` (index) towards the local ``wo``."""
     mei = interaction(si.p, -si.to_world(si.wi), si)
-    return Evaluation(*space.media.query(medium, _evaluated, mei, si.to_world(wo), active))
+    return Evaluation(*space.media.query(medium, _evaluated, mei, si.to_world(wo), active), mi.Bool(True))
 
 
 def sample(
@@ -108,5 +108,6 @@ def sample(
         delta=mi.Bool(False),
         null=mi.Bool(False),
         eta=mi.Float(1),
+        volume=mi.Bool(True),
     )
-    return step, Evaluation(*joined) if target else None
+    return step, Evaluation(*joined, mi.Bool(True)) if target else None

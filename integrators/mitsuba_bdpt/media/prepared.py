@@ -35,7 +35,7 @@ def prepare(
             f"{named(one)} of class {one.class_name()} polarizes what it lets pass, which is not supported "
             "in scenes with participating media; take out the media or the surface, or use volpath"
         )
-    space = Space(emitters.scene, media, emitters.shape_errors, traits.null_transmission)
+    space = Space(emitters.scene, emitters.shape_errors, media, traits.null_transmission)
     far = medium_at_far_plane(space, sensor)
     space = replace(space, clipped=far > 0 and media.objects[far - 1].is_homogeneous())
     return space, LightMedia(space, emitters, sensor, far, about)

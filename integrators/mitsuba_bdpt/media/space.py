@@ -3,34 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import drjit as dr
 import mitsuba as mi
 
-from ..geometry.rounding import ShapeErrors
+from ..geometry import polarization
+from ..sampling.points import Purpose
+from ..transport.contribution import MEDIA, Counters
+from ..transport.vacuum import Vacuum
 from . import flight, phase, transmittance
 from .media import Media
 
+# Largest optical depth of a connection's approximate transmittance, in the medium that it starts in:
+# connections of less actual depth are drawn at most e^2 times too rarely.
+_GUESSED_DEPTH = 2.0
+
 
 @dataclass(frozen=True)
-class Space:
-    """The space between vertices: ``scene``, ``media``, rounding errors of shapes.
+class Space(Vacuum):
+    """The space between vertices: the scene's ``media``.
 
     ``null_transmission(si, active)``: transmission of a surface straight through (``Spectrum``); ``clipped``:
     some camera ray ends in a homogeneous medium at the far plane, in front of the environment.
     """
 
-    scene: mi.Scene
     media: Media
-    shape_errors: ShapeErrors
     null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.UnpolarizedSpectrum]
     clipped: bool = False
 
-    # Hooks of a walk: its first edge, the end of an edge, the event at its end.
+    # Hooks of a walk: its first edge, the end of an edge, the event at its end, the next edge.
     begin = flight.begin
-    advance = flight.advance
+    arrive = flight.arrive
     sample = phase.sample
-    # Hooks of connections: the phase function, transmittance.
+    depart = flight.depart
+    # Hooks of connections: the phase function, the optical depth.
     evaluate = phase.evaluate
-    between = transmittance.between
     depth_along = transmittance.depth_along
+
+    @property
+    def scatters(self) -> bool:
+        return self.media.scatters
+
+    @property
+    def counters(self) -> tuple[str, ...]:
+        return MEDIA if self.media.grids else MEDIA[:1]
+
+    def medium_towards(self, vertex, d):
+        beyond = self.media.number(vertex.si.target_medium(d))
+        return dr.select(vertex.si.is_medium_transition(), beyond, vertex.medium)
+
+    def allows_next_event(self, vertex):
+        if self.media.all_lit:
+            return None
+        return ~vertex.volume | self.media.allows_next_event(vertex.medium)
+
+    def guessed(self, vertex, between):
+        sigma = self.media.mean(self.medium_towards(vertex, between))
+        return dr.exp(-dr.minimum(sigma * dr.norm(between), _GUESSED_DEPTH))
+
+    def seen(self, kernel, c, shadow_ray):
+        word = mi.UInt32(0)
+        if self.media.grids:
+            series = shadow_ray.stream, Purpose.TRACKING, shadow_ray.event, 1 + shadow_ray.number
+            word = kernel.points.series(*series)
+        ends = shadow_ray.ray, shadow_ray.medium, c.active, shadow_ray.own
+        crossing = transmittance.between(self, *ends, word, shadow_ray.hidden)
+        weight, shares = kernel.heuristic.weigh(*c.sides, crossing.tr)
+        return replace(
+            c,
+            value=polarization.scaled(c.value, crossing.transmittance),
+            weight=weight,
+            shares=shares,
+            active=c.active & crossing.visible,
+            counted=c.counted + Counters(segments=crossing.segments, collisions=crossing.collisions),
+        )
+
+    def clear(self, ray, medium, active):
+        return transmittance.between(self, ray, medium, active, None, mi.UInt32(0)).clear

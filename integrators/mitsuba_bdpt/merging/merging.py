@@ -225,7 +225,7 @@ def with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Co
     """The contribution ``c`` of ``drawn`` with its light group and path layer, if there are such layers."""
     photon, path_layer = drawn.photon, None
     if kernel.path_layers:
-        of_camera = path_layers.evaluated(z.layer, drawn.f, None, adjoint=False)
+        of_camera = path_layers.evaluated(z.layer, drawn.f, adjoint=False)
         path_layer = path_layers.joined(of_camera, photon.layer)
     return replace(c, light_group=kernel.light_group(photon.emitter, c.active), path_layer=path_layer)
 

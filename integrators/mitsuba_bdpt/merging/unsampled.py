@@ -136,6 +136,6 @@ def _merged(
         return seen | there, size, through
 
     state = mi.Bool(False), mi.Float(0), mi.UInt32(0)
-    state, _ = random_walk(kernel, side, walk, sample.stream, visit, state)
+    state, _ = random_walk(kernel, side, walk, visit, state)
     dr.eval(sums, state, () if undersampled is None else undersampled.kinds)
     return sums, *state

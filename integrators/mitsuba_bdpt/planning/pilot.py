@@ -137,18 +137,18 @@ class Pilot:
             size = self._size(c)
             own, squares = self._parts(size, c)
             unshadowed = own
-            if kernel.space is not None:  # its weight depends on the medium
+            if kernel.has_media:  # its weight depends on the medium
                 c, size = seen, self._size(seen)
                 own, squares = self._parts(size, seen)
             self._add_emission(replace(c, emission=lane.emission), size, start.position, seen.active)
             found = {"visible": own, **squares}
             new = {n: [dr.select(seen.active, x, 0) for x in v] for n, v in found.items()}
             new = {"unshadowed": unshadowed} | new
-            if kernel.space is not None:
+            if kernel.has_media:
                 new["drawn"] = [_drawn(a, b) for a, b in zip(new["visible"], unshadowed, strict=True)]
             return {name: _sums(sums, new[name]) for name, sums in total.items()}
 
-        names = ("unshadowed", "visible") if kernel.space is None else ("unshadowed", "visible", "drawn")
+        names = ("unshadowed", "visible", "drawn") if kernel.has_media else ("unshadowed", "visible")
         found = {name: _none(SAMPLE.parts["draw"]) for name in names}
         found |= {name: total[name] for name in ("moment", "light", "peak")}
         found, counted = connections.connect_all(kernel, z, lane.path, stream, found, add)

@@ -10,7 +10,7 @@ bump and normal maps, interpolated normals and hair; Mitsuba's importance mode w
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
 import drjit as dr
@@ -30,17 +30,22 @@ _LEAST_COS = 1e-18
 class Evaluation:
     """``value`` f |cos| (light side: with adjoint factor); densities in solid angle.
 
-    ``pdf_fwd_w`` of the new direction, ``pdf_rev_w`` of the reverse (0 without `Traits.reverse`).
+    ``pdf_fwd_w`` of the new direction, ``pdf_rev_w`` of the reverse (0 without `Traits.reverse`); ``volume``:
+    mask, scattering in a medium.
     """
 
     value: mi.Spectrum
     pdf_fwd_w: mi.Float
     pdf_rev_w: mi.Float
+    volume: mi.Bool = field(default_factory=lambda: mi.Bool(False))
 
 
 @dataclass
 class Step:
-    """A sampled direction; ``pdf_*`` as in `Evaluation`, unset where ``delta``."""
+    """A sampled event, on a surface, in a ``volume``, or ``null``.
+
+    ``pdf_*`` as in `Evaluation`, unset where ``delta``; ``cos_out``: geometric cosine of ``wo``.
+    """
 
     wo: mi.Vector3f
     weight: mi.Spectrum
@@ -50,6 +55,7 @@ class Step:
     delta: mi.Bool
     null: mi.Bool
     eta: mi.Float
+    volume: mi.Bool = field(default_factory=lambda: mi.Bool(False))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from .contribution import (
     MEDIA,
     Contribution,
     Counters,
-    counted_in_media,
     drop_non_finite,
     layers,
     one,
@@ -26,8 +25,8 @@ from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex
 from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
-from .visibility import ShadowRay, guessed, seen
-from .walk import Vertex, allows_next_event, hard_merges, newest_coefficient, where_lit
+from .vacuum import ShadowRay
+from .walk import Vertex, direct_coefficient, hard_merges, newest_coefficient
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -51,8 +50,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~spectra.is_zero(value)
 
-    direct = where_lit(kernel, kernel.kappa.direct, allows_next_event(kernel, y))
-    newest_y = newest_coefficient(kernel, direct, y.edges)
+    newest_y = newest_coefficient(kernel, direct_coefficient(kernel, y), y.edges)
     at_y = newest_y, f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
     newest_z = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
     at_z = newest_z, f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
@@ -72,11 +70,11 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """Connect ``z`` with every stored light vertex, with a shadow ray each.
 
     ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility
-    (`visibility.seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
+    (`Vacuum.seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    crossed = Counters.zeros(*counted_in_media(kernel.space))
+    crossed = Counters.zeros(*kernel.space.counters)
     while dr.hint(
         slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
     ):
@@ -84,8 +82,9 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
         lost += c.counted.non_finite
-        shadow_ray = _shadow_ray(kernel, z, y).numbered(kernel, stream, z.event, slot + 1)
-        visible = seen(kernel, c, shadow_ray)
+        ray, own = _shadow_ray(kernel, z, y)
+        medium = kernel.space.medium_towards(z, ray.d)
+        visible = kernel.space.seen(kernel, c, ShadowRay(ray, medium, stream, z.event, slot + 1, own))
         total = add(_as_drawn(kernel, z, y, c), visible, total)
         crossed = crossed + Counters(**{name: getattr(visible.counted, name) for name in MEDIA})
         slot += 1
@@ -122,18 +121,18 @@ def connect_one(
     end, own = drawn.end, None
     if kernel.shape_errors.small:
         y = read_light_vertex(kernel, path, drawn.end)
-        shadow_ray = _shadow_ray(kernel, z, y)
-        ray, own, end = shadow_ray.ray, shadow_ray.own, y.si.p
+        (ray, own), end = _shadow_ray(kernel, z, y), y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     kernel.observer.drawn(end)
-    if kernel.space is None:
-        active &= ~rays.occluded(kernel.scene, ray, active, own)
-        return dr.select(active, value / survival, 0), counted, drawn.layers
-    shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, ray.d)).numbered(kernel, stream, z.event, 1)
-    estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
+    estimate = value / survival
+    if drawn.sides is not None:
+        estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
+    shadow_ray = ShadowRay(ray, kernel.space.medium_towards(z, ray.d), stream, z.event, 1, own)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
-    c = drop_non_finite(seen(kernel, c, shadow_ray))
+    c = kernel.space.seen(kernel, c, shadow_ray)
+    if drawn.sides is not None:  # only now with its weight
+        c = drop_non_finite(c)
     return c.weighted(), counted + c.counted, drawn.layers
 
 
@@ -181,7 +180,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     path_layer = None
     if kernel.path_layers:  # as wide as the lanes, see `Walk.begin`
         path_layer = dr.full(mi.UInt32, path_layers.INDIRECT, dr.width(candidates))
-    if kernel.space is not None:
+    if kernel.has_media:
         empty = kernel.heuristic.zero()
         kept = dr.zeros(mi.Spectrum), empty, empty, mi.Float(0)
     while dr.hint(
@@ -253,18 +252,13 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
     """The connection ``c`` as drawn: in media with an approximate transmittance."""
-    if kernel.space is None:
-        return c
-    between = y.si.p - z.si.p
-    guess = guessed(kernel, z.medium_towards(kernel, between), dr.norm(between))
-    return replace(c, value=c.value * guess)
+    return replace(c, value=c.value * kernel.space.guessed(z, y.si.p - z.si.p))
 
 
-def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> ShadowRay:
-    """Shadow ray from ``z`` to the light vertex ``y``."""
+def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> tuple[mi.Ray3f, rays.Own | None]:
+    """Shadow ray from ``z`` to the light vertex ``y``, see `rays.shadow_ray`."""
     met = rounding.met(y.si.shape, y.si.instance)
-    ray, own = rays.shadow_ray(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
-    return ShadowRay(ray, own, z.medium_towards(kernel, ray.d))
+    return rays.shadow_ray(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
@@ -274,6 +268,6 @@ def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     are no edges), or slots of several light subpaths, several vertices may have the same number.
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
-    if kernel.space is not None or path.proxies is not None:
+    if kernel.has_media or path.proxies is not None:
         return dr.select(possible, path.count, 0)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

@@ -11,7 +11,6 @@ import mitsuba as mi
 from ..emitters.records import Cell
 from . import spectra
 from .inputs import Kernel
-from .plan import Plan
 
 # Least survival probability of roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
@@ -86,24 +85,22 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counted_in_media(space) -> list[str]:
-    """Names of the counters of edges in media; collisions only with grids."""
-    return [] if space is None else list(MEDIA if space.media.grids else MEDIA[:1])
-
-
-def counted_by_light(plan: Plan, space) -> Counters:
+def counted_by_light(kernel: Kernel) -> Counters:
     """Counters of the vertices of light subpaths."""
+    plan = kernel.plan
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     names += ["non_finite"] * (plan.splat or plan.arrival)
-    return Counters.zeros(*names, *counted_in_media(space) * plan.splat)
+    return Counters.zeros(*names, *kernel.space.counters * plan.splat)
 
 
-def counted_by_camera(plan: Plan, space) -> Counters:
+def counted_by_camera(kernel: Kernel) -> Counters:
     """Counters of the vertices of camera subpaths."""
+    plan = kernel.plan
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     names += ["shadow_inner", "evaluated", "zero"] * inner
-    return Counters.zeros(*names, *counted_in_media(space) * (plan.direct or inner))
+    counters = Counters.zeros(*names, *kernel.space.counters * (plan.direct or inner))
+    return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
 
 
 @dataclass
@@ -113,7 +110,7 @@ class Contribution:
     ``value``: unweighted spectrum; ``weight`` in [0, 1]; ``s``, ``t``: numbers of light and camera vertices;
     ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`; ``position`` on the film in pixels, None
     for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
-    the connected edge until `visibility.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
+    the connected edge until `Vacuum.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
     ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
     sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, ``path_layer`` of the path (see
     `path_layers`), None without such layers.

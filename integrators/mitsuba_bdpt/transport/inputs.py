@@ -15,6 +15,7 @@ from ..settings import MAX_STORED, Settings
 from . import mis
 from .plan import Plan
 from .sds import PhotonStrategy
+from .vacuum import Vacuum
 
 if TYPE_CHECKING:
     from ..emitters.light_groups import LightGroups
@@ -100,15 +101,16 @@ class Kernel:
         # Whether a strategy in use starts from the light's side, so that weights need reverse densities.
         self.reverse = plan.light or plan.merging or plan.guided > 0
         self.traits = prepared.traits if self.reverse else prepared.traits.from_one_side()
-        self.space = prepared.space
+        self.has_media = prepared.space is not None
+        self.space = prepared.space or Vacuum(self.scene, self.shape_errors)
         self.light_media = prepared.light_media
         if self.light_media is not None and plan.light:
             self.light_media.settle()
-        self.sensor_medium = None if self.space is None else u32(self.space.media.sensor)
-        self.scatters = self.surfaces or (self.space is not None and self.space.media.scatters)
+        self.sensor_medium = u32(self.space.media.sensor) if self.has_media else None
+        self.scatters = self.surfaces or self.space.scatters
         depth = settings.max_depth
         reach = min(depth, prepared.stored_vertices(settings))
-        kept = plan.joined * (min(reach - 2, KEPT) if self.space is not None else reach - 2)
+        kept = plan.joined * (min(reach - 2, KEPT) if self.has_media else reach - 2)
         self.store_size = next(size for size in STORE_SIZES if size >= kept)
         self.strategy_images = settings.strategy_images
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)

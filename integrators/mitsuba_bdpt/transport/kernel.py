@@ -57,11 +57,11 @@ In scenes with media y and z may lie in one as well; null surfaces are passed an
 
     the medium of the first edge <- boundaries around the emitter; the      media.light_media
         one that the sensor declares
-    an edge ends where a flight collides, or at a surface that is not       walk._landing, media.flight
+    an edge ends where a flight collides, or at a surface that is not       media.flight
         null; throughput <- times the albedo
     d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
     BSDF -> phase function, cosine -> 1, in a volume                        scattering, media.phase
-    a shadow ray -> transmittance T of the value and T~ of the weight       visibility, media.transmittance
+    a shadow ray -> transmittance T of the value and T~ of the weight       media.space, media.transmittance
     store y -> of a long subpath 64 reweighted vertices                     light_path.Thinning
 
 Each strategy i of a path adds w_i f / (n_i p_i), with n_i its number of samples per camera sample: the light
@@ -90,7 +90,7 @@ from . import (
     techniques,
 )
 from .batch import Batch, Places, Sharing
-from .contribution import Counters, counted_by_camera, counted_by_light, counted_in_media, one
+from .contribution import Counters, counted_by_camera, counted_by_light
 from .inputs import Kernel, Observer, Shared
 from .subpaths import CameraSample
 from .walk import random_walk
@@ -179,7 +179,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
 @dr.syntax
 def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path):
     """Trace the light subpaths of a lane one after the other, see `_light_subpath`."""
-    counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel.plan, kernel.space)
+    counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel)
     number, count = mi.UInt32(0), kernel.plan.joined
     while dr.hint(
         number < count,
@@ -228,7 +228,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
             light_path.store_light_vertex(kernel, vertex, path)
         return path, counters
 
-    if kernel.space is not None:
+    if kernel.has_media:
         # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
@@ -237,10 +237,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     sds = kernel.sds if plan.arrival or near_specular else None
     walk = subpaths.light_walk(kernel, e, stream, shared, sds)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)
-    state = path, counted_by_light(plan, kernel.space)
-    (path, counted), walk = random_walk(kernel, side, walk, stream, visit, state)
-    counters += counted + walk.counted(active)
-    counters += Counters(light=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
+    state = path, counted_by_light(kernel)
+    (path, counted), walk = random_walk(kernel, side, walk, visit, state)
+    counters += counted + walk.counted("light", active)
     return path, counters, emitted
 
 
@@ -250,8 +249,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 @dr.syntax
 def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Counters:
     """Call ``trace_sample`` for each camera sample of the lane; returns the counters."""
-    walked = Counters.zeros("camera", *counted_in_media(kernel.space))
-    counters = walked + _camera_counters(kernel)
+    counters = Counters.zeros("camera", *kernel.space.counters) + counted_by_camera(kernel)
     number = mi.UInt32(0)
     while dr.hint(
         number < kernel.camera_paths,
@@ -263,11 +261,6 @@ def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Count
     return counters
 
 
-def _camera_counters(kernel: Kernel) -> Counters:
-    counters = counted_by_camera(kernel.plan, kernel.space)
-    return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
-
-
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and connect it with the lane's light subpath."""
     sample = subpaths.camera_sample(kernel, lane.place, lane.shared, slot, active)
@@ -275,10 +268,9 @@ def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     walk = subpaths.camera_walk(kernel, sample, active)
     side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha)
     visit = _camera_visit(kernel, sink, lane, sample)
-    state = sink.begin(), _camera_counters(kernel)
-    (total, counters), walk = random_walk(kernel, side, walk, sample.stream, visit, state)
-    counters += Counters(camera=dr.select(active, walk.traced(), 0), non_finite=one(walk.broken))
-    counters += walk.counted(active)
+    state = sink.begin(), counted_by_camera(kernel)
+    (total, counters), walk = random_walk(kernel, side, walk, visit, state)
+    counters += walk.counted("camera", active)
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 

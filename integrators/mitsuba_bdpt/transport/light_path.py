@@ -39,9 +39,9 @@ class StoredVertex:
     sds: Any = None  # a `State`
 
     @property
-    def volume(self) -> mi.Bool | None:
-        """Mask: in a medium; None in scenes without media."""
-        return None if self.medium is None else self.medium != 0
+    def volume(self) -> mi.Bool:
+        """Mask: in a medium."""
+        return mi.Bool(False) if self.medium is None else self.medium != 0
 
     def cosine(self, d: mi.Vector3f) -> mi.Float:
         """Absolute geometric cosine of ``d``, 1 in volumes."""
@@ -57,7 +57,7 @@ class StoredVertex:
             throughput_over_cos=mi.Spectrum(vertex.throughput / vertex.cos),
             partial=vertex.partial,
             edges=vertex.edges,
-            medium=None if vertex.volume is None else dr.select(vertex.volume, vertex.edge.medium, 0),
+            medium=None if vertex.edge is None else dr.select(vertex.volume, vertex.edge.medium, 0),
             layer=vertex.layer,
             sds=vertex.sds,
         )
@@ -141,7 +141,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
-        medium=None if kernel.space is None else dr.alloc_local(mi.UInt32, size),
+        medium=dr.alloc_local(mi.UInt32, size) if kernel.has_media else None,
         light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
         light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
         layers=dr.alloc_local(mi.UInt32, size) if kernel.path_layers else None,

@@ -61,9 +61,11 @@ def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> lis
 def is_narrow(f, least: float | None = None):
     """Mask: near-specular scattering, by its densities from both sides, so that both subpaths agree.
 
-    ``f``: an `Evaluation`, or a `Step` that is not delta; ``least`` density, by default `NARROW`.
+    Never in a medium. ``f``: an `Evaluation`, or a `Step` that is not delta; ``least`` density, by default
+    `NARROW`.
     """
-    return dr.minimum(f.pdf_fwd_w, f.pdf_rev_w) >= (NARROW if least is None else least)
+    least = NARROW if least is None else least
+    return ~f.volume & (dr.minimum(f.pdf_fwd_w, f.pdf_rev_w) >= least)
 
 
 def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:

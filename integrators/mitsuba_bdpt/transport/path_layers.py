@@ -32,29 +32,20 @@ EMISSION, DIRECT, INDIRECT, CAUSTIC = range(len(NAMES))
 _SPECULAR = len(NAMES)
 
 
-def sampled(layer: mi.UInt32, step: Step, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
-    """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before.
-
-    ``volume``: the vertex is in a medium; None in scenes without media.
-    """
-    specular = step.delta | _is_specular(step, volume)
-    return dr.select(step.null, layer, _after(layer, specular, adjoint))
+def sampled(layer: mi.UInt32, step: Step, adjoint: bool) -> mi.UInt32:
+    """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before."""
+    return dr.select(step.null, layer, _after(layer, step.delta | is_narrow(step), adjoint))
 
 
-def evaluated(layer: mi.UInt32, f: Evaluation, volume: mi.Bool | None, adjoint: bool) -> mi.UInt32:
+def evaluated(layer: mi.UInt32, f: Evaluation, adjoint: bool) -> mi.UInt32:
     """The same after an event whose directions were given, with evaluation ``f``."""
-    return _after(layer, _is_specular(f, volume), adjoint)
+    return _after(layer, is_narrow(f), adjoint)
 
 
 def connected(z, f_z: Evaluation, y, f_y: Evaluation) -> mi.UInt32:
     """Layer of the path that connects the vertices ``z`` and ``y`` of a camera and a light subpath."""
-    of_camera = evaluated(z.layer, f_z, z.volume, adjoint=False)
-    return joined(of_camera, evaluated(y.layer, f_y, y.volume, adjoint=True))
-
-
-def _is_specular(event: Step | Evaluation, volume: mi.Bool | None) -> mi.Bool:
-    narrow = is_narrow(event)
-    return narrow if volume is None else narrow & ~volume
+    of_camera = evaluated(z.layer, f_z, adjoint=False)
+    return joined(of_camera, evaluated(y.layer, f_y, adjoint=True))
 
 
 def joined(of_camera: mi.UInt32, of_light: mi.UInt32) -> mi.UInt32:

@@ -12,16 +12,13 @@ from .bsdf import Evaluation, Target
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
     """Continue a subpath: the `Step`, and the `Evaluation` of ``target`` or None."""
     take = bsdf.sample_adjoint if adjoint else bsdf.sample
-    if vertex.volume is None:
-        return take(vertex.bsdf, vertex.si, u1, u2, active, kernel.traits, target)
-    on_surface = _of(target, ~vertex.volume)
-    step, f = None, None
+    step, f, on_surface = None, None, _of(target, ~vertex.volume)
     if kernel.surfaces:
         step, f = take(vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface)
-    if not kernel.space.media.scatters:
+    if not kernel.space.scatters:
         return step, f
-    medium, active = vertex.edge.medium, active & vertex.volume
-    in_volume = kernel.space.sample(medium, vertex.si, u1, u2, active, _of(target, vertex.volume))
+    of_medium, active = _of(target, vertex.volume), active & vertex.volume
+    in_volume = kernel.space.sample(vertex.medium, vertex.si, u1, u2, active, of_medium)
     return in_volume if step is None else dr.select(vertex.volume, in_volume, (step, f))
 
 
@@ -33,37 +30,25 @@ def _of(target: Target | None, mask: mi.Bool) -> Target | None:
 def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, reverse: bool = True) -> Evaluation:
     """Evaluate a camera vertex towards the local ``wo``, with both densities (``reverse``) or one."""
     traits = kernel.traits if reverse else kernel.traits.from_one_side()
-    if vertex.volume is None:
-        return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active, traits)
-    return _chosen(
-        kernel,
-        vertex,
-        vertex.edge.medium,
-        wo,
-        active,
-        lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, traits),
+    return _evaluated(
+        kernel, vertex, wo, active, lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, traits)
     )
 
 
 def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio) -> Evaluation:
     """Evaluate a light vertex towards the local ``wo``, see `bsdf.evaluate_adjoint`."""
-    if vertex.volume is None:
-        return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, active, kernel.traits, cos_ratio)
-    return _chosen(
-        kernel,
-        vertex,
-        vertex.medium,
-        wo,
-        active,
-        lambda mask: bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, mask, kernel.traits, cos_ratio),
-    )
+
+    def on_surface(mask):
+        return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, mask, kernel.traits, cos_ratio)
+
+    return _evaluated(kernel, vertex, wo, active, on_surface)
 
 
-def _chosen(kernel, vertex, medium, wo, active, surface) -> Evaluation:
-    """Evaluation by ``surface`` (a function of a mask) or by the vertex's medium."""
-    if not kernel.space.media.scatters:
-        return surface(active & ~vertex.volume)
-    in_volume = kernel.space.evaluate(medium, vertex.si, wo, active & vertex.volume)
+def _evaluated(kernel, vertex, wo, active, on_surface) -> Evaluation:
+    """Evaluation by ``on_surface``, a function of a mask, or by the vertex's medium."""
+    if not kernel.space.scatters:
+        return on_surface(active & ~vertex.volume)
+    in_volume = kernel.space.evaluate(vertex.medium, vertex.si, wo, active & vertex.volume)
     if not kernel.surfaces:
         return in_volume
-    return dr.select(vertex.volume, in_volume, surface(active & ~vertex.volume))
+    return dr.select(vertex.volume, in_volume, on_surface(active & ~vertex.volume))

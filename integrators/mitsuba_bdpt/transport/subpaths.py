@@ -84,8 +84,8 @@ def light_walk(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) ->
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
     edge = None
-    if kernel.space is not None:
-        edge = _first_edge(kernel, "light", stream, kernel.light_media.at(e), ray)
+    if kernel.has_media:
+        edge = kernel.space.begin(kernel, "light", stream, kernel.light_media.at(e), ray)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     walk = replace(walk, broken=broken)
     return walk if sds is None else sds.begin_light(kernel, walk)
@@ -95,6 +95,7 @@ def light_side(kernel: Kernel, e, stream, shared, walk, sds: PhotonStrategy | No
     """The `Side` of a light subpath."""
     return Side(
         "light",
+        stream,
         shared,
         spectra.brightest(walk.throughput),
         True,
@@ -125,8 +126,8 @@ def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
     """A camera subpath on its first edge."""
     start, edge = sample.start, None
     ray = start.ray
-    if kernel.space is not None:
-        edge = _first_edge(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
+    if kernel.has_media:
+        edge = kernel.space.begin(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
     if kernel.plan.hide_emitters and edge is None:
         pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
     else:
@@ -144,6 +145,7 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False)
 
     return Side(
         "camera",
+        sample.stream,
         shared,
         spectra.brightest(walk.throughput),
         False,
@@ -156,9 +158,6 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False)
     )
 
 
-# -- the first edge of either ------------------------------------------------------------------
-
-
 def _first_partial(kernel: Kernel, start):
     """Partial sums of a camera subpath's first edge: t = 1 is newest, t = 0 older."""
     h = kernel.heuristic
@@ -166,14 +165,3 @@ def _first_partial(kernel: Kernel, start):
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):
         arrival = h.present(arrival)
     return mis.Partial(h.start(dr.rcp(start.pdf_w)), arrival)
-
-
-def _first_edge(kernel: Kernel, side: str, stream, medium, ray):
-    """The first edge of a subpath along ``ray`` from ``medium``, in scenes with media."""
-    points = kernel.points
-
-    def u_channel():
-        return points.draw_1d(side, stream, Purpose.CHANNEL)
-
-    u = points.draw_1d(side, stream, Purpose.FLIGHT, 1)
-    return kernel.space.begin(medium, ray.maxt, u, u_channel)

@@ -20,11 +20,11 @@ from . import bsdf, mis, path_layers, spectra
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
 from .sds import PhotonStrategy
-from .visibility import ShadowRay, seen
+from .vacuum import ShadowRay
 from .walk import (
     Vertex,
     Walk,
-    allows_next_event,
+    direct_coefficient,
     hard_merges,
     hard_merges_before_end,
     newest_coefficient,
@@ -35,13 +35,9 @@ from .walk import (
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     """Mask: the camera subpath has hit a visible emitter."""
     active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
-    if z.volume is not None:
-        active &= ~z.volume
-        if kernel.plan.hide_emitters:  # as in `volpath`
-            active &= z.seen
-    elif kernel.plan.hide_emitters:  # as in `path`: the environment is behind null surfaces too
-        active &= z.hit | z.seen
-    return active
+    if kernel.plan.hide_emitters:  # as in `volpath`; in `path` the environment is behind null surfaces too
+        active &= z.seen if kernel.has_media else z.hit | z.seen
+    return active & ~z.volume
 
 
 def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contribution:
@@ -57,7 +53,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
     endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need exactly this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    direct = where_lit(kernel, kernel.kappa.direct, None if z.edge is None else z.edge.lit)
+    direct = where_lit(kernel, z.edge.lit if kernel.has_media else None)
     newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
     older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # no light subpath comes straight from infinity past all shapes
@@ -114,7 +110,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     Returns an `emitters.Direct` and its `bsdf.Target`.
     """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
-    if (lit := allows_next_event(kernel, z)) is not None:
+    if (lit := kernel.space.allows_next_event(z)) is not None:
         active &= lit
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
@@ -154,7 +150,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
-    shadow_ray = ShadowRay(ray, own, z.medium_towards(kernel, e.d)).numbered(kernel, stream, z.event)
+    shadow_ray = ShadowRay(ray, kernel.space.medium_towards(z, e.d), stream, z.event, own=own)
     emission = None
     if kernel.cells is not None:
         cos = dr.abs(dr.dot(e.anchor.n, e.d))
@@ -164,8 +160,8 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(e.index, active)
     if kernel.path_layers:
-        c.path_layer = path_layers.evaluated(z.layer, f, z.volume, adjoint=False)
-    return seen(kernel, c, shadow_ray)
+        c.path_layer = path_layers.evaluated(z.layer, f, adjoint=False)
+    return kernel.space.seen(kernel, c, shadow_ray)
 
 
 def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
@@ -198,7 +194,7 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     weight, shares = h.weigh(*sides)
 
     ray = rays.segment(emission.anchor, connection.anchor, emission.si)
-    if kernel.space is not None:  # the sensor's medium is known in every direction
+    if kernel.has_media:  # the sensor's medium is known in every direction
         ray = rays.segment(connection.anchor, emission.anchor, emission.si)
     # From the sensor towards infinity, for light from infinity.
     away = rays.spawn(connection.anchor, -connection.d, emission.si)
@@ -210,7 +206,7 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     c = replace(c, towards=connection.d)
     if kernel.path_layers:
         c.path_layer = mi.UInt32(path_layers.EMISSION)
-    return seen(kernel, c, ShadowRay(ray, medium=kernel.sensor_medium).numbered(kernel, stream, mi.UInt32(0)))
+    return kernel.space.seen(kernel, c, ShadowRay(ray, kernel.sensor_medium, stream, mi.UInt32(0)))
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
@@ -238,7 +234,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
-    direct = where_lit(kernel, kernel.kappa.direct, allows_next_event(kernel, y))
+    direct = direct_coefficient(kernel, y)
     newest = newest_coefficient(kernel, direct, y.edges)
     densities = f.pdf_rev_w, connection.pdf_w * to_area
     light_side = mis.alternatives(h, y.partial, newest, *densities)
@@ -256,13 +252,13 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, connection.anchor, y.si)
-    medium = y.medium_towards(kernel, connection.d)
-    shadow_ray = ShadowRay(ray, medium=medium, hidden=kernel.plan.hide_emitters)
+    medium = kernel.space.medium_towards(y, connection.d)
+    shadow_ray = ShadowRay(ray, medium, stream, y.event, hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
     if kernel.path_layers:
-        of_light = path_layers.evaluated(y.layer, f, y.volume, adjoint=True)
+        of_light = path_layers.evaluated(y.layer, f, adjoint=True)
         c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), of_light)
-    return seen(kernel, c, shadow_ray.numbered(kernel, stream, y.event))
+    return kernel.space.seen(kernel, c, shadow_ray)
 
 
 # Relative rounding error of distances.
@@ -280,7 +276,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     z = kernel.camera.hit(_reaching(walk, y), y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
     throughput, tr = walk.throughput, None
-    if kernel.space is not None:
+    if kernel.has_media:
         reached, depth = _edge_to_sensor(kernel, walk, y, z, active)
         active &= reached
         throughput = walk.edge.without_collision(throughput, depth)
@@ -307,7 +303,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=hard)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
-        active &= ~(asked & hidden(kernel, z.surroundings, asked))
+        active &= ~asked | kernel.space.clear(z.surroundings, kernel.sensor_medium, asked)
     ends = walk.edges + 1, mi.UInt32(0)
     c = Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
     if walk.layer is not None:
@@ -317,7 +313,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
 
 def _reaching(walk: Walk, y: Vertex):
     """``walk`` for `Sensor.hit`: in scenes with media its edge ends at ``y``."""
-    if y.landing is None:
+    if y.edge is None:
         return walk
     return replace(walk, pi=_End(y.hit, dr.norm(y.si.p - walk.previous)))
 
@@ -344,13 +340,6 @@ def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active)
     depth = kernel.space.depth_along(ray, walk.edge.medium, active)
     before_end = ~y.hit | (distance <= dr.norm(y.si.p - walk.previous) * (1 + _ROUNDING))
     return (length > 0) & before_end, depth
-
-
-def hidden(kernel: Kernel, ray: mi.Ray3f, active):
-    """Mask: a surface blocks ``ray``."""
-    if kernel.space is None:
-        return rays.occluded(kernel.scene, ray, active)
-    return ~kernel.space.between(ray, kernel.sensor_medium, active, None, mi.UInt32(0)).clear
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):

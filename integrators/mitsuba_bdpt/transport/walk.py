@@ -15,10 +15,10 @@ import mitsuba as mi
 
 from ..emitters.records import Direct
 from ..geometry import polarization, rays
-from ..sampling.points import Purpose
+from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, scattering, spectra
-from .contribution import Counters
+from .contribution import Counters, one
 from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
@@ -85,14 +85,15 @@ class Walk:
         """Closest-hit rays of an ended walk, whose last step traces no ray."""
         return dr.maximum(self.edges if self.edge is None else self.edge.rays, 2) - 1
 
-    def counted(self, active: mi.Bool) -> Counters:
-        """Counters of the edges of an ended walk, in lanes ``active`` at its start."""
+    def counted(self, name: str, active: mi.Bool) -> Counters:
+        """Counters of an ended walk, in lanes ``active`` at its start; ``name``: of its closest-hit rays."""
+        rays = dr.select(active, self.traced(), 0)
+        counters = Counters(**{name: rays}, non_finite=one(self.broken))
         if self.edge is None:
-            return Counters()
-        segments, collisions = dr.select(active, self.traced(), 0), self.edge.collisions
-        return Counters(
-            segments=segments, collisions=None if collisions is None else dr.select(active, collisions, 0)
-        )
+            return counters
+        collisions = self.edge.collisions
+        collisions = None if collisions is None else dr.select(active, collisions, 0)
+        return counters + Counters(segments=rays, collisions=collisions)
 
 
 @dataclass
@@ -102,8 +103,8 @@ class Vertex:
     ``partial``: in the area measure (camera subpaths that left the scene: solid angle); ``cos``: absolute
     geometric cosine of the edge to it; ``anchor``: starts rays; ``hit``: false in the environment;
     ``endpoint`` of its connection and the BSDF ``f`` towards it (a `bsdf.Evaluation`), where
-    ``endpoint_active``, see `Side`; ``event``: index of its random numbers. In scenes with media ``volume``:
-    mask, in a medium; ``landing``: end of its edge; else None. ``layer``: that of `Walk` on arrival.
+    ``endpoint_active``, see `Side`; ``event``: index of its random numbers; ``volume``, ``edge``: see
+    `vacuum.Arrival`. ``layer``: that of `Walk` on arrival.
     """
 
     si: mi.SurfaceInteraction3f
@@ -118,8 +119,8 @@ class Vertex:
     hit: mi.Bool
     active: mi.Bool
     event: mi.UInt32
-    volume: mi.Bool | None = None
-    landing: Any = None  # a `media.flight.Landing`
+    volume: mi.Bool
+    edge: Any = None
     # Set with a `Side.connect`.
     endpoint: Any = None  # a `Direct`, or a `CameraConnection`
     endpoint_active: Any = None
@@ -132,9 +133,9 @@ class Vertex:
     sds: Any = None  # an `sds.State`
 
     @property
-    def edge(self) -> Any:
-        """Its incident edge; None in scenes without media."""
-        return None if self.landing is None else self.landing.edge
+    def medium(self) -> mi.UInt32:
+        """Index of the medium of its incident edge."""
+        return self.edge.medium
 
     def cosine(self, d: mi.Vector3f) -> mi.Float:
         """Absolute geometric cosine of ``d``, 1 in volumes."""
@@ -142,38 +143,25 @@ class Vertex:
 
     def connectible(self):
         """Mask: its distribution of directions is not purely delta."""
-        of_surface = bsdf.connectible(self.bsdf)
-        return of_surface if self.volume is None else of_surface | self.volume
-
-    @property
-    def medium(self) -> Any:
-        """Index of the medium of its incident edge."""
-        return self.edge.medium
-
-    def medium_towards(self, kernel: Kernel, d: mi.Vector3f) -> mi.UInt32 | None:
-        """Index of the medium in direction ``d``; None in scenes without media."""
-        if self.landing is None:
-            return None
-        beyond = kernel.space.media.number(self.si.target_medium(d))
-        return dr.select(self.si.is_medium_transition(), beyond, self.edge.medium)
+        return bsdf.connectible(self.bsdf) | self.volume
 
 
-def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool | None) -> mi.Float:
+def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool) -> mi.Float:
     """Factor D of the geometry term: absolute geometric cosine, 1 in a ``volume``."""
-    cos = dr.abs(dr.dot(si.n, d))
-    return cos if volume is None else dr.select(volume, 1, cos)
+    return dr.select(volume, 1, dr.abs(dr.dot(si.n, d)))
 
 
 @dataclass(frozen=True)
 class Side:
     """Constants of a subpath, which distinguish the two kinds.
 
-    ``shared``: time and wavelengths; ``reference``: throughput that roulette compares with; ``adjoint``:
-    light travels with the walk; ``coefficient``: kappa of the class of the newest alternative at vertex 1
-    (next-event estimation on the light side, t = 1 on the camera side); ``alpha``: the film needs to know
-    whether a non-null event happened; ``parallel``: the first edge has one direction, with density one across
-    it; ``isolated``, ``only_delta``: the subpath ends once the flag of `Walk` is false; ``only_specular``: it
-    ends at an event that is not delta and has a smaller density from one side (1 / sr; 0: at none).
+    ``stream`` of its random numbers; ``shared``: time and wavelengths; ``reference``: throughput that
+    roulette compares with; ``adjoint``: light travels with the walk; ``coefficient``: kappa of the class of
+    the newest alternative at vertex 1 (next-event estimation on the light side, t = 1 on the camera side);
+    ``alpha``: the film needs to know whether a non-null event happened; ``parallel``: the first edge has one
+    direction, with density one across it; ``isolated``, ``only_delta``: the subpath ends once the flag of
+    `Walk` is false; ``only_specular``: it ends at an event that is not delta and has a smaller density from
+    one side (1 / sr; 0: at none).
     Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
@@ -182,6 +170,7 @@ class Side:
     """
 
     name: str
+    stream: Stream
     shared: Shared
     reference: mi.Float
     adjoint: bool
@@ -209,35 +198,34 @@ def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3
 
 
 @dr.syntax
-def random_walk(kernel: Kernel, side: Side, walk: Walk, stream, visit, state):
+def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the ended walk.
 
     ``visit(vertex, state, walk)`` returns the new state; ``walk`` as before its arrival.
     """
-    kernel.observer.started(kernel, side, walk, stream)
+    kernel.observer.started(kernel, side, walk, side.stream)
     while dr.hint(
         walk.active,
         # Dr.Jit's kernel cache does not distinguish sizes of local memory; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
-        exclude=[kernel, side, stream, visit],  # constants, see `Walk`
+        exclude=[kernel, side, visit],  # constants, see `Walk`
     ):
-        vertex = _vertex(kernel, side, walk, stream)
-        step = _interact(kernel, side, walk, vertex, stream)
+        vertex = _vertex(kernel, side, walk)
+        step = _interact(kernel, side, walk, vertex)
         kernel.observer.vertex(side, walk, vertex, step)
         state = visit(vertex, state, walk)
-        walk = _scatter(kernel, side, walk, vertex, step, stream)
+        walk = _scatter(kernel, side, walk, vertex, step)
     return state, walk
 
 
-def allows_next_event(kernel: Kernel, vertex):
-    """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
-    if kernel.space is None or kernel.space.media.all_lit:
-        return None
-    return ~vertex.volume | kernel.space.media.allows_next_event(vertex.medium)
+def direct_coefficient(kernel: Kernel, vertex) -> mis.Coefficient:
+    """kappa of next-event estimation at ``vertex``, 0 where a medium does not allow it."""
+    return where_lit(kernel, kernel.space.allows_next_event(vertex))
 
 
-def where_lit(kernel: Kernel, direct: mis.Coefficient, lit) -> mis.Coefficient:
-    """Coefficient of next-event estimation where it is allowed (`allows_next_event`), else 0."""
+def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
+    """kappa of next-event estimation where ``lit`` (None: everywhere), else 0."""
+    direct = kernel.kappa.direct
     return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
 
 
@@ -255,21 +243,13 @@ def newest_connection(kernel: Kernel, first: mis.Coefficient, vertex: Vertex) ->
     return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
 
 
-def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
+def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
-    ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
-    landing = tr = volume = None
-    if kernel.space is None:
-        si = kernel.hits.at(walk.pi, ray, walk.active)
-        hit = walk.active & si.is_valid()
-        throughput = walk.throughput
-    else:
-        landing = _landing(kernel, side, walk, ray, stream)
-        ray.o, volume, throughput = landing.o, landing.collided, landing.throughput
-        si = _landed(kernel, landing, ray, walk.active)
-        hit = walk.active & (si.is_valid() | volume)
-        tr = landing.edge.weight_transmittance()
+    arrival = kernel.space.arrive(kernel, side, walk)
+    si, volume, throughput, edge = arrival.si, arrival.volume, arrival.throughput, arrival.edge
+    hit = walk.active & (si.is_valid() | volume)
+    tr = None if edge is None else edge.weight_transmittance()
     cos = volume_cosine(si, walk.d, volume)
     dist2 = dr.squared_norm(si.p - walk.previous)
     partial = walk.partial
@@ -294,11 +274,12 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         choose(hit, in_area.d_vm, partial.d_vm),
         choose(hit, in_area.d_vm_newest, partial.d_vm_newest),
     )
+    on_surface = rays.surface_anchor(si, arrival.ray, kernel.shape_errors)
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
         cos=cos,
-        anchor=_anchor(kernel, si, ray, volume),
+        anchor=dr.select(volume, rays.free_anchor(si.p), on_surface),
         throughput=throughput,
         partial=partial,
         edges=walk.edges,
@@ -308,37 +289,14 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk, stream) -> Vertex:
         active=walk.active,
         event=walk.event,
         volume=volume,
-        landing=landing,
+        edge=edge,
         guided=None if walk.sds is None else walk.sds.guided,
         layer=walk.layer,
         sds=None if walk.sds is None or walk.sds.specular is None else walk.sds,
     )
 
 
-def _anchor(kernel: Kernel, si, ray, volume: mi.Bool | None) -> rays.Anchor:
-    anchor = rays.surface_anchor(si, ray, kernel.shape_errors)
-    return anchor if volume is None else dr.select(volume, rays.free_anchor(si.p), anchor)
-
-
-def _landing(kernel: Kernel, side: Side, walk: Walk, ray, stream):
-    """End of the walk's edge in a scene with media."""
-    word = kernel.points.series(stream, Purpose.TRACKING, walk.event)
-    hidden = None
-    if kernel.plan.hide_emitters and not side.adjoint:
-        hidden = walk.edges == 1
-    return kernel.space.advance(ray, walk, word, hidden)
-
-
-def _landed(kernel: Kernel, landing, ray, active) -> mi.SurfaceInteraction3f:
-    """The surface at the end of an edge; in a medium a point without normal and shape."""
-    si = kernel.hits.at(landing.pi, ray, active & ~landing.collided)
-    point = dr.zeros(mi.SurfaceInteraction3f)
-    point.p, point.t, point.time, point.wavelengths = ray(landing.t), landing.t, ray.time, ray.wavelengths
-    point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
-    return dr.select(landing.collided, point, si)
-
-
-def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
+def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     """Sample the next direction, and connect ``vertex`` with an endpoint."""
     if not kernel.scatters:  # a virtual call needs a target
         return None
@@ -347,9 +305,9 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, stream):
     if side.connect is not None:
         vertex.endpoint, target = side.connect(vertex)
         vertex.endpoint_active = target.active
-    u1 = points.draw_1d(side.name, stream, Purpose.LOBE, walk.event)
-    u2 = points.draw_2d(side.name, stream, Purpose.BSDF, walk.event)
-    sampled = _is_sampled(side, walk, vertex)
+    u1 = points.draw_1d(side.name, side.stream, Purpose.LOBE, walk.event)
+    u2 = points.draw_2d(side.name, side.stream, Purpose.BSDF, walk.event)
+    sampled = _is_sampled(kernel, side, walk, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
     if side.sds is not None:
         vertex.advice = side.sds.advise(kernel, side.adjoint, vertex, walk, step)
@@ -360,33 +318,33 @@ def _goes_on(side: Side, walk: Walk, vertex: Vertex):
     return vertex.hit & (walk.edges < side.last_edge)
 
 
-def _is_sampled(side: Side, walk: Walk, vertex: Vertex):
+def _is_sampled(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     """Whether to sample at this vertex.
 
     `path` samples at the last vertex too: alpha is 1 unless that event is null. With media null events are no
     edges, so that subpaths go on after them; `volpath` has alpha 1 where a medium may scatter again.
     """
-    if vertex.volume is not None:
-        return vertex.hit & (~vertex.volume | (walk.edges < side.last_edge))
-    return vertex.hit if side.alpha else _goes_on(side, walk, vertex)
+    at_last = ~vertex.volume if side.alpha or kernel.has_media else mi.Bool(False)
+    return vertex.hit & (at_last | (walk.edges < side.last_edge))
 
 
-def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, stream) -> Walk:
+def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Walk:
     """Take the sampled ``step``, play roulette and trace the next edge."""
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
     h, si = kernel.heuristic, vertex.si
-    active = _goes_on(side, walk, vertex)
-    passes = None
-    if vertex.volume is not None:
-        passes = step.null & _is_sampled(side, walk, vertex)
-        active |= passes
-    first = side.coefficient
-    if side.adjoint:
-        first = where_lit(kernel, first, allows_next_event(kernel, vertex))
+    sampled = _is_sampled(kernel, side, walk, vertex)
+    # Null events are no edges, with media.
+    passes = step.null & sampled if kernel.has_media else mi.Bool(False)
+    active = _goes_on(side, walk, vertex) | passes
+    first = direct_coefficient(kernel, vertex) if side.adjoint else side.coefficient
     coefficient = newest_coefficient(kernel, first, walk.edges)
     sds, merge = _sds(kernel, side, walk, vertex, coefficient, step)
     partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
+    d_vcm, d_vc = walk.partial.d_vcm, walk.partial.d_vc
+    partial = replace(
+        partial, d_vcm=choose(passes, d_vcm, partial.d_vcm), d_vc=choose(passes, d_vc, partial.d_vc)
+    )
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
@@ -402,45 +360,42 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, strea
     if side.only_delta:
         active &= step.delta
     if side.only_specular:
-        specular = is_narrow(step, side.only_specular) | step.delta
-        active &= specular if vertex.volume is None else specular & ~vertex.volume
+        active &= is_narrow(step, side.only_specular) | step.delta
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
-    throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, stream, useful)
+    throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, useful)
     active &= goes_on
 
-    seen = walk.seen | (_is_sampled(side, walk, vertex) & ~step.null)
     layer = walk.layer
     if kernel.path_layers:
-        layer = path_layers.sampled(layer, step, vertex.volume, side.adjoint)
+        layer = path_layers.sampled(layer, step, side.adjoint)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
-    after = Walk(
-        pi=walk.pi,
+    edge, ray = kernel.space.depart(kernel, side, vertex, passes, ray)
+    return Walk(
+        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active),
         o=ray.o,
         d=ray.d,
-        previous=si.p,
+        previous=dr.select(passes, walk.previous, mi.Point3f(si.p)),
         throughput=throughput,
         partial=partial,
         eta=eta,
-        edges=walk.edges,
-        seen=seen,
+        edges=walk.edges + dr.select(passes, mi.UInt32(0), 1),
+        seen=walk.seen | (sampled & ~step.null),
         broken=broken,
         active=active,
+        edge=edge,
         sds=sds,
         layer=layer,
     )
-    if passes is not None:
-        after, ray = _past_null(kernel, side, walk, vertex, after, passes, stream)
-    return _traced(kernel, after, ray, passes)
 
 
-def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, stream, useful):
+def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, useful):
     """Russian roulette of a subpath: its throughput, and whether it goes on.
 
     With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`;
     ``useful``: times this probability or None, see `PhotonStrategy.survival`. Weights ignore it.
     """
-    u = kernel.points.draw_1d(side.name, stream, Purpose.ROULETTE, walk.event)
-    playing = walk.edges >= kernel.rr_depth if kernel.space is None else walk.edges > kernel.rr_depth
+    u = kernel.points.draw_1d(side.name, side.stream, Purpose.ROULETTE, walk.event)
+    playing = walk.edges > kernel.rr_depth if kernel.has_media else walk.edges >= kernel.rr_depth
     if useful is not None:
         survive, playing = useful * dr.select(playing, survive, 1), mi.Bool(True)
     return dr.select(playing, throughput / survive, throughput), ~playing | (u < survive)
@@ -498,8 +453,7 @@ def _guided(kernel: Kernel, guided: mi.Float | None, vertex: Vertex, step):
 
 def has_lobe(kernel: Kernel, vertex: Vertex) -> mi.Bool:
     """Mask: a ``vertex`` on a surface whose event is not always delta; the path may have a further edge."""
-    possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth)
-    return possible if vertex.volume is None else possible & ~vertex.volume
+    return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth) & ~vertex.volume
 
 
 def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
@@ -543,28 +497,3 @@ def hard_merges_before_end(
         return 0
     connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
     return mis.older_merges(kernel.heuristic, partial, connection, pdf)
-
-
-def _traced(kernel: Kernel, walk: Walk, ray, passes) -> Walk:
-    """``walk`` on its next edge along ``ray``; null events, ``passes``, are no edges."""
-    return replace(
-        walk,
-        pi=kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=walk.active),
-        previous=mi.Point3f(walk.previous),
-        edges=walk.edges + (1 if passes is None else dr.select(passes, mi.UInt32(0), 1)),
-    )
-
-
-def _past_null(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, after: Walk, passes, stream):
-    """``after`` and its ray, with media; the edge goes on where it ``passes``."""
-    medium = vertex.medium_towards(kernel, after.d)
-    u = kernel.points.draw_1d(side.name, stream, Purpose.FLIGHT, walk.event + 1)
-    edge = vertex.edge.onwards(passes, vertex.landing.t, medium, allows_next_event(kernel, vertex), u)
-    partial = mis.Partial(
-        choose(passes, walk.partial.d_vcm, after.partial.d_vcm),
-        choose(passes, walk.partial.d_vc, after.partial.d_vc),
-    )
-    previous = dr.select(passes, walk.previous, after.previous)
-    shared = side.shared
-    ray = mi.Ray3f(after.o, after.d, edge.maxt, shared.time, shared.wavelengths)
-    return replace(after, previous=previous, partial=partial, edge=edge), ray

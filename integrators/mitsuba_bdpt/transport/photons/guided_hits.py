@@ -207,6 +207,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     first = walk.edges
     side = Side(
         "camera",
+        numbers,
         shared,
         spectra.brightest(walk.throughput),  # reference of roulette
         False,
@@ -219,7 +220,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     )
     begun = walk.active
     state = (total, lost, traced) if connects else (total, lost)
-    (total, lost, *rays), walk = random_walk(kernel, side, walk, numbers, visit, state)
+    (total, lost, *rays), walk = random_walk(kernel, side, walk, visit, state)
     traced = rays[0] if connects else traced
     traced += dr.select(begun, walk.edges - first, 0)
     return total, lost + one(walk.broken), aimed + one(begun), traced
@@ -256,5 +257,5 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
         state = replace(state, diffuse=~specular, guided=older, newest=ratio)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
     if kernel.path_layers:
-        walk = replace(walk, layer=path_layers.evaluated(z.layer, f, z.volume, adjoint=False))
+        walk = replace(walk, layer=path_layers.evaluated(z.layer, f, adjoint=False))
     return walk

@@ -89,7 +89,7 @@ def trace(kernel: Kernel, estimator: Estimator, batch: Batch, points: Points, ad
             total.vertices + found.vertices,
         )
 
-    found, walk = random_walk(kernel, side, walk, sample.stream, visit, nothing())
+    found, walk = random_walk(kernel, side, walk, visit, nothing())
     add(index, sample.start.position, found)
 
 

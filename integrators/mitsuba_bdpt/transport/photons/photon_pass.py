@@ -146,7 +146,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: PhotonPolicy, out: Photo
         return counters + Counters(photons=one(keep))
 
     begun = walk.active
-    counters, walk = random_walk(kernel, side, walk, stream, visit, Counters.zeros("photons"))
+    counters, walk = random_walk(kernel, side, walk, visit, Counters.zeros("photons"))
     counters += Counters(photon=dr.select(begun, walk.traced(), 0), non_finite=one(walk.broken))
     counts = counters.summed()
     broken = mi.Bool(False)

@@ -1,0 +1,92 @@
+"""The space between vertices; in scenes with media `media.space.Space` overrides it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+
+from ..geometry import rays
+from ..geometry.rounding import ShapeErrors
+from ..sampling.points import Stream
+
+
+@dataclass
+class Arrival:
+    """End of an edge: at the surface ``si``, or in a ``volume``, at a point ``si`` without normal and shape.
+
+    ``ray``: its last segment; ``edge``: its state at the end (a `media.flight.Edge`), None without media.
+    Without media the mask ``volume`` is a literal, and Dr.Jit leaves out what only media need.
+    """
+
+    si: mi.SurfaceInteraction3f
+    ray: mi.Ray3f
+    volume: mi.Bool
+    throughput: mi.Spectrum
+    edge: Any = None
+
+
+@dataclass
+class ShadowRay:
+    """The shadow ray of connection ``number`` at the vertex of ``event``, and its end (`rays.Own` or None).
+
+    ``medium``: index of the one in which it starts, None without media; ``stream`` of its random numbers;
+    ``hidden``: emitters do not block it.
+    """
+
+    ray: mi.Ray3f
+    medium: mi.UInt32 | None
+    stream: Stream
+    event: mi.UInt32
+    number: mi.UInt32 | int = 0
+    own: rays.Own | None = None
+    hidden: bool = False
+
+
+@dataclass(frozen=True)
+class Vacuum:
+    """The space between the vertices of ``scene``, with rounding errors of shapes.
+
+    ``scatters``: some medium does; ``counters``: names of the `Counters` of edges.
+    """
+
+    scene: mi.Scene
+    shape_errors: ShapeErrors
+
+    scatters = False
+    counters = ()
+
+    def arrive(self, kernel, side, walk, /) -> Arrival:
+        """Follow the edge of a ``walk`` to its end."""
+        ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
+        si = kernel.hits.at(walk.pi, ray, walk.active)
+        return Arrival(si, ray, mi.Bool(False), walk.throughput)
+
+    def depart(self, kernel, side, vertex, passes: mi.Bool, ray: mi.Ray3f, /) -> tuple[Any, mi.Ray3f]:
+        """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
+        return None, ray
+
+    def medium_towards(self, vertex, d: mi.Vector3f) -> mi.UInt32 | None:
+        """Index of the medium at ``vertex`` in direction ``d``; None without media."""
+        return None
+
+    def allows_next_event(self, vertex) -> mi.Bool | None:
+        """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
+        return None
+
+    def guessed(self, vertex, between: mi.Vector3f) -> mi.Float:
+        """Approximate transmittance from ``vertex`` along ``between``, for draws."""
+        return mi.Float(1)
+
+    def seen(self, kernel, c, shadow_ray: ShadowRay):
+        """The `Contribution` ``c`` after its shadow ray, with T in the value and T~ in the weight."""
+        ray, active = shadow_ray.ray, c.active
+        if not shadow_ray.hidden:
+            return replace(c, active=active & ~rays.occluded(self.scene, ray, active, shadow_ray.own))
+        pi, _ = rays.intersect_past_emitters(self.scene, self.shape_errors, ray, active, coherent=False)
+        return replace(c, active=active & ~pi.is_valid())
+
+    def clear(self, ray: mi.Ray3f, medium: mi.UInt32 | None, active: mi.Bool) -> Any:
+        """Mask: no surface blocks ``ray``, which starts in ``medium``."""
+        return ~rays.occluded(self.scene, ray, active)
