@@ -438,6 +438,16 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
         assert ("skipped (not worth its cost here): merging" in text) != used
 
 
+def test_light_that_is_hit_too_rarely_is_merged():
+    """Rationale: a pilot dropped hits that a render rarely has, found no gain, and left out ``merging=true``:
+    the image was black. Expected: a tiny lamp is merged."""
+    described = under_glass(ball(0.001))
+    described["sensor"]["film"] |= {"width": 64, "height": 64}
+    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))
+    assert image.any() and method.statistics["merging"]["merges"]
+
+
 def test_no_photon_of_the_guide_is_dropped(monkeypatch):
     """Expected: with memory for one photon at first the same image, to the rounding of sums."""
     scene = mi.load_dict(under_glass(ball(0.1)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -31,7 +32,7 @@ LANES, PHOTONS = 1 << 14, 1 << 16
 CAMERA_PATHS = 4
 
 # Estimates of s = 0 above the arriving light times ``samples`` / SHARE are dropped: a render rarely samples
-# such light, so that it adds no noise to the image.
+# such light, so that it adds no noise to the image. Not where merging would sample it.
 SHARE = 16
 
 
@@ -52,8 +53,8 @@ def measure(
     if made[0] is None or made[1] is None:
         return None
     kernel.sds = Unguided(kernel.near_specular)
-    counts = dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, samples / SHARE)
-    estimator = Estimator(made[0], made[1], *counts)
+    most = math.inf if settings.merging is True else samples / SHARE
+    estimator = Estimator(*made, dr.opaque(mi.Float, PHOTONS), dr.opaque(mi.Float, most))
     region = prepared.camera.region
     pixels = int(region.size.prod())
     chosen = min(LANES, pixels)
