@@ -8,6 +8,7 @@ import pytest
 import variants
 from mitsuba_bdpt.merging import undersampled, unsampled
 from mitsuba_bdpt.planning import unsampled_light
+from mitsuba_bdpt.planning.budget import PROVISIONAL_SAMPLES
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import aim
 
@@ -391,11 +392,13 @@ def test_merging_finds_it():
 
 
 def test_a_timeout_bounds_the_samples(monkeypatch):
-    """Rationale: a render of a million samples that ends after a second has few. Expected: samples per pixel
-    are those of the passes so far, at their rate until the timeout, and at most those of the render."""
-    scene = slab(frosted(0.05))
+    """Rationale: a render of a million samples that ends after a second has few; its light was not merged.
+    Expected: samples per pixel are those of the passes so far, at their rate until the timeout, at most those
+    of the render, and before the first pass as many as a pilot assumes, also under ``target_error``."""
+    scene, assumed = slab(frosted(0.05)), PROVISIONAL_SAMPLES // 32**2
     timed, untimed = (render_of(scene, 10**6, **keys) for keys in ({"timeout": 30.0}, {}))
-    assert timed._samples() == untimed._samples() == 10**6
+    assert timed._samples() == render_of(scene, 10**6, target_error=0.1)._samples() == assumed
+    assert untimed._samples() == 10**6
     monkeypatch.setattr(type(timed.accumulator), "passes", (8,))
     monkeypatch.setattr(timed.meter, "rate", lambda done: done / 4)
     assert timed._samples() == 64 and untimed._samples() == 10**6

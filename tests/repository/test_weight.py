@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 6858,
+    "transport merging guided_emission": 6854,
     "planning": 2572,
     "emitters": 2680,
     "cli": 1812,
@@ -18,7 +18,7 @@ MOST = {
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1255,
+    "run": 1259,
     "scene sampling": 771,
     "host": 1077,
     "sensors": 934,

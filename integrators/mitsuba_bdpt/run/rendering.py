@@ -22,6 +22,7 @@ from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
 from ..planning import unsampled_light
+from ..planning.budget import expected_samples
 from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE, NOT_WORTH
 from ..planning.findings import SceneCache
@@ -463,7 +464,10 @@ class Render:
         Under ``timeout`` those that the passes so far predict, rounded, as each number has its own estimate.
         """
         done, timeout = sum(self.passes), self.settings.timeout
-        if not done or not 0 <= timeout < math.inf:
+        if not done:
+            pixels = int(self.prepared.camera.region.size.prod())
+            return expected_samples(self.settings, self.spp * pixels) // pixels
+        if not 0 <= timeout < math.inf:
             return max(self.spp, done)
         predicted = max(self.meter.rate(done) * timeout, done, 1)
         return min(self.spp, 2 ** round(math.log2(predicted)))
