@@ -889,8 +889,8 @@ MUTANTS = (
     Mutant(
         "media: T~ in one class only",
         "media/space.py",
-        "weigh(*c.sides, crossing.tr)",
-        'weigh(*c.sides, crossing.tr if c.kind == "inner" else None)',
+        "of_depth(crossing.depth)",
+        'of_depth(crossing.depth) if c.kind == "inner" else None',
         (
             "tests/transport/test_media_oracle.py::test_kernel_in_fog_agrees_with_explicit_densities[point-balance]",
         ),
@@ -907,8 +907,8 @@ MUTANTS = (
     Mutant(
         "media: estimates of T in weights",
         "media/space.py",
-        "weigh(*c.sides, crossing.tr)",
-        "weigh(*c.sides, dr.mean(crossing.transmittance))",
+        "of_depth(crossing.depth)",
+        "dr.mean(crossing.transmittance)",
         ("tests/images/test_media.py::test_weighted_strategies_add_up_to_volpath[grid]",),
     ),
     Mutant(
@@ -1331,9 +1331,9 @@ MUTANTS = (
     ),
     Mutant(
         "near-specular guiding: one specular vertex guides",
-        "transport/walk.py",
-        "guided = dr.select(specular, before.guided_before_last(kernel.heuristic), 0)",
-        "guided = dr.select(specular, before.guided, 0)",
+        "transport/sds.py",
+        "guided = dr.select(specular, self.guided_before_last(heuristic), 0)",
+        "guided = dr.select(specular, self.guided, 0)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
         ),
@@ -1379,7 +1379,7 @@ MUTANTS = (
     ),
     Mutant(
         "merging: a path is isolated again after an edge that is connectible",
-        "transport/walk.py",
+        "transport/sds.py",
         "isolated = isolated & (step.delta",
         "isolated = (step.delta",
         ("tests/images/test_merging.py::test_joined_paths_are_not_merged",),

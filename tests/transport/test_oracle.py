@@ -936,7 +936,7 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
     ],
 )
 def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """Rationale: as above, also of ``passes.trace``, ``walk.is_sds_vertex`` and ``merging.merge``:
+    """Rationale: as above, also of ``passes.trace``, ``alternatives.is_sds_vertex`` and ``merging.merge``:
     photons are traced along the paths, sorted into the grid and found again from the camera's side, in discs
     so small that each holds the vertex of its own path alone. Radii depend on the place, so that eta is
     spread over three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.

@@ -13,7 +13,7 @@ from ..sampling.points import Purpose
 from ..transport.contribution import MEDIA, Counters
 from ..transport.vacuum import Vacuum
 from . import flight, phase, transmittance
-from .media import Media
+from .media import Media, of_depth
 
 # Largest optical depth of a connection's approximate transmittance, in the medium that it starts in:
 # connections of less actual depth are drawn at most e^2 times too rarely.
@@ -69,13 +69,14 @@ class Space(Vacuum):
             word = kernel.points.series(*series)
         ends = shadow_ray.ray, shadow_ray.medium, c.active, shadow_ray.own
         crossing = transmittance.between(self, *ends, word, shadow_ray.hidden)
-        weight, shares = kernel.heuristic.weigh(*c.sides, crossing.tr)
+        weight, shares = kernel.heuristic.weigh(*c.sides, of_depth(crossing.depth))
         return replace(
             c,
             value=polarization.scaled(c.value, crossing.transmittance),
             weight=weight,
             shares=shares,
-            active=c.active & crossing.visible,
+            # NaN is kept, to be counted.
+            active=c.active & ~dr.all(crossing.transmittance == 0),
             counted=c.counted + Counters(segments=crossing.segments, collisions=crossing.collisions),
         )
 

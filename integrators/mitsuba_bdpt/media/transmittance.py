@@ -12,7 +12,7 @@ from ..geometry import rays
 from ..geometry.rounding import met
 from ..host import renamed
 from . import tracking
-from .media import Media, depth_of, of_depth
+from .media import Media, depth_of
 
 if TYPE_CHECKING:
     from .space import Space
@@ -31,16 +31,6 @@ class Crossing:
     clear: mi.Bool
     segments: mi.UInt32
     collisions: mi.UInt32 | None
-
-    @property
-    def tr(self):
-        """T~ of the edge, as used in the weights."""
-        return of_depth(self.depth)
-
-    @property
-    def visible(self):
-        """Mask: transmittance is not 0. (True for NaN, so that it is counted.)"""
-        return ~dr.all(self.transmittance == 0)
 
 
 def between(

@@ -27,10 +27,11 @@ import mitsuba as mi
 
 from ..sampling.points import Purpose, Stream, sequential
 from ..transport import mis
+from ..transport.alternatives import newest_connection
 from ..transport.contribution import Contribution
 from ..transport.inputs import Kernel
 from ..transport.sds import State, begun
-from ..transport.walk import Vertex, newest_connection
+from ..transport.walk import Vertex
 from .merging import Merging, sample, with_layers
 
 # Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.

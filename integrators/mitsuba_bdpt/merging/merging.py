@@ -25,12 +25,13 @@ from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from ..transport import bsdf, mis, path_layers, spectra
+from ..transport.alternatives import is_sds_vertex
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon, same_surface
 from ..transport.sds import PhotonStrategy, State, begun
-from ..transport.walk import Vertex, is_sds_vertex
+from ..transport.walk import Vertex
 from .radius import Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..transport.alternatives import newest_connection
 from ..transport.inputs import Kernel
 from ..transport.near_specular import is_narrow
-from ..transport.walk import Vertex, newest_connection
+from ..transport.walk import Vertex
 from .merging import Merging, Sample
 
 # Expected samples per pixel below which light is undersampled: nine of ten pixels have none of it, the others

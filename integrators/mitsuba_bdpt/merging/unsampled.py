@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from ..sampling.points import Points
 from ..transport import subpaths
+from ..transport.alternatives import has_lobe, is_sds_vertex
 from ..transport.batch import Batch, Places
 from ..transport.inputs import Kernel, Observer
 from ..transport.near_specular import NARROW
@@ -24,7 +25,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.sds import State
-from ..transport.walk import has_lobe, is_sds_vertex, random_walk
+from ..transport.walk import random_walk
 from .merging import Merging
 from .merging import sample as draw
 from .passes import sort

@@ -11,8 +11,8 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from . import mis, path_layers, scattering, spectra
+from .alternatives import direct_coefficient, hard_merges, newest_coefficient
 from .contribution import (
-    MEDIA,
     Contribution,
     Counters,
     drop_non_finite,
@@ -26,7 +26,7 @@ from .light_path import LightPath, StoredVertex, read_light_vertex
 from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
 from .vacuum import ShadowRay
-from .walk import Vertex, direct_coefficient, hard_merges, newest_coefficient
+from .walk import Vertex
 
 
 def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
@@ -73,23 +73,21 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     (`Vacuum.seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
-    slot, nonzero, lost = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    crossed = Counters.zeros(*kernel.space.counters)
+    slot, nonzero = mi.UInt32(0), mi.UInt32(0)
+    counters = Counters.zeros("non_finite", *kernel.space.counters)
     while dr.hint(
         slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
-        lost += c.counted.non_finite
         ray, own = _shadow_ray(kernel, z, y)
         medium = kernel.space.medium_towards(z, ray.d)
         visible = kernel.space.seen(kernel, c, ShadowRay(ray, medium, stream, z.event, slot + 1, own))
         total = add(_as_drawn(kernel, z, y, c), visible, total)
-        crossed = crossed + Counters(**{name: getattr(visible.counted, name) for name in MEDIA})
+        counters = counters + visible.counted
         slot += 1
-    counted = Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
-    return total, counted + crossed
+    return total, counters + Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero)
 
 
 def connect_one(

@@ -10,10 +10,11 @@ import mitsuba as mi
 
 from ..geometry import polarization, rays
 from . import mis
+from .alternatives import newest_coefficient
 from .inputs import KEPT, Kernel
 from .proxy_vertices import ProxyVertex, ProxyVertices
 from .sds import State
-from .walk import Vertex, newest_coefficient, volume_cosine
+from .walk import Vertex, volume_cosine
 
 
 @dataclass

@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from . import mis
@@ -54,6 +55,27 @@ class State:
         """The state after an event; ``coefficient`` of the connection of the edge to it."""
         isolated = ~self.is_connectible(specular, coefficient) & self.isolated
         return replace(self, isolated=isolated, specular=specular)
+
+    def after(self, heuristic: mis.Heuristic, vertex, coefficient: mis.Coefficient, step) -> State:
+        """The state after the sampled ``step`` at ``vertex``; ``coefficient`` as in `scattered`."""
+        only_delta = None if self.only_delta is None else self.only_delta & step.delta
+        if self.specular is None:
+            isolated, guided = self.isolated, self.guided
+            if isolated is not None:
+                isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
+            # Without advice it is kept as well: guided subpaths end at events that are not delta.
+            if guided is not None and vertex.advice is not None:
+                guided = dr.select(step.delta, guided, heuristic.start(vertex.advice.ratio(step)))
+            return State(isolated, only_delta, guided)
+        specular = step.delta | is_specular(step)
+        state = replace(self.scattered(specular, coefficient), only_delta=only_delta)
+        if self.guided is None:
+            return state
+        # A diffuse vertex guides alone: guided subpaths end at others.
+        guides = ~step.delta & ~(specular & self.diffuse)
+        guided = dr.select(specular, self.guided_before_last(heuristic), 0)
+        newest = heuristic.start(vertex.advice.ratio(step, guides))
+        return replace(state, diffuse=self.diffuse | ~specular, guided=guided, newest=newest)
 
     def guided_before_last(self, heuristic: mis.Heuristic) -> Any:
         """The densities of the guide, over those of the path, at all vertices before the next one."""
@@ -107,6 +129,10 @@ class Advice:
     active: mi.Bool
     found: mi.UInt32
     other: mi.Float
+
+    def ratio(self, step, guides: mi.Bool | bool = True) -> mi.Float:
+        """`other` over the density of the BSDF, where the vertex ``guides``; else 0."""
+        return dr.select(guides & (self.other > 0), self.other / step.pdf_fwd_w, 0)
 
 
 class PhotonStrategy:

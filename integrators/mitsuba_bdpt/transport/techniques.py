@@ -17,19 +17,18 @@ from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, path_layers, spectra
-from .contribution import Contribution, Counters, one, roulette
-from .inputs import Kernel
-from .sds import PhotonStrategy
-from .vacuum import ShadowRay
-from .walk import (
-    Vertex,
-    Walk,
+from .alternatives import (
     direct_coefficient,
     hard_merges,
     hard_merges_before_end,
     newest_coefficient,
     where_lit,
 )
+from .contribution import Contribution, Counters, one, roulette
+from .inputs import Kernel
+from .sds import PhotonStrategy
+from .vacuum import ShadowRay
+from .walk import Vertex, Walk
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:

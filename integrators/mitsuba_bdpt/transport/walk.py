@@ -18,11 +18,12 @@ from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, scattering, spectra
+from .alternatives import direct_coefficient, newest_coefficient
 from .contribution import Counters, one
 from .inputs import Kernel, Shared
 from .mis import choose
 from .near_specular import is_narrow
-from .sds import PhotonStrategy, State, is_specular
+from .sds import PhotonStrategy, State
 
 
 @dataclass
@@ -218,31 +219,6 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
     return state, walk
 
 
-def direct_coefficient(kernel: Kernel, vertex) -> mis.Coefficient:
-    """kappa of next-event estimation at ``vertex``, 0 where a medium does not allow it."""
-    return where_lit(kernel, kernel.space.allows_next_event(vertex))
-
-
-def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
-    """kappa of next-event estimation where ``lit`` (None: everywhere), else 0."""
-    direct = kernel.kappa.direct
-    return direct if lit is None else choose(lit, direct, kernel.heuristic.zero())
-
-
-def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
-    """kappa of the newest alternative's class at vertex ``edges``, for s >= 1.
-
-    s = 0 differs, see `techniques.hit_emitter`. ``first``: kappa at vertex 1, see `Side`.
-    """
-    return choose(edges == 1, first, kernel.kappa.inner)
-
-
-def newest_connection(kernel: Kernel, first: mis.Coefficient, vertex: Vertex) -> mis.PartialSum:
-    """The newest alternative at ``vertex``: ``d_vcm`` times `newest_coefficient`."""
-    newest = newest_coefficient(kernel, first, vertex.edges)
-    return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
-
-
 def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
@@ -406,94 +382,12 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
 
     ``coefficient``: that of the class that connects the edge to it.
     """
-    if side.sds is not None and side.sds.hard:
-        return walk.sds, side.sds.merge(kernel, vertex, None)
-    if walk.sds is None:
+    state, strategy = walk.sds, side.sds
+    if strategy is not None and strategy.hard:
+        return state, strategy.merge(kernel, vertex, None)
+    if state is None:
         return None, None
-    if walk.sds.specular is not None:
-        return _near_specular(kernel, side, walk.sds, vertex, coefficient, step)
-    isolated, only_delta, guided = walk.sds.isolated, walk.sds.only_delta, walk.sds.guided
-    if isolated is not None:
-        isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
-    if only_delta is not None:
-        only_delta = only_delta & step.delta
-    guided = _guided(kernel, guided, vertex, step)
-    merge = None
-    if side.sds is not None and not mis.is_absent(walk.partial.d_vm):
-        merge = side.sds.merge(kernel, vertex, isolated)
-    return State(isolated, only_delta, guided), merge
-
-
-def _near_specular(kernel: Kernel, side: Side, before: State, vertex: Vertex, coefficient, step):
-    """`_sds` where near-specular events count as specular."""
-    specular = step.delta | is_specular(step)
-    state = before.scattered(specular, coefficient)
-    state = replace(state, only_delta=before.only_delta & step.delta)
-    if before.guided is not None:
-        # A diffuse vertex guides alone: guided subpaths end at others.
-        guides = ~step.delta & ~(specular & before.diffuse) & (vertex.advice.other > 0)
-        newest = kernel.heuristic.start(dr.select(guides, vertex.advice.other / step.pdf_fwd_w, 0))
-        guided = dr.select(specular, before.guided_before_last(kernel.heuristic), 0)
-        state = replace(state, diffuse=before.diffuse | ~specular, guided=guided, newest=newest)
-    if side.sds is None or mis.is_absent(vertex.partial.d_vm):
+    state = state.after(kernel.heuristic, vertex, coefficient, step)
+    if strategy is None or mis.is_absent(vertex.partial.d_vm):
         return state, None
-    return state, side.sds.merge(kernel, vertex, state.isolated)
-
-
-def _guided(kernel: Kernel, guided: mi.Float | None, vertex: Vertex, step):
-    """`State.guided` after an event; a delta event keeps it.
-
-    Without advice it is kept too: guided subpaths end at other events.
-    """
-    if guided is None or vertex.advice is None:
-        return guided
-    other = dr.select(vertex.advice.other > 0, vertex.advice.other / step.pdf_fwd_w, 0)
-    return dr.select(step.delta, guided, kernel.heuristic.start(other))
-
-
-def has_lobe(kernel: Kernel, vertex: Vertex) -> mi.Bool:
-    """Mask: a ``vertex`` on a surface whose event is not always delta; the path may have a further edge."""
-    return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth) & ~vertex.volume
-
-
-def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk: Walk, vertex: Vertex) -> mi.Bool:
-    """Mask: the diffuse ``vertex`` of an SDS path, if the other subpath matches.
-
-    No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
-    path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
-    """
-    newest = newest_coefficient(kernel, first, vertex.edges)
-    if vertex.sds is not None:
-        return has_lobe(kernel, vertex) & vertex.sds.isolated & ~vertex.sds.is_connectible(False, newest)
-    connectible = mis.is_connectible(vertex.partial, newest)
-    possible = has_lobe(kernel, vertex) & ~connectible
-    isolated = None if walk.sds is None else walk.sds.isolated
-    return possible if isolated is None else possible & isolated
-
-
-def hard_merges(
-    kernel: Kernel, vertex, coefficient: mis.Coefficient, pdf_rev_w, pdf_a, own: mis.Coefficient
-) -> mis.PartialSum:
-    """Merges on hard paths at the vertices up to ``vertex``, which a strategy connects; see `mis.merges`.
-
-    The number 0 if hard paths are not merged.
-    """
-    sds = kernel.sds
-    if sds is None or not sds.hard:
-        return 0
-    ratio = kernel.heuristic.start(sds.weighed(vertex.si.p))
-    return mis.merges(kernel.heuristic, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
-
-
-def hard_merges_before_end(
-    kernel: Kernel, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
-) -> mis.PartialSum:
-    """The same before the end of a subpath, on an emitter or the sensor.
-
-    ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the connection of
-    the last edge, times the density of the end if ``pdf`` contains it.
-    """
-    if not kernel.merges_hard:
-        return 0
-    connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
-    return mis.older_merges(kernel.heuristic, partial, connection, pdf)
+    return state, strategy.merge(kernel, vertex, state.isolated)

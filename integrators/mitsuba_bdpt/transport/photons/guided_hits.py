@@ -29,11 +29,12 @@ from ...geometry import rays
 from ...sampling import sobol
 from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, path_layers, spectra, techniques
+from ..alternatives import is_sds_vertex, newest_coefficient
 from ..contribution import one
 from ..inputs import Kernel
 from ..near_specular import GUIDED
 from ..sds import Advice, PhotonStrategy, State, begun, begun_near_specular, is_specular
-from ..walk import Side, Vertex, Walk, is_sds_vertex, newest_coefficient, not_finite, random_walk
+from ..walk import Side, Vertex, Walk, not_finite, random_walk
 from . import photon_guide
 
 # Seed that separates random numbers of guided subpaths from those of their camera subpath.

@@ -24,12 +24,13 @@ import mitsuba as mi
 from ...sampling.points import Points, Purpose, Stream, sequential
 from ...sampling.reservoir import offer
 from .. import bsdf, subpaths
+from ..alternatives import is_sds_vertex, newest_connection
 from ..batch import Batch, Places
 from ..contribution import size_of
 from ..inputs import Kernel, Observer
 from ..plan import GUIDED
 from ..sds import is_specular
-from ..walk import Vertex, Walk, is_sds_vertex, newest_connection, random_walk
+from ..walk import Vertex, Walk, random_walk
 from . import photon_guide
 from .photon import same_surface
 from .photon_guide import WINDOW, Guide

@@ -10,11 +10,12 @@ import mitsuba as mi
 
 from ...sampling.points import Points, Purpose
 from .. import mis, spectra, subpaths
+from ..alternatives import has_lobe, is_sds_vertex, newest_connection
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..near_specular import GUIDED, NARROW
 from ..sds import PhotonStrategy, State, begun_near_specular
-from ..walk import has_lobe, is_sds_vertex, newest_connection, random_walk
+from ..walk import random_walk
 from .aim import Aim
 from .photon import ConnectedPhoton, GuidingPhoton, HardPhoton, Photon
 from .photon_guide import Guide
