@@ -7,7 +7,7 @@ everything up to and including the edge to the vertex. Equation numbers: Georgie
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -314,18 +314,9 @@ def _reaching(walk: Walk, y: Vertex):
     """``walk`` for `Sensor.hit`: in scenes with media its edge ends at ``y``."""
     if y.edge is None:
         return walk
-    return replace(walk, pi=_End(y.hit, dr.norm(y.si.p - walk.previous)))
-
-
-@dataclass
-class _End:
-    """End of an edge for `Sensor.hit`: validity, and distance from the vertex before."""
-
-    hit: mi.Bool
-    t: mi.Float
-
-    def is_valid(self) -> mi.Bool:
-        return self.hit
+    pi = mi.PreliminaryIntersection3f(walk.pi)
+    pi.t = dr.select(y.hit, dr.norm(y.si.p - walk.previous), dr.inf)
+    return replace(walk, pi=pi)
 
 
 def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
