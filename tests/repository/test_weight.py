@@ -14,7 +14,7 @@ MOST = {
     "planning": 2572,
     "emitters": 2680,
     "cli": 1812,
-    "media": 1497,
+    "media": 1485,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
