@@ -9,6 +9,7 @@ import variants
 from mitsuba_bdpt.merging import undersampled, unsampled
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.planning.budget import PROVISIONAL_SAMPLES
+from mitsuba_bdpt.planning.configuration import PATH_TRACING
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import aim
 
@@ -148,6 +149,16 @@ def test_light_that_light_tracing_finds_is_not_missing():
     assert share_of(lost_in(scene)) < 0.005
     assert share_of(lost_in(scene, light_paths=0)) == pytest.approx(0.35, rel=0.1)
     assert "leave light_paths" in said(scene, light_paths=0)
+
+
+def test_what_a_pilot_chose_is_no_remedy():
+    """Rationale: where a pilot chose path tracing, the remedy was to leave that to the integrator. Expected:
+    other remedies alone."""
+    render = render_of(slab(frosted(0.01)))
+    plan = PATH_TRACING.plan(render.plan)
+    lost = unsampled_light.estimate(render.prepared, plan, render.settings)
+    text = unsampled_light.in_words(render.prepared, plan, unsampled_light.shares(lost, MEAN), lost, 64)
+    assert "connections rarely sample" in text and "light_paths" not in text
 
 
 def test_the_aim_of_photons_changes_nothing(monkeypatch):

@@ -316,7 +316,7 @@ def _in_words(
     what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
     if unsampled.is_undersampled:
         remedy = _remedy(prepared, lamps)
-        if not plan.splat and prepared.camera.connectible:
+        if any(skipped["why"] == "light_paths=0" for skipped in plan.skipped):  # no pilot's choice
             remedy = f"leave light_paths to the integrator, {remedy}"
         by_arrival = _is_left_to_arrival(prepared, plan)
         cause, remedy = _undersampled(what, unsampled, samples, remedy, by_arrival)
