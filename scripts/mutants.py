@@ -1802,8 +1802,8 @@ MUTANTS = (
     Mutant(
         "joined light subpaths: roulette has the number of the even draw",
         "transport/connections.py",
-        "found = _Drawn(value, size_of(value), end, left, one(some)",
-        "found = _Drawn(value, size_of(value), end, u_even, one(some)",
+        "_Drawn(value, size_of(value), end, left, counted",
+        "_Drawn(value, size_of(value), end, u_even, counted",
         ("tests/images/test_joined_light_paths.py::test_the_draw_is_unbiased_whatever_is_guessed[1.0-5.0]",),
     ),
     Mutant(

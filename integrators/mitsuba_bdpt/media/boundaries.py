@@ -10,32 +10,20 @@ import mitsuba as mi
 
 from ..geometry import rays
 from ..host import renamed
+from . import transmittance
 
 if TYPE_CHECKING:
     from .space import Space
 
 
-@dr.syntax
 def behind(space: Space, ray: mi.Ray3f, medium: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
     """Trace ``ray`` from ``medium`` through transmitting surfaces.
 
     Returns the number of the medium at its end, and whether it arrives there.
     """
-    o, left = mi.Point3f(ray.o), mi.Float(ray.maxt)
     number = mi.UInt32(medium) + dr.zeros(mi.UInt32, dr.width(ray.o))
-    going, arrived = mi.Bool(True), mi.Bool(False)
-    while dr.hint(going, label="media up to the end of a ray", exclude=[space, ray, medium]):
-        segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
-        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
-        hit = going & si.is_valid()
-        arrived |= going & ~hit
-        passed = hit & ~dr.all(space.null_transmission(si, hit) == 0)
-        crossed = passed & si.is_medium_transition()
-        number = dr.select(crossed, space.media.number(si.target_medium(ray.d)), number)
-        onwards = rays.passed(segment, si, space.shape_errors)
-        o, left = mi.Point3f(segment(onwards)), left - onwards
-        going = mi.Bool(passed)
-    return number, arrived
+    end = transmittance.through_surfaces(space, ray, number, mi.Bool(True), None, mi.UInt32(0), False)
+    return end.medium, end.clear
 
 
 @dataclass

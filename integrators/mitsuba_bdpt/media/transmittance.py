@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,7 +23,7 @@ class Crossing:
     """Unbiased ``transmittance`` of an edge (``Spectrum``), ``depth`` of its T~.
 
     ``clear``: no surface blocks it; ``segments``: their number; ``collisions``: tentative ones in grids (None
-    without any).
+    without any); ``medium``: index at its end, if surfaces were passed.
     """
 
     transmittance: mi.UnpolarizedSpectrum
@@ -31,6 +31,7 @@ class Crossing:
     clear: mi.Bool
     segments: mi.UInt32
     collisions: mi.UInt32 | None
+    medium: Any = None
 
 
 def between(
@@ -52,7 +53,7 @@ def between(
         transmittance, depth, _, collisions = _along(media, medium, ray, ray.maxt, word, visible)
         traced = dr.select(active, mi.UInt32(1), 0)
         return Crossing(dr.select(visible, transmittance, 0), depth, visible, traced, collisions)
-    return _through_surfaces(space, ray, medium, active, own, word, hidden)
+    return through_surfaces(space, ray, medium, active, own, word, hidden)
 
 
 def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool):
@@ -62,7 +63,7 @@ def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool)
     """
     if not space.media.null_lobes:
         return _along(space.media, medium, ray, ray.maxt, mi.UInt32(0), active)[1]
-    return _through_surfaces(space, ray, medium, active, None, mi.UInt32(0), False).depth
+    return through_surfaces(space, ray, medium, active, None, mi.UInt32(0), False).depth
 
 
 def _along(media: Media, medium, ray, length, word, active):
@@ -78,7 +79,8 @@ def _along(media: Media, medium, ray, length, word, active):
 
 
 @dr.syntax
-def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> Crossing:
+def through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> Crossing:
+    """Like `between`, surface by surface."""
     media, scene = space.media, space.scene
     o, left, medium = mi.Point3f(ray.o), mi.Float(ray.maxt), mi.UInt32(medium)
     transmittance, word, going = mi.UnpolarizedSpectrum(1), mi.UInt32(word), mi.Bool(active)
@@ -104,7 +106,7 @@ def _through_surfaces(space: Space, ray, medium, active, own, word, hidden) -> C
         onwards = dr.select(hit, rays.passed(segment, si, space.shape_errors), 0)
         o, left = mi.Point3f(segment(onwards)), left - onwards
         going = hit & clear & (left > 0)
-    return Crossing(dr.select(active, transmittance, 0), depth, clear, segments, collisions)
+    return Crossing(dr.select(active, transmittance, 0), depth, clear, segments, collisions, medium)
 
 
 def _is_end(si, own, t) -> mi.Bool:

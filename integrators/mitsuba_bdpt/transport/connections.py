@@ -46,7 +46,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     wo_z, wo_y = z.si.to_local(d), y.si.to_local(-d)
     cos_z, cos_y = z.cosine(d), y.cosine(d)
     f_z = scattering.evaluate(kernel, z, wo_z, active)
-    f_y = scattering.evaluate_adjoint(kernel, y, wo_y, active, cos_y)
+    f_y = scattering.evaluate(kernel, y, wo_y, active, cos_y)
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~spectra.is_zero(value)
 
@@ -110,12 +110,7 @@ def connect_one(
         value = value / kernel.plan.joined
     active = drawn.total > 0
     active, survival, rouletted = roulette(kernel, value, drawn.u, active)
-    counted = rouletted + Counters(
-        shadow_inner=one(active),
-        evaluated=drawn.evaluated,
-        zero=drawn.evaluated - drawn.nonzero,
-        non_finite=drawn.lost,
-    )
+    counted = drawn.counted + rouletted + Counters(shadow_inner=one(active))
     end, own = drawn.end, None
     if kernel.shape_errors.small:
         y = read_light_vertex(kernel, path, drawn.end)
@@ -146,18 +141,16 @@ class _Drawn:
     """A drawn inner connection.
 
     Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
-    `ShapeErrors.small`), rescaled random number ``u``, number ``evaluated`` and nonzero, number ``lost`` as
-    non-finite. In scenes with media, where the weight is known after the shadow ray, also ``unweighted``
-    value, ``sides`` (see `Contribution`) and ``size`` in the draw. ``layers``: see `Contribution`.
+    `ShapeErrors.small`), rescaled random number ``u``, `Counters`. In scenes with media, where the weight is
+    known after the shadow ray, also ``unweighted`` value, ``sides`` (see `Contribution`) and ``size`` in the
+    draw. ``layers``: see `Contribution`.
     """
 
     value: mi.Spectrum
     total: mi.Float
     end: mi.Point3f | mi.UInt32
     u: mi.Float
-    evaluated: mi.UInt32
-    nonzero: mi.UInt32
-    lost: mi.UInt32
+    counted: Counters
     unweighted: mi.Spectrum | None = None
     sides: tuple | None = None
     size: mi.Float | None = None
@@ -199,7 +192,8 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         slot += 1
     # One light subpath: all vertices are of one emitter.
     own = layers(path.light_group, path_layer)
-    drawn = _Drawn(value, total, end, u, candidates, nonzero, lost, layers=own)
+    counted = Counters(evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
+    drawn = _Drawn(value, total, end, u, counted, layers=own)
     if kept is not None:
         unweighted, light_side, camera_side, size = kept
         sides = kernel.kappa.inner, light_side, camera_side
@@ -244,8 +238,8 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     c = drop_non_finite(inner(kernel, replace(z, hit=z.hit & some), y))
     value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
-    found = _Drawn(value, size_of(value), end, left, one(some), one(c.active), c.counted.non_finite)
-    return replace(found, layers=c.layers)
+    counted = c.counted + Counters(evaluated=one(some), zero=one(some & ~c.active))
+    return _Drawn(value, size_of(value), end, left, counted, layers=c.layers)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:

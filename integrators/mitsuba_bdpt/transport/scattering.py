@@ -27,28 +27,20 @@ def _of(target: Target | None, mask: mi.Bool) -> Target | None:
     return target and Target(target.wo, target.active & mask, target.cos_ratio)
 
 
-def evaluate(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, reverse: bool = True) -> Evaluation:
-    """Evaluate a camera vertex towards the local ``wo``, with both densities (``reverse``) or one."""
+def evaluate(
+    kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio: mi.Float | None = None, reverse: bool = True
+) -> Evaluation:
+    """Evaluate ``vertex`` towards the local ``wo``, with both densities (``reverse``) or one.
+
+    ``cos_ratio``, of light vertices: see `bsdf.evaluate_adjoint`.
+    """
     traits = kernel.traits if reverse else kernel.traits.from_one_side()
-    return _evaluated(
-        kernel, vertex, wo, active, lambda mask: bsdf.evaluate(vertex.bsdf, vertex.si, wo, mask, traits)
-    )
 
+    def on_surface() -> Evaluation:
+        given = vertex.bsdf, vertex.si, wo, active & ~vertex.volume, traits
+        return bsdf.evaluate(*given) if cos_ratio is None else bsdf.evaluate_adjoint(*given, cos_ratio)
 
-def evaluate_adjoint(kernel, vertex, wo: mi.Vector3f, active: mi.Bool, cos_ratio) -> Evaluation:
-    """Evaluate a light vertex towards the local ``wo``, see `bsdf.evaluate_adjoint`."""
-
-    def on_surface(mask):
-        return bsdf.evaluate_adjoint(vertex.bsdf, vertex.si, wo, mask, kernel.traits, cos_ratio)
-
-    return _evaluated(kernel, vertex, wo, active, on_surface)
-
-
-def _evaluated(kernel, vertex, wo, active, on_surface) -> Evaluation:
-    """Evaluation by ``on_surface``, a function of a mask, or by the vertex's medium."""
     if not kernel.space.scatters:
-        return on_surface(active & ~vertex.volume)
+        return on_surface()
     in_volume = kernel.space.evaluate(vertex.medium, vertex.si, wo, active & vertex.volume)
-    if not kernel.surfaces:
-        return in_volume
-    return dr.select(vertex.volume, in_volume, on_surface(active & ~vertex.volume))
+    return dr.select(vertex.volume, in_volume, on_surface()) if kernel.surfaces else in_volume

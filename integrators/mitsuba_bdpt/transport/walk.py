@@ -290,10 +290,6 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     return step
 
 
-def _goes_on(side: Side, walk: Walk, vertex: Vertex):
-    return vertex.hit & (walk.edges < side.last_edge)
-
-
 def _is_sampled(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     """Whether to sample at this vertex.
 
@@ -312,7 +308,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Wa
     sampled = _is_sampled(kernel, side, walk, vertex)
     # Null events are no edges, with media.
     passes = step.null & sampled if kernel.has_media else mi.Bool(False)
-    active = _goes_on(side, walk, vertex) | passes
+    active = vertex.hit & (walk.edges < side.last_edge) | passes
     first = direct_coefficient(kernel, vertex) if side.adjoint else side.coefficient
     coefficient = newest_coefficient(kernel, first, walk.edges)
     sds, merge = _sds(kernel, side, walk, vertex, coefficient, step)
