@@ -49,7 +49,8 @@ class Space(Vacuum):
     def counters(self) -> tuple[str, ...]:
         return MEDIA if self.media.grids else MEDIA[:1]
 
-    def medium_towards(self, vertex, d):
+    def medium_towards(self, vertex, d: mi.Vector3f) -> mi.UInt32:
+        """Index of the medium at ``vertex`` in direction ``d``."""
         beyond = self.media.number(vertex.si.target_medium(d))
         return dr.select(vertex.si.is_medium_transition(), beyond, vertex.medium)
 
@@ -63,11 +64,13 @@ class Space(Vacuum):
         return dr.exp(-dr.minimum(sigma * dr.norm(between), _GUESSED_DEPTH))
 
     def seen(self, kernel, c, shadow_ray):
-        word = mi.UInt32(0)
+        z, medium, event, word = shadow_ray.vertex, kernel.sensor_medium, mi.UInt32(0), mi.UInt32(0)
+        if z is not None:
+            medium, event = self.medium_towards(z, shadow_ray.d), z.event
         if self.media.grids:
-            series = shadow_ray.stream, Purpose.TRACKING, shadow_ray.event, 1 + shadow_ray.number
+            series = shadow_ray.stream, Purpose.TRACKING, event, 1 + shadow_ray.number
             word = kernel.points.series(*series)
-        ends = shadow_ray.ray, shadow_ray.medium, c.active, shadow_ray.own
+        ends = shadow_ray.ray, medium, c.active, shadow_ray.own
         crossing = transmittance.between(self, *ends, word, shadow_ray.hidden)
         weight, shares = kernel.heuristic.weigh(*c.sides, of_depth(crossing.depth))
         return replace(

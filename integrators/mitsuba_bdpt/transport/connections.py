@@ -82,8 +82,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
         ray, own = _shadow_ray(kernel, z, y)
-        medium = kernel.space.medium_towards(z, ray.d)
-        visible = kernel.space.seen(kernel, c, ShadowRay(ray, medium, stream, z.event, slot + 1, own))
+        visible = kernel.space.seen(kernel, c, ShadowRay(ray, stream, z, ray.d, slot + 1, own))
         total = add(_as_drawn(kernel, z, y, c), visible, total)
         counters = counters + visible.counted
         slot += 1
@@ -121,9 +120,8 @@ def connect_one(
     estimate = value / survival
     if drawn.sides is not None:
         estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
-    shadow_ray = ShadowRay(ray, kernel.space.medium_towards(z, ray.d), stream, z.event, 1, own)
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
-    c = kernel.space.seen(kernel, c, shadow_ray)
+    c = kernel.space.seen(kernel, c, ShadowRay(ray, stream, z, ray.d, 1, own))
     if drawn.sides is not None:  # only now with its weight
         c = drop_non_finite(c)
     return c.weighted(), counted + c.counted, drawn.layers

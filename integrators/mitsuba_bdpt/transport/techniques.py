@@ -149,7 +149,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
-    shadow_ray = ShadowRay(ray, kernel.space.medium_towards(z, e.d), stream, z.event, own=own)
+    shadow_ray = ShadowRay(ray, stream, z, e.d, own=own)
     emission = None
     if kernel.cells is not None:
         cos = dr.abs(dr.dot(e.anchor.n, e.d))
@@ -205,7 +205,7 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     c = replace(c, towards=connection.d)
     if kernel.path_layers:
         c.path_layer = mi.UInt32(path_layers.EMISSION)
-    return kernel.space.seen(kernel, c, ShadowRay(ray, kernel.sensor_medium, stream, mi.UInt32(0)))
+    return kernel.space.seen(kernel, c, ShadowRay(ray, stream))
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
@@ -251,8 +251,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, connection.anchor, y.si)
-    medium = kernel.space.medium_towards(y, connection.d)
-    shadow_ray = ShadowRay(ray, medium, stream, y.event, hidden=kernel.plan.hide_emitters)
+    shadow_ray = ShadowRay(ray, stream, y, connection.d, hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
     if kernel.path_layers:
         of_light = path_layers.evaluated(y.layer, f, adjoint=True)

@@ -29,16 +29,15 @@ class Arrival:
 
 @dataclass
 class ShadowRay:
-    """The shadow ray of connection ``number`` at the vertex of ``event``, and its end (`rays.Own` or None).
+    """The shadow ray of connection ``number`` of ``vertex`` in direction ``d``, and its end.
 
-    ``medium``: index of the one in which it starts, None without media; ``stream`` of its random numbers;
-    ``hidden``: emitters do not block it.
+    From the sensor if ``vertex`` is None; ``stream`` of random numbers; ``hidden``: emitters do not block it.
     """
 
     ray: mi.Ray3f
-    medium: mi.UInt32 | None
     stream: Stream
-    event: mi.UInt32
+    vertex: Any = None
+    d: mi.Vector3f | None = None
     number: mi.UInt32 | int = 0
     own: rays.Own | None = None
     hidden: bool = False
@@ -66,10 +65,6 @@ class Vacuum:
     def depart(self, kernel, side, vertex, passes: mi.Bool, ray: mi.Ray3f, /) -> tuple[Any, mi.Ray3f]:
         """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
         return None, ray
-
-    def medium_towards(self, vertex, d: mi.Vector3f) -> mi.UInt32 | None:
-        """Index of the medium at ``vertex`` in direction ``d``; None without media."""
-        return None
 
     def allows_next_event(self, vertex) -> mi.Bool | None:
         """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
