@@ -227,7 +227,7 @@ print(sum(bdpt.statistics["passes"]), "samples per pixel")
 # (specular-diffuse-specular, SDS) has no edge that can be connected, and only camera subpaths that happen to hit the lamp
 # find it: fireflies. By default photons guide them where a pilot finds that it pays (`guiding`). Vertex merging,
 # which is photon mapping for these paths alone, finds the light of point lamps too, is biased by a blur of about a pixel, and
-# converges to the right image ([the method](../method/sds_paths.md#vertex-merging-of-sds-paths)).
+# converges to the right image ([the method](../method/sds_paths.md#vertex-merging)).
 
 # %%
 water = {

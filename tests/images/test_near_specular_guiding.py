@@ -13,7 +13,7 @@ import welch as st
 from mitsuba_bdpt.planning import sds_light, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run.rendering import Render
-from mitsuba_bdpt.transport import light_path, sds, walk
+from mitsuba_bdpt.transport import light_path, sds
 from mitsuba_bdpt.transport.photons import guided_hits, guiding_benefit
 from sds_scenes import (
     NEAR_SPECULAR,
@@ -266,7 +266,7 @@ def test_scenes_without_near_specular_lobes_have_no_flags(monkeypatch):
     def never(*_):
         raise AssertionError
 
-    for module in (sds, walk, guided_hits, guiding_benefit):
+    for module in (sds, guided_hits, guiding_benefit):
         monkeypatch.setattr(module, "is_specular", never)
     monkeypatch.setattr(light_path, "_flags", never)
     images(mi.load_dict(under_glass(ball())), 4, 1, guiding="always")

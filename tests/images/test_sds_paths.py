@@ -16,54 +16,44 @@ from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.sampling import sobol
 from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
-from sds_scenes import ball, images, matte, point, strategy_images, transform, under_glass
+from sds_scenes import ball, images, matte, point, transform, under_glass
 from snapshots import ROUNDING
 
 import drjit as dr  # isort: skip
 
 
-def through_the_plate():
+def through_the_plate(lamp):
     """The camera sees the floor through the plate: paths of six edges."""
-    return under_glass(ball())
+    return under_glass(lamp)
 
 
-def by_a_mirror():
+def by_a_mirror(lamp):
     """The camera is below the plate and sees the floor in a mirror alone: paths of five edges."""
     to_world = transform().translate([-1.5, 0, 0.2]).rotate([0, 1, 0], 90).scale([0.2, 1, 1])
     mirror = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
-    scene = under_glass(ball(), mirror=mirror)
+    scene = under_glass(lamp, mirror=mirror)
     scene["sensor"] = views.camera(origin=(0, 0, 0.3), target=(-1.5, 0, 0.3), fov=16, size=16)
     return scene
 
 
-@pytest.mark.parametrize("way", [{"merging": True}, {"guiding": "always"}], ids=["merging", "guided"])
+@pytest.mark.parametrize(
+    "lamp, way", [(point(), {"merging": True}), (ball(), {"guiding": "always"})], ids=["merging", "guided"]
+)
 @pytest.mark.parametrize(
     "described, edges", [(through_the_plate, 6), (by_a_mirror, 5)], ids=["plate", "mirror"]
 )
-def test_no_path_is_longer_than_max_depth(described, edges, way):
+def test_no_path_is_longer_than_max_depth(described, edges, lamp, way):
     """Rationale: the edges of a merged path are those of a photon and of a camera vertex, those of a guided
     path those of two subpaths. Expected: with ``max_depth`` one less than the shortest SDS path the image of
     the same seed without merging and guiding, to the rounding of sums; another one from there on.
     """
-    scene = mi.load_dict(described())
+    scene = mi.load_dict(described(lamp))
     for depth in (edges - 1, edges):
         settings = {"max_depth": depth, "skip": "impossible"}
-        a, b = (images(scene, 16, 1, **settings, **w) for w in (way, {"guiding": "emission"}))
+        a, b = (
+            images(scene, 16, 1, **settings, **w) for w in (way, {"guiding": "emission", "merging": False})
+        )
         assert np.allclose(a, b, **ROUNDING) == (depth < edges)
-
-
-def test_merges_beyond_stored_vertices_have_no_other_strategy():
-    """Rationale: t = 0 makes no path of more than ``stored_vertices`` edges. Expected: under a point lamp and
-    with a wide lens merges have all of the weight with ``stored_vertices=1`` (to the rounding of sums), and a
-    part of it without.
-    """
-    scene = under_glass(point(), kind="thinlens")
-    scene["sensor"] |= {"aperture_radius": 0.8}
-    scene = mi.load_dict(scene)
-    for more, alone in (({"stored_vertices": 1}, True), ({}, False)):
-        _, layers = strategy_images(scene, 32, 1, merging_radius=0.5, skip="impossible", **more)
-        weighted, unweighted = (layers[f"{of}.merged"] for of in ("weighted", "unweighted"))
-        assert weighted.any() and np.allclose(weighted, unweighted, **ROUNDING) == alone
 
 
 def random_photons(count, seed=1):

@@ -19,7 +19,7 @@ Edge i joins x_i and x_{i+1}. All arrays have one row per path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -89,12 +89,16 @@ class Paths:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1."""
+    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1.
+
+    ``splat_count``: that of t = 1 where merges are compared with it.
+    """
 
     endpoints: float = 1.0
     splat: float = 1.0
     inner: float = 1.0
     arrival: float = 1.0
+    splat_count: float = 1.0
 
     def of(self, s: int, k: int) -> float:
         """kappa of the strategy (s, k + 1 - s)."""
@@ -179,13 +183,13 @@ def log_densities(paths: Paths) -> np.ndarray:
     return p
 
 
-def log_merges(paths: Paths, eta: np.ndarray, aimed: np.ndarray | None = None) -> np.ndarray:
+def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
     """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1); -inf at delta events.
 
     Both subpaths make x_m, and the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons'
-    subpaths times its area, ``aimed`` (n,) the density of photons' first direction in place of ``second``.
+    subpaths times its area.
     """
-    light, camera, _ = log_steps(paths if aimed is None else replace(paths, second=aimed))
+    light, camera, _ = log_steps(paths)
     p = np.empty((len(paths.kind), max(paths.k - 1, 0)))
     for m in range(1, paths.k):
         p[:, m - 1] = np.log(eta[:, m]) + light[:, : m + 1].sum(1) + camera[:, m:].sum(1)
@@ -196,20 +200,13 @@ def log_merges(paths: Paths, eta: np.ndarray, aimed: np.ndarray | None = None) -
 class Explicit:
     """All strategies of ``paths`` under ``coefficients``.
 
-    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite. With ``eta`` and ``aimed``, see
-    `log_merges`, the merges are further columns; they make paths that no strategy with s and t >= 1 in use
-    makes.
+    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite.
     """
 
-    def __init__(self, paths: Paths, coefficients: Coefficients, eta: np.ndarray | None = None, aimed=None):
+    def __init__(self, paths: Paths, coefficients: Coefficients):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
         with np.errstate(divide="ignore"):
-            self.size = log_densities(paths) + np.log(kappa)
-        if eta is not None:
-            isolated = ~np.isfinite(self.size[:, 1 : paths.k + 1]).any(1)
-            merges = np.where(isolated[:, None], log_merges(paths, eta, aimed), -np.inf)
-            self.size = np.concatenate([self.size, merges], axis=1)
-        self._take(self.size)
+            self._take(log_densities(paths) + np.log(kappa))
 
     def _take(self, size):
         """Keep the logarithms of kappa p."""
@@ -238,28 +235,30 @@ def _combined(log_terms, heuristic: str):
         return best + np.log(np.exp(exponent * (log_terms - best[:, None])).sum(1)) / exponent
 
 
-class Hard(Explicit):
-    """All strategies of ``paths``, with merges on hard paths, see `mis`.
+class Merged(Explicit):
+    """All strategies of ``paths``, with merges in further columns, see `mis`.
 
     S is the sum of kappa p of all strategies but merges, V that of the merges that have at least ``least``
-    (B) times the kappa p of the connection of either edge at their vertex; a path is ``hard`` if V >= B S.
-    ``log_s``, ``log_v``: logarithms of S and V; ``near``: mask, a comparison is closer than 0.1 %, so that
-    rounding may decide it.
+    (B) times that of the connection of either edge at their vertex, where t = 1 has `splat_count` for kappa;
+    a path is ``merged`` if V >= B S. ``log_s``, ``log_v``: logarithms of S and V; ``near``: mask, a
+    comparison is closer than 0.1 %, so that rounding may decide it.
     """
 
     def __init__(self, paths: Paths, coefficients: Coefficients, eta, least: float, heuristic: str):
         super().__init__(paths, coefficients)
-        k, size = paths.k, self.size
+        k, size, rivals = paths.k, self.size, self.size.copy()
         with np.errstate(divide="ignore", invalid="ignore"):
             merges, log_b = log_merges(paths, eta), np.log(least)
-            edges = np.maximum(size[:, 1:k], size[:, 2 : k + 1])  # before and after x_1 ... x_{k-1}
+            if coefficients.splat and k > 1:
+                rivals[:, k] += np.log(coefficients.splat_count / coefficients.splat)
+            edges = np.maximum(rivals[:, 1:k], rivals[:, 2 : k + 1])  # before and after x_1 ... x_{k-1}
             over = merges - (log_b + edges)
             merges = np.where(over >= 0, merges, -np.inf)
             self.log_s, self.log_v = _combined(size, heuristic), _combined(merges, heuristic)
             total = self.log_v - (log_b + self.log_s)
             self.near = (np.abs(over) < 1e-3).any(1) | (np.abs(total) < 1e-3)
-        self.hard = (total >= 0) & np.isfinite(merges).any(1)
-        merges = np.where(self.hard[:, None], merges, -np.inf)
+        self.merged = (total >= 0) & np.isfinite(merges).any(1)
+        merges = np.where(self.merged[:, None], merges, -np.inf)
         self._take(np.concatenate([size, merges], axis=1))
 
 

@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 6828,
+    "transport merging guided_emission": 6765,
     "planning": 2572,
     "emitters": 2680,
     "cli": 1812,
@@ -18,13 +18,13 @@ MOST = {
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1259,
+    "run": 1257,
     "scene sampling": 771,
     "host": 1077,
     "sensors": 934,
     "": 1557,  # top files
 }
-OUTSIDE = {"scripts": 6124, "tests": 45150}
+OUTSIDE = {"scripts": 6095, "tests": 44965}
 MOST_WORDS = 70600
 
 

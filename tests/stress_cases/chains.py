@@ -19,12 +19,12 @@ from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coeffic
 # n c: all classes, kappa different from every count, and classes left out.
 COEFFICIENTS = {
     "n1c1": Coefficients(1, 1, 1, 1),
-    "quarter": Coefficients(0.25, 0.0625, 1, 0.25),
-    "odd": Coefficients(3.7, 0.013, 42.0, 0.21),
+    "quarter": Coefficients(0.25, 0.0625, 1, 0.25, 1.0),
+    "odd": Coefficients(3.7, 0.013, 42.0, 0.21, 0.05),
     "n1c0": Coefficients(1, 1, 0, 1),
-    "n1c0-half": Coefficients(0.5, 0.3, 0, 0),
-    "n0c1": Coefficients(0, 0, 0.7, 0),
-    "n0c0": Coefficients(0, 0, 0, 0),
+    "n1c0-half": Coefficients(0.5, 0.3, 0, 0, 0.6),
+    "n0c1": Coefficients(0, 0, 0.7, 0, 0),
+    "n0c0": Coefficients(0, 0, 0, 0, 0),
 }
 
 
@@ -70,22 +70,15 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
     )
 
 
-def recursion(
-    paths: Paths, kappa: Coefficients, name: str, eta=None, aimed=None, hard: bool = False
-) -> np.ndarray:
+def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndarray:
     """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use.
 
-    With ``eta`` and ``aimed``, see `oracle.log_merges`, those of the k - 1 merges follow; they sample SDS
-    paths, or ``hard`` paths.
+    With ``eta``, see `oracle.log_merges`, those of the k - 1 merges follow.
     """
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
-    merges = None
-    if eta is not None:
-        discs = [mi.Float(x) for x in eta.astype(np.float32).T]
-        merges = discs, mi.Float((paths.second if aimed is None else aimed).astype(np.float32))
-    kind = HardRecursion if hard else Recursion
-    chain = kind(Columns.of(paths), kappa, mis.Heuristic(name), merges)
+    discs = None if eta is None else [mi.Float(x) for x in eta.astype(np.float32).T]
+    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), discs)
     weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
     if paths.k > 1:
         weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
@@ -161,24 +154,18 @@ class Recursion:
     In the order of calls of ``walk.py`` and ``techniques.py``.
     """
 
-    _no_newest = 0
-
-    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, merges=None):
-        self.path, self.kappa, self.h = path, kappa, heuristic
-        self.eta, self.aimed = (None, None) if merges is None else merges
-        self._no_merges = 0 if merges is None else heuristic.zero()
-        self.aimed_over_own = 1.0 if merges is None else self.aimed / path.second
+    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
+        self.path, self.kappa, self.h, self.eta = path, kappa, heuristic, eta
+        self._no_merges = 0 if eta is None else heuristic.zero()
         self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))
-        self.light, self._last = self._along_light(path.second)
-        self.photons = None if merges is None else self._along_light(self.aimed)[0]
+        self.light, self._last = self._along_light()
         self.camera = self._along_camera()
 
     # -- subpaths -----------------------------------------------------------------------------
 
-    def _fold(self, partial, coefficient, pdf_fwd_w, pdf_rev_w, cos_out, i, isolated):
+    def _fold(self, partial, coefficient, rival, pdf_fwd_w, pdf_rev_w, cos_out, i):
         is_delta = self.path.delta[i]
-        isolated = self._isolated(isolated, partial, coefficient, is_delta)
-        merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), isolated)
+        merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), None, rival)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
             pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),
@@ -186,21 +173,17 @@ class Recursion:
             cos_out=cos_out,
             delta=is_delta,
         )
-        return mis.scatter(self.h, partial, coefficient, step, merge), isolated
+        return mis.scatter(self.h, partial, coefficient, step, merge)
 
-    def _isolated(self, before, partial, coefficient, is_delta):
-        return before & (is_delta | ~mis.is_connectible(partial, coefficient))
-
-    def _along_light(self, second):
+    def _along_light(self):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
-        ``second``: the density of its first direction. As in subpaths.light_walk, walk._vertex and _scatter.
+        As in subpaths.light_walk, walk._vertex and _scatter.
         """
         x, h = self.path, self.h
-        inverse = dr.rcp(x.first * second)
+        inverse = dr.rcp(x.first * x.second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
-        partial = mis.Partial(h.start(inverse), start, self._no_merges, self._no_newest)
-        isolated = mi.Bool(True)
+        partial = mis.Partial(h.start(inverse), start, self._no_merges, self._no_merges)
         at_point = dr.select(x.position, x.direct * x.dist2[0], x.direct)
         complete = dr.select(x.area, x.direct * x.cos_light[0], at_point)
         found = [None]
@@ -211,9 +194,7 @@ class Recursion:
             partial = mis.to_area(h, partial, dist2, x.cos_camera[e - 1], x.transmittance[e - 1])
             found.append(partial)
             densities = x.to_camera[e], x.to_light[e]
-            partial, isolated = self._fold(
-                partial, self._of_light(e), *densities, x.cos_light[e], e, isolated
-            )
+            partial = self._fold(partial, *[self._of_light(e)] * 2, *densities, x.cos_light[e], e)
         return found, partial
 
     def _along_camera(self):
@@ -221,8 +202,7 @@ class Recursion:
         x, h, k = self.path, self.h, self.path.k
         from_lens = h.start(x.cos_camera[k - 1] / (x.lens_pdf * x.sensor_pdf))
         arrival = h.scale(from_lens, self.arrival)
-        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), arrival, self._no_merges, self._no_newest)
-        isolated = mi.Bool(True)
+        partial = mis.Partial(h.start(dr.rcp(x.sensor_pdf)), arrival, self._no_merges, self._no_merges)
         found = [None]
         for e in range(1, k + 1):
             i = k - e
@@ -233,9 +213,8 @@ class Recursion:
             found.append(partial)
             if e < k:
                 densities = x.to_light[i], x.to_camera[i]
-                partial, isolated = self._fold(
-                    partial, self._of_camera(e), *densities, x.cos_camera[i - 1], i, isolated
-                )
+                kappa = self._of_camera(e), self._rival(e)
+                partial = self._fold(partial, *kappa, *densities, x.cos_camera[i - 1], i)
         return found
 
     def _of_light(self, e):
@@ -243,6 +222,10 @@ class Recursion:
 
     def _of_camera(self, e):
         return self.kappa.splat if e == 1 else self.kappa.inner
+
+    def _rival(self, e):
+        """The coefficient beside which a merge at z_e has to count."""
+        return self.kappa.splat_count if e == 1 else self.kappa.inner
 
     # -- strategies ---------------------------------------------------------------------------
 
@@ -256,33 +239,30 @@ class Recursion:
         arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1], x.transmittance[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
-        merges = h.scale(h.scale(arrived.d_vm, x.sensor_pdf * x.lens_pdf), self.aimed_over_own)
-        light_side = h.combine(light_side, self._sds(arrived, newest, merges))
-        connection = h.scale(arrived.d_vcm, newest)
-        merges = h.scale(self._before_end(arrived, connection, x.sensor_pdf), x.lens_pdf)
+        rival = kappa.endpoints if k == 1 else kappa.splat_count
+        merges = h.scale(self._before_end(arrived, rival, x.sensor_pdf), x.lens_pdf)
         return h.weigh(kappa.arrival, light_side, mi.Float(0), merges=merges)[0]
 
-    def _sds(self, partial, newest, merges):
-        """``merges`` where the last edge is not connectible."""
+    def _before_end(self, partial, coefficient, pdf):
+        """Merges at the vertices before the end of a subpath, an emitter or the sensor."""
         if self.eta is None:
             return 0
-        return dr.select(mis.is_connectible(partial, newest), 0, merges)
-
-    def _before_end(self, partial, connection, pdf):
-        """Merges on hard paths at the vertices before the end of a subpath, an emitter or the sensor."""
-        return 0
+        return mis.older_merges(self.h, partial, self.h.scale(partial.d_vcm, coefficient), pdf)
 
     def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
-        """Merges on hard paths at the vertices of a subpath that is connected at x_i."""
-        return 0
+        """Merges at the vertices of a subpath that is connected at x_i; coefficients of rivals."""
+        if self.eta is None:
+            return 0
+        return mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, own, self.h.start(self.eta[i]))
 
     def merge(self, m):
         """Both subpaths up to x_m (merging.merge)."""
-        x, h, light, camera = self.path, self.h, self.photons[m], self.camera[self.path.k - m]
-        light_side = h.scale(h.combine(light.d_vc, light.d_vm), x.to_light[m])
-        arrival = h.scale(camera.d_vc, x.second / self.aimed)
-        camera_side = h.scale(h.combine(arrival, camera.d_vm), x.to_camera[m])
-        return h.weight(h.start(self.eta[m]), light_side, camera_side)
+        x, h, e = self.path, self.h, self.path.k - m
+        y, z = self.light[m], self.camera[e]
+        light = y, h.scale(y.d_vcm, self._of_light(m)), x.to_light[m]
+        camera = z, h.scale(z.d_vcm, self._rival(e)), x.to_camera[m]
+        connections = h.combine(light[1], h.scale(z.d_vcm, self._of_camera(e)))
+        return mis.weigh_merge(h, h.start(self.eta[m]), light, camera, connections)
 
     def hit(self):
         """s = 0 (techniques.hit_emitter)."""
@@ -290,9 +270,7 @@ class Recursion:
         connected = dr.select(x.area, x.direct * x.cos_light[0] / x.dist2[0], x.direct)
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
-        merges = 0 if self.eta is None else h.scale(last.d_vm, x.first * self.aimed)
-        camera_side = h.combine(camera_side, self._sds(last, newest, merges))
-        merges = self._before_end(last, h.scale(last.d_vcm, newest), x.first * x.second)
+        merges = self._before_end(last, newest, x.first * x.second)
         return h.weigh(1, mi.Float(0), camera_side, merges=merges)[0]
 
     def _joined(self, kappa, light_side, camera_side, edge, merges=0):
@@ -314,10 +292,10 @@ class Recursion:
         x, h, k = self.path, self.h, self.path.k
         light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
         density = x.ratio * x.cos_camera[0]
-        of_camera = self._of_camera(k - 1)
-        end = self.camera[k - 1], of_camera, x.to_camera[1], density
-        merges = self._of_side(*end, 1.0, 1)
-        return self._joined(1, light_side, mis.alternatives(h, *end), 0, merges)
+        z, densities = self.camera[k - 1], (x.to_camera[1], density)
+        merges = self._of_side(z, self._rival(k - 1), *densities, 1.0, 1)
+        camera_side = mis.alternatives(h, z, self._of_camera(k - 1), *densities)
+        return self._joined(1, light_side, camera_side, 0, merges)
 
     def inner(self, s):
         """s and t >= 2 (connections.inner)."""
@@ -328,7 +306,8 @@ class Recursion:
         from_light = x.to_camera[s - 1] * x.cos_camera[s - 1] / x.dist2[s - 1]
         y = self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
         z = self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
-        merges = h.combine(self._of_side(*y, kappa.inner, s - 1), self._of_side(*z, kappa.inner, s))
+        of_z = self._of_side(z[0], self._rival(k - s), *z[2:], kappa.inner, s)
+        merges = h.combine(self._of_side(*y, kappa.inner, s - 1), of_z)
         sides = mis.alternatives(h, *y), mis.alternatives(h, *z)
         return self._joined(kappa.inner, *sides, s - 1, merges)
 
@@ -341,35 +320,8 @@ class Recursion:
         y = self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
         to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
         camera_side = h.scale(h.start(to_sensor), self.arrival)
-        merges = self._of_side(*y, kappa.splat, k - 1)
+        merges = self._of_side(*y, kappa.splat_count, k - 1)
         return self._joined(kappa.splat, mis.alternatives(h, *y), camera_side, k - 1, merges)
-
-
-class HardRecursion(Recursion):
-    """The same with merges on hard paths, whose photons set out by the emitter's own density."""
-
-    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, merges):
-        self._no_newest = heuristic.zero()
-        super().__init__(path, kappa, heuristic, merges)
-
-    def _isolated(self, before, partial, coefficient, is_delta):
-        return None
-
-    def _sds(self, partial, newest, merges):
-        return 0
-
-    def _before_end(self, partial, connection, pdf):
-        return mis.older_merges(self.h, partial, connection, pdf)
-
-    def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
-        return mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, own, self.h.start(self.eta[i]))
-
-    def merge(self, m):
-        """Both subpaths up to x_m (merging.merge)."""
-        x, h, e = self.path, self.h, self.path.k - m
-        light = self.light[m], h.scale(self.light[m].d_vcm, self._of_light(m)), x.to_light[m]
-        camera = self.camera[e], h.scale(self.camera[e].d_vcm, self._of_camera(e)), x.to_camera[m]
-        return mis.weigh_merge(h, h.start(self.eta[m]), light, camera)
 
 
 def columns(values, n) -> np.ndarray:

@@ -62,9 +62,9 @@ from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
 
 
-def check(paths, kappa, name, weights, relative, eta=None):
+def check(paths, kappa, name, weights, relative):
     """Compare with the oracle."""
-    explicit = oracle.Explicit(paths, kappa, eta)
+    explicit = oracle.Explicit(paths, kappa)
     weights = np.where(explicit.used, weights, 0)
     assert np.isfinite(weights).all()
     # A relative bound tests small weights as sharply as large ones; below 1e-30 float32 ends.
@@ -92,54 +92,27 @@ def test_recursion_agrees_with_explicit_densities(name, classes):
         check(paths, COEFFICIENTS[classes], name, weights, relative=1e-4)
 
 
-@pytest.mark.parametrize("name", settings.HEURISTICS)
-@pytest.mark.parametrize("classes", COEFFICIENTS)
-def test_recursion_with_merges(name, classes):
-    """Rationale: a third float per vertex and a flag must say which paths are isolated, and what the merges
-    at all other vertices would do. 1,000 random paths each of k = 2 ... 7 edges, half of the vertices delta,
-    discs whose eta is spread over six orders of magnitude, and so are the densities of first directions with
-    which photons are aimed; otherwise as above. Expected: every weight, of
-    merges too, is the oracle's to 1e-4 of its own size, and those of a path sum to 1 within 1e-4; paths that
-    are not isolated have the weights that they have without merging, to the bit.
-    """
-    rng, total = np.random.default_rng(5), 0
-    for k in range(2, 8):
-        paths = random_paths(rng, 1000, k, delta=0.5)
-        eta = (10.0 ** rng.uniform(-3, 3, (1000, k + 1))).astype(np.float32)
-        aimed = (10.0 ** rng.uniform(-3, 3, 1000)).astype(np.float32)
-        explicit = oracle.Explicit(paths, COEFFICIENTS[classes], eta, aimed)
-        weights = recursion(paths, COEFFICIENTS[classes], name, eta, aimed)
-        found = np.where(explicit.used, weights, 0)
-        np.testing.assert_allclose(found, explicit.weights(name), rtol=1e-4, atol=1e-30, err_msg=f"k={k}")
-        np.testing.assert_allclose(found[explicit.used.any(1)].sum(1), 1, atol=1e-4)
-        merged = explicit.used[:, k + 2 :].any(1)
-        total += merged.sum()
-        without = recursion(paths, COEFFICIENTS[classes], name)
-        np.testing.assert_array_equal(weights[~merged, : k + 2], without[~merged])
-    assert total > 200
-
-
 @pytest.mark.parametrize("least", [0.0, 1.0, 30.0])
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", COEFFICIENTS)
-def test_recursion_with_merges_on_hard_paths(name, classes, least, monkeypatch):
+def test_recursion_with_merges(name, classes, least, monkeypatch):
     """Rationale: S and V are sums over all vertices, and every strategy knows a part of them: two further
-    floats must say what the explicit densities say, and whether the path is hard. 1,000 random paths each of
-    k = 2 ... 7 edges, a fifth of the vertices delta, eta spread over six orders of magnitude; B = 0 merges at
-    all vertices that are not delta (the whole of Georgiev's method).
+    floats must say what the explicit densities say, and whether the path is merged. 1,000 random paths each
+    of k = 2 ... 7 edges, a fifth of the vertices delta, eta spread over six orders of magnitude; B = 0 merges
+    at all vertices that are not delta (the whole of Georgiev's method).
 
     Expected: every weight, of merges too, is the oracle's to 1e-4 of its own size, and those of a path sum to
-    1 within 1e-4; paths that are not hard have the weights that they have without merging, to the bit. Left
+    1 within 1e-4; paths that are not merged have the weights that they have without merging, to the bit. Left
     out: paths (about 1 %) on which a comparison is closer than 0.1 %, which rounding may decide either way.
     """
-    monkeypatch.setattr(mis, "HARD", least)
+    monkeypatch.setattr(mis, "MERGE_DOMINATED", least)
     rng, total, plain = np.random.default_rng(6), 0, 0
     for k in range(2, 8):
         paths = random_paths(rng, 1000, k)
         eta = (10.0 ** rng.uniform(-3, 3, (1000, k + 1))).astype(np.float32)
-        explicit = oracle.Hard(paths, COEFFICIENTS[classes], eta, least, name)
+        explicit = oracle.Merged(paths, COEFFICIENTS[classes], eta, least, name)
         sure = ~explicit.near
-        weights = recursion(paths, COEFFICIENTS[classes], name, eta, hard=True)
+        weights = recursion(paths, COEFFICIENTS[classes], name, eta)
         merged = np.where(explicit.used, weights, 0)
         assert np.isfinite(merged).all()
         np.testing.assert_allclose(
@@ -148,12 +121,12 @@ def test_recursion_with_merges_on_hard_paths(name, classes, least, monkeypatch):
         others = ~explicit.used[:, k + 2 :] & ~paths.delta[:, 1:k] & sure[:, None]
         assert not weights[:, k + 2 :][others].any()
         np.testing.assert_allclose(merged[sure & explicit.used.any(1)].sum(1), 1, atol=1e-4)
-        without, easy = recursion(paths, COEFFICIENTS[classes], name), sure & ~explicit.hard
+        without, easy = recursion(paths, COEFFICIENTS[classes], name), sure & ~explicit.merged
         np.testing.assert_array_equal(
             np.where(explicit.used, weights, 0)[easy, : k + 2],
             np.where(explicit.used[:, : k + 2], without, 0)[easy],
         )
-        total, plain = total + (explicit.hard & sure).sum(), plain + easy.sum()
+        total, plain = total + (explicit.merged & sure).sum(), plain + easy.sum()
         assert explicit.near.mean() < 0.05
     assert total > 200 and plain > 200
 
@@ -605,7 +578,7 @@ def python_loop(times):
 class Inputs(SimpleNamespace):
     """Stand-in for `inputs.Kernel`."""
 
-    merges_hard = inputs.Kernel.merges_hard
+    merges = inputs.Kernel.merges
     guides_near_specular = inputs.Kernel.guides_near_specular
 
 
@@ -693,6 +666,7 @@ def kernel_weights(
             endpoints=f(kappa.endpoints) if plan.endpoints else 0,
             arrival=f(kappa.arrival) if plan.arrival else 0,
             inner=f(kappa.inner) if kappa.inner > 0 else 0,
+            splat_count=f(kappa.splat_count) if plan.splat else 0,
         ),
         refracts=True,
         points=Nothing(),
@@ -713,7 +687,7 @@ def kernel_weights(
     shared = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     if merges is not None:
         k_.sds = traced_photons(world, k_, merges, shared, monkeypatch)
-        (record_hard_merges if merges.hard else record_merges)(world, monkeypatch)
+        record_merges(world, monkeypatch)
     result = [f(0)] * (k + 2 + (0 if guide is None else 2 * (k - 2)))
     stored = []
     if guide is not None:
@@ -782,24 +756,17 @@ def kernel_weights(
     return columns(result, world.n)
 
 
+@dataclass
 class Unaimed:
     """A stand-in for `aim.Aim`: photons set out by the emitter's own density."""
+
+    no_sky: bool = False
 
     def emission(self, emitters, u_point, u_direction, shared):
         return emitters.sample_emission(u_point, u_direction, shared, mi.Bool(True)), mi.Float(1)
 
     def density(self, emission, number=None):
         return emission.pdf_second
-
-    def density_at(self, hit, p, d, pdf_second):
-        return pdf_second
-
-
-@dataclass
-class UnaimedAt(Unaimed):
-    """The same, with `aim.Aim.no_sky`."""
-
-    no_sky: bool
 
 
 def traced_photons(world: World, k_, merges, shared, monkeypatch):
@@ -819,34 +786,7 @@ def record_merges(world: World, monkeypatch):
     """Keep in ``world.merged`` what is merged at each x_m, a `Contribution`; inactive where nothing is."""
     from mitsuba_bdpt.merging import merging
 
-    is_sds_vertex, merge, draw, loop = merging.is_sds_vertex, merging.merge, merging._draw, dr.while_loop
-    world.merged, mask = {}, {}
-
-    def recorded_mask(kernel_, first, walk, z):
-        mask[0] = is_sds_vertex(kernel_, first, walk, z)
-        return mask[0]
-
-    def recorded_merge(kernel_, merging_, z, *more):
-        out, m = merge(kernel_, merging_, z, *more), world.k - int(z.edges[0])
-        out.active = out.active & mask[0]
-        world.merged[m] = out
-        world.demands.append(~out.active | ((out.s == m + 1) & (out.t == world.k - m)))
-        return out
-
-    def drawn(*arguments):
-        with monkeypatch.context() as patch:  # a loop over photons, which are no stand-ins
-            patch.setattr(dr, "while_loop", loop)
-            return draw(*arguments)
-
-    for name, function in (("is_sds_vertex", recorded_mask), ("merge", recorded_merge), ("_draw", drawn)):
-        monkeypatch.setattr(merging, name, function)
-
-
-def record_hard_merges(world: World, monkeypatch):
-    """The same of hard paths."""
-    from mitsuba_bdpt.merging import hard_paths, merging
-
-    kind, draw, loop, mask = hard_paths.HardMerging, merging._draw, dr.while_loop, {}
+    kind, draw, loop, mask = merging.Merging, merging._draw, dr.while_loop, {}
     is_merged, merged = kind.is_merged, kind.merged
     world.merged = {}
 
@@ -927,58 +867,6 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "name, classes, lens",
-    [
-        ("balance", "odd", True),
-        ("balance", "n0c0", True),
-        ("power", "n1c0-half", True),
-        ("balance", "odd", False),
-    ],
-)
-def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """Rationale: as above, also of ``passes.trace``, ``alternatives.is_sds_vertex`` and ``merging.merge``:
-    photons are traced along the paths, sorted into the grid and found again from the camera's side, in discs
-    so small that each holds the vertex of its own path alone. Radii depend on the place, so that eta is
-    spread over three orders of magnitude; kappa of merges is 0.3; half of the vertices are delta.
-
-    Expected: the weights of all strategies and merges are the oracle's, as above. There is a merge at each
-    vertex where the oracle has one, and else only where an event is delta on a BSDF that has other lobes. A
-    merge's estimate is the photon's flux over eta and the cosine towards the light's side, to 1e-3; the flux
-    is 1 / density of the events before it, times their adjoint factors.
-    """
-    from mitsuba_bdpt.merging.merging import Merging
-    from mitsuba_bdpt.merging.radius import Radius
-
-    kappa, rng, share, total = COEFFICIENTS[classes], np.random.default_rng(9), 0.3, 0
-    for k in (4, 5):
-        world = World(rng, 1000, k, lens, delta=0.5)
-        centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
-        radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
-        with monkeypatch.context() as patch:
-            merges = Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
-            weights = kernel_weights(world, kappa, name, patch, merges)
-        distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
-        eta = count * np.pi * np.clip(angle * distance, low, high) ** 2
-        check(world.paths, kappa, name, weights, relative=1e-3, eta=share * eta)
-
-        paths, inner = world.paths, slice(1, k)
-        used = oracle.Explicit(paths, kappa, share * eta).used[:, k + 2 :]
-        merged = [world.merged[m] for m in range(1, k)]
-        active = np.stack([np.broadcast_to(c.active.numpy(), 1000) for c in merged], axis=1)
-        assert (active >= used).all()
-        assert not (active & ~used)[~(paths.delta & world.mixed)[:, inner]].any()
-        total += used.sum()
-        towards_light = paths.cos_camera[:, : k - 1]  # at x_1 ... x_{k-1}
-        density = np.where(paths.delta, 1, paths.to_camera)[:, inner]
-        flux = np.cumprod(paths.cos_light[:, inner] / towards_light / density, axis=1)
-        flux = np.concatenate([np.ones((1000, 1)), flux[:, :-1]], axis=1)
-        value = columns([c.value[0] for c in merged], 1000)
-        expected = flux / (eta[:, inner] * towards_light)
-        np.testing.assert_allclose(value[used], expected[used], rtol=1e-3, err_msg=f"k={k}")
-    assert total > 200
-
-
-@pytest.mark.parametrize(
     "name, classes, lens, least",
     [
         ("balance", "odd", True, 0.0),
@@ -989,32 +877,33 @@ def test_kernel_with_merges_agrees_with_explicit_densities(name, classes, lens, 
         ("power", "n1c1", False, 0.0),
     ],
 )
-def test_kernel_with_merges_on_hard_paths(name, classes, lens, least, monkeypatch):
-    """Rationale: as above, of hard paths: merges on paths that connections sample too. Every strategy has to
+def test_kernel_with_merges(name, classes, lens, least, monkeypatch):
+    """Rationale: as above, with merges on paths that connections sample too. Every strategy has to
     pass V the vertex, densities and coefficients of its own, and stored vertices carry it. Bounds from one
-    side that are not exact are off (`hard_paths.SLACK`), eta is spread over three orders of magnitude, and a
+    side that are not exact are off (`merging.SLACK`), eta is spread over three orders of magnitude, and a
     fifth of the vertices are delta.
 
     Expected: the weights of all strategies and merges are the oracle's, to 1e-3, and their sums 1 within
-    1e-4, but on the paths where rounding decides a comparison (closer than 0.1 %; a few per mille).
+    1e-4, but on the paths where rounding decides a comparison (closer than 0.1 %; a few per mille). A
+    merge's estimate is the photon's flux over eta and the cosine towards the light's side, to 1e-3; the flux
+    is 1 / density of the events before it, times their adjoint factors.
     """
-    from mitsuba_bdpt.merging import hard_paths
+    from mitsuba_bdpt.merging import merging
     from mitsuba_bdpt.merging.radius import Radius
 
-    monkeypatch.setattr(mis, "HARD", least)
-    monkeypatch.setattr(hard_paths, "SLACK", 1e30)
+    monkeypatch.setattr(mis, "MERGE_DOMINATED", least)
+    monkeypatch.setattr(merging, "SLACK", 1e30)
     kappa, rng, share, total = COEFFICIENTS[classes], np.random.default_rng(9), 0.3, 0
     for k in (2, 3, 5):
         world = World(rng, 1000, k, lens)
         centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
         radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
         with monkeypatch.context() as patch:
-            aim = UnaimedAt(no_sky=False)
-            merges = hard_paths.HardMerging(radius, mi.Float(count), mi.Float(share), aim)
+            merges = merging.Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
             weights = kernel_weights(world, kappa, name, patch, merges)
         distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
         eta = share * count * np.pi * np.clip(angle * distance, low, high) ** 2
-        explicit = oracle.Hard(world.paths, kappa, eta, least, name)
+        explicit = oracle.Merged(world.paths, kappa, eta, least, name)
         sure, used = ~explicit.near, explicit.used
         found = np.where(used, weights, 0)
         np.testing.assert_allclose(
@@ -1023,9 +912,19 @@ def test_kernel_with_merges_on_hard_paths(name, classes, lens, least, monkeypatc
         np.testing.assert_allclose(found[sure & used.any(1)].sum(1), 1, atol=1e-4)
         others = ~used[:, k + 2 :] & ~world.paths.delta[:, 1:k] & sure[:, None]
         assert not weights[:, k + 2 :][others].any()
-        total += (explicit.hard & sure).sum()
+        paths, inner = world.paths, slice(1, k)
+        towards_light = paths.cos_camera[:, : k - 1]  # at x_1 ... x_{k-1}
+        flux = np.where(paths.delta, 1, paths.to_camera)[:, inner]
+        flux = np.cumprod(paths.cos_light[:, inner] / towards_light / flux, axis=1)
+        flux = np.concatenate([np.ones((1000, 1)), flux[:, :-1]], axis=1)
+        at, value = (
+            used[:, k + 2 :] & sure[:, None],
+            columns([world.merged[m].value[0] for m in range(1, k)], 1000),
+        )
+        np.testing.assert_allclose(value[at], (share * flux / (eta[:, inner] * towards_light))[at], rtol=1e-3)
+        total += (explicit.merged & sure).sum()
         assert explicit.near.mean() < 0.02
-    assert total > 100
+    assert total > 50
 
 
 def layers_of(paths) -> np.ndarray:
@@ -1041,26 +940,24 @@ def layers_of(paths) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("kind", ["alone", "merging", "hard"])
+@pytest.mark.parametrize("kind", ["alone", "merging"])
 def test_strategies_agree_on_path_layers(kind, monkeypatch):
     """Rationale: each strategy knows the events of two halves of a path, and makes one or two by connecting
     them. Paths and photons as above, half of the vertices delta, the others near-specular at half of the
     densities. Expected: every strategy that samples a path, merges too, states the layer that
     follows from its definition."""
-    from mitsuba_bdpt.merging.hard_paths import HardMerging
     from mitsuba_bdpt.merging.merging import Merging
     from mitsuba_bdpt.merging.radius import Radius
 
     monkeypatch.setattr(near_specular, "NARROW", 0.3)
-    monkeypatch.setattr(mis, "HARD", 0.0)
+    monkeypatch.setattr(mis, "MERGE_DOMINATED", 0.0)
     rng, met = np.random.default_rng(4), np.zeros((len(NAMES), 2), dtype=int)
-    for k in {"alone": (1, 2, 3, 4, 5), "merging": (4,), "hard": (3,)}[kind]:
+    for k in {"alone": (1, 2, 3, 4, 5), "merging": (3,)}[kind]:
         world, merges = World(rng, 800, k, True, delta=0.5), None
         world.path_layers = True
         if kind != "alone":
             radius = Radius(mi.Point3f(0.0), *(mi.Float(x) for x in (0.0, 1e-3, 2.5e-4, 2e-3)))
-            aim, made = (UnaimedAt(no_sky=False), HardMerging) if kind == "hard" else (Unaimed(), Merging)
-            merges = made(radius, mi.Float(1e4), mi.Float(0.3), aim)
+            merges = Merging(radius, mi.Float(1e4), mi.Float(0.3), Unaimed())
         with monkeypatch.context() as patch:
             kernel_weights(world, COEFFICIENTS["odd"], "balance", patch, merges)
         expected, paths = layers_of(world.paths), world.paths
@@ -1074,7 +971,7 @@ def test_strategies_agree_on_path_layers(kind, monkeypatch):
             layer = np.broadcast_to(layer.numpy(), len(expected))
             np.testing.assert_array_equal(layer[sampled], expected[sampled], err_msg=f"{k}, {strategy}")
             met[:, int(strategy.startswith("merge"))] += np.bincount(layer[sampled], minlength=len(NAMES))
-    merged = {"alone": (), "merging": (CAUSTIC,), "hard": (DIRECT, INDIRECT, CAUSTIC)}[kind]
+    merged = {"alone": (), "merging": (DIRECT, INDIRECT, CAUSTIC)}[kind]
     assert (met[:, 0] > 20).all() and (met[merged, 1] > 20).all()
 
 

@@ -1,15 +1,24 @@
-"""Vertex merging (photon mapping) of SDS paths.
+"""Vertex merging (photon mapping) of paths that merges dominate.
 
-Source: Georgiev 2012, see `mis`; here restricted to paths that no connection can sample (see `sds`). Both
-subpaths are traced up to the same diffuse vertex, and a photon within a radius of the camera vertex counts as
-if it were there.
+Source: Georgiev 2012, see `mis`. Both subpaths are traced up to the same vertex, whose event is not delta,
+and a photon within a radius of the camera vertex counts as if it were there. Paths are merged if merges
+sample them better than all other strategies together, see `mis`: SDS paths, and paths through lobes so narrow
+that connections rarely succeed. The weights need no flags of delta events. The estimate is consistent, not
+unbiased.
 
-With n photon subpaths, discs of radius r(x) about camera vertices, area measure, p-> densities of the light
-subpath and p<- of the camera subpath::
+Photons and camera vertices of other paths would cost time for nothing. Two bounds from one side leave out
+most, without bias:
 
-    n p_m = eta prod_{i<=m} p->_i prod_{m<=i<k} p<-_i,    eta = n pi r(x_m)^2
+* A merge needs B times the connections of both of its own edges, each of which one side knows.
+* Where it has little beside all older alternatives of its side, ``d_vc`` times the density ``pdf_rev_w`` of
+  the reverse direction, it has little of the weight. That density is known with the other side alone; on a
+  diffuse surface it is the cosine over pi, and elsewhere, or if the path has further merges, the path may be
+  merged all the same. So photons, photon subpaths and camera vertices play Russian roulette, with the ratio
+  to that of a diffuse surface. Where one side plays, the estimate of a merge is then at most 1 / SLACK times
+  that at a diffuse surface: its density, and with it its BSDF, is as small as the probability.
 
-and kappa n p_m in the weights. The estimate is consistent, not unbiased.
+Photons may be aimed, but weights take the emitter's own density of first directions: weights may be any
+function of the path, and S and V then differ by densities that every strategy knows.
 """
 
 from __future__ import annotations
@@ -25,7 +34,7 @@ from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from ..transport import bsdf, mis, path_layers, spectra
-from ..transport.alternatives import is_sds_vertex
+from ..transport.alternatives import newest_connection
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
@@ -38,6 +47,12 @@ from .wavelength_sets import SET_BITS, WavelengthSets
 # Bits of a bucket's index in the hash table, and of each coordinate of a cell.
 BUCKET_BITS = 18
 _CELL_BITS = 20
+
+# Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.
+SLACK = 0.2
+
+# Index of the series of hashed numbers, of a camera vertex, that play this roulette; merges use the first.
+_OF_QUERIES = 3
 
 # Most distance of a merged photon from the tangent plane of the camera vertex, over the radius.
 _FLAT = 0.25
@@ -61,6 +76,7 @@ class Merging(PhotonStrategy):
     wavelengths: WavelengthSets | None = None
 
     counters = ("merges",)
+    merges = True
 
     def eta(self, p: mi.Point3f) -> mi.Float:
         """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
@@ -75,24 +91,44 @@ class Merging(PhotonStrategy):
         return self.kappa * self.count * dr.pi * dr.square(radius)
 
     def begin_light(self, kernel, walk):
-        return begun(walk, State(isolated=mi.Bool(True)), kernel.heuristic.zero())
+        return begun(walk, None, kernel.heuristic.zero(), kernel.heuristic.zero())
 
     begin_camera = begin_light
 
     def merge(self, kernel, vertex, isolated) -> mis.Merge:
-        return mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), isolated)
+        return mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), None)
 
-    def longest(self, kernel: Kernel) -> mi.UInt32:
-        """Most edges of a merged path."""
-        return kernel.max_depth
+    def survival(self, state, partial, p):
+        # Whichever is larger, since it may go on to where pixels are larger.
+        eta = dr.maximum(self.weighed(p), self.weighed_in(self.radius.median))
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, eta))
+        return survived / state.survived, State(survived=survived)
 
-    def is_merged(self, kernel: Kernel, z: Vertex, walk, stream: Stream) -> mi.Bool:
-        """Mask: the camera vertex ``z`` looks for photons."""
-        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+    def may_merge(self, kernel: Kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
+        possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
+        return possible & mis.exceeds(self.weighed(vertex.si.p), connection)
+
+    def kept(self, kernel: Kernel, vertex, survived=1.0):
+        d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
+        return dr.minimum(_probability(d_vc, self.weighed(vertex.si.p)) / survived, 1)
+
+    def is_merged(self, kernel, z, walk, stream):
+        word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
+        asks = self.may_merge(kernel, z, newest_connection(kernel, kernel.kappa.splat_count, z))
+        return self.photons.exist & asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-        """The contribution of merges at the camera vertex ``z``."""
-        return merge(kernel, self, z, stream, wavelength_set)
+        drawn = sample(kernel, self, z, stream, wavelength_set)
+        y, f = drawn.photon, drawn.f
+        light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
+        camera = z.partial, newest_connection(kernel, kernel.kappa.splat_count, z), f.pdf_rev_w
+        h = kernel.heuristic
+        connections = h.combine(y.connection, newest_connection(kernel, kernel.kappa.splat, z))
+        weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera, connections)
+        active = drawn.active & ~(weight == 0)
+        value = drawn.value / self.kept(kernel, z)
+        c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")
+        return _with_layers(kernel, c, z, drawn)
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
         total, counters = state
@@ -111,14 +147,15 @@ class Merging(PhotonStrategy):
         )
         return total, replace(counters, non_finite=lost, merges=merges)
 
-    def hit(self, kernel, z, connectible, densities, sides, active):
-        h, (light_side, camera_side), (pdf_first, pdf_second) = kernel.heuristic, sides, densities
-        emitted = self.aim.density_at(z.hit, z.si.p, dr.normalize(z.previous - z.si.p), pdf_second)
-        merges = h.scale(z.partial.d_vm, pdf_first * emitted)
-        return (light_side, h.combine(camera_side, dr.select(connectible, 0, merges))), active
 
-    def arrive(self, kernel, merges, emission):
-        return kernel.heuristic.scale(merges, self.aim.density(emission) / emission.pdf_second)
+def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:
+    """Probability with which a ``merge`` of this partial sum is sampled beside older alternatives ``d_vc``.
+
+    ``d_vc`` before the edge to it.
+    """
+    if mis.is_absent(d_vc):
+        return mi.Float(1)
+    return dr.minimum(SLACK * dr.pi * merge / (mis.MERGE_DOMINATED * d_vc), 1)
 
 
 def coefficient(samples: float, radius: float) -> float:
@@ -197,7 +234,7 @@ def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, waveleng
     Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
     """
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
-    chosen, total = _draw(merging, z, merging.longest(kernel) - z.edges, word, wavelength_set)
+    chosen, total = _draw(merging, z, kernel.last_merged - z.edges, word, wavelength_set)
     active = z.hit & (total > 0)
     photon = merging.photons.found.at(chosen, active)
     f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
@@ -208,21 +245,7 @@ def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, waveleng
     return Sample(photon, f, value, active & ~spectra.is_zero(value), total / size_of(photon.flux))
 
 
-def merge(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-    """Merge the camera vertex ``z`` with one photon near it, see `sample`."""
-    h, drawn = kernel.heuristic, sample(kernel, merging, z, stream, wavelength_set)
-    photon, f = drawn.photon, drawn.f
-    light_side = h.scale(photon.older, f.pdf_fwd_w)
-    # t = 0, the oldest alternative of the camera's side, does not sample longer paths.
-    older = mis.choose(kernel.within_store(photon.edges + z.edges), z.partial.d_vc, 0)
-    older = h.scale(older, photon.aim)  # t = 0 starts with the emitter's density, not the photons'
-    camera_side = h.scale(h.combine(older, z.partial.d_vm), f.pdf_rev_w)
-    weight, shares = h.weigh(h.start(merging.weighed(z.si.p)), light_side, camera_side)
-    c = Contribution(drawn.value, weight, photon.edges + 1, z.edges, drawn.active, shares, "merge")
-    return with_layers(kernel, c, z, drawn)
-
-
-def with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Contribution:
+def _with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Contribution:
     """The contribution ``c`` of ``drawn`` with its light group and path layer, if there are such layers."""
     photon, path_layer = drawn.photon, None
     if kernel.path_layers:

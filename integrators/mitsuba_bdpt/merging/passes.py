@@ -16,20 +16,19 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
-from .hard_paths import HardMerging
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import Footprints, in_pass
+from .radius import Footprints, after
 from .wavelength_sets import SETS, WavelengthSets
 
-# Camera samples of a pass per photon subpath, and where hard paths are merged (experiments, "Hard paths").
-SAMPLES_PER_PHOTON, SAMPLES_PER_HARD_PHOTON = 8, 16
+# Camera samples of a pass per photon subpath (experiments, "Which paths are merged").
+SAMPLES_PER_PHOTON = 8
 
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Samples per pixel of a pass that merges many paths, and least samples of a pass: its photons and its queries
-# grow with them, and merges with their product (experiments, "Hard paths").
-_SHORT_PASS, _LEAST_SAMPLES = 16, 1 << 16
+# Samples per pixel of a pass, of one that merges many vertices, and least samples of a pass: its photons and
+# its queries grow with them, and merges with their product (experiments, "Which paths are merged").
+_PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 
 # Bits of the edges and of the subpath's index in the sort key of photons.
 _EDGES_BITS, _LANE_BITS = 12, 32
@@ -48,50 +47,57 @@ def why_not(sensor: mi.Sensor, media: bool) -> str:
 class Passes:
     """Vertex merging in one render of ``pixels`` pixels; ``aim`` of the photons.
 
-    ``hard``: hard paths are merged, not SDS paths alone.
+    ``near_specular``: the scene has near-specular lobes, whose vertices are merged too.
     """
 
     def __init__(
-        self, scene: mi.Scene, sensor: mi.Sensor, settings: Settings, aim: Aim, pixels: int, hard: bool
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        settings: Settings,
+        aim: Aim,
+        pixels: int,
+        near_specular: bool,
     ):
         # Without light subpaths most camera vertices are merged.
-        self._many = hard or settings.light_paths == 0
+        many = near_specular or settings.light_paths == 0
+        self._pass = _SHORT_PASS if many else _PASS
         self._footprints = Footprints.of(scene, sensor)
-        self._radius, self._aim, self._pixels = settings.internals.merging_radius, aim, pixels
-        self._kind = HardMerging if hard else Merging
-        self._samples_per_photon = SAMPLES_PER_HARD_PHOTON if hard else SAMPLES_PER_PHOTON
+        # Densities decide where the light of an even sky is merged.
+        self._aim = replace(aim, no_sky=False)
+        self._radius, self._pixels = settings.internals.merging_radius, pixels
 
     @property
     def best_pass(self) -> int:
-        """Samples per pixel of a pass, 0 for as many as a launch has."""
-        return max(_SHORT_PASS, _LEAST_SAMPLES // self._pixels) if self._many else 0
+        """Samples per pixel of a pass."""
+        return max(self._pass, _LEAST_SAMPLES // self._pixels)
 
     def trace(
         self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None
     ) -> tuple[Merging, mi.UInt64]:
         """Trace the photons of a pass; returns its strategy, and counters.
 
-        ``samples`` of each pixel; ``done``: earlier passes of all parts of the image, from which the radius
+        ``samples`` of each pixel; ``done``: earlier ones, in all parts of the image, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
-        radius = in_pass(self._radius, done)  # in pixels
-        count = photons_of_pass(samples * self._pixels, self._pixels, radius, self._samples_per_photon)
+        radius = after(self._radius, done + samples)  # in pixels
+        count = photons_of_pass(samples * self._pixels, self._pixels, radius)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done)
             count = max(count // sets, 1) * sets
         kappa = coefficient(samples / sets, radius)
-        if self._kind.hard:  # photons beyond those of the samples would make ordinary paths hard
-            kappa *= min(1.0, samples * self._pixels / (self._samples_per_photon * count))
+        # Photons beyond those of the samples would make ordinary paths merge-dominated.
+        kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
-        merging = self._kind(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
+        merging = Merging(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
         return trace(kernel, merging, points, count)
 
 
-def photons_of_pass(samples: int, pixels: int, radius: float, each: int = SAMPLES_PER_PHOTON) -> int:
-    """Number of photon subpaths of a pass, one for ``each`` so many samples; ``radius`` in pixels."""
+def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
+    """Number of photon subpaths of a pass of so many ``samples``; ``radius`` in pixels."""
     most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
-    return min(photon_pass.photons_of(samples, each), most)
+    return min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most)
 
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:

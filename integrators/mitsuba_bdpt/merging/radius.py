@@ -22,14 +22,15 @@ _LOWEST, _HIGHEST = 1 / 8, 8
 # Radius in diagonals of the scene where no pixels can be measured (meters, custom sensors, empty views).
 _OF_DIAGONAL = 1 / 512
 
-# Exponent alpha: the radius of pass i is that of the first times i^((alpha - 1) / 2) (C. Knaus and M.
-# Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
-SHRINKING = 2 / 3
+# Exponent alpha: the radius is proportional to i^((alpha - 1) / 2) in pass i (C. Knaus and M. Zwicker,
+# "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15). Here i is the number of samples per
+# pixel over `_OF_SAMPLES`, so that passes of any length have the same radius.
+SHRINKING, _OF_SAMPLES = 2 / 3, 64
 
 
-def in_pass(first: float, done: int) -> float:
-    """Radius after ``done`` passes, in the unit of the ``first`` pass's radius (`SHRINKING`)."""
-    return first * (done + 1) ** ((SHRINKING - 1) / 2)
+def after(radius: float, samples: int) -> float:
+    """Radius of a pass that ends after ``samples`` per pixel; ``radius`` after `_OF_SAMPLES`."""
+    return radius * (samples / _OF_SAMPLES) ** ((SHRINKING - 1) / 2)
 
 
 # Most change of the radius per distance, which the widths of cells allow for (`merging.cell_at`).

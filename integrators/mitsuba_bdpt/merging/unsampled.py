@@ -58,6 +58,18 @@ class Unsampled:
     kinds: mi.Float64 | None = None
 
 
+@dataclass
+class _Discs(Merging):
+    """Photons in discs, of which weights do not know."""
+
+    merges = False
+
+    def begin_light(self, kernel, walk):
+        return walk
+
+    begin_camera = begin_light
+
+
 def estimate(
     kernel: Kernel,
     batch: Batch,
@@ -79,7 +91,7 @@ def estimate(
     of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
     discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     met = dr.opaque(mi.Float, count / sets)
-    merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
+    merging = _Discs(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
     undersampled = None if samples is None else Undersampled.of(samples)
     kept = PhotonPolicy.UNSAMPLED if samples is None else PhotonPolicy.UNDERSAMPLED
     traced = photon_pass.trace(kernel, merging, aim, photon_points, count, kept)
@@ -100,7 +112,6 @@ def _merged(
     shared = subpaths.shared_by_lane(kernel, points.stream("light", mi.UInt64(lane)), mi.UInt64(lane))
     sample = subpaths.camera_sample(kernel, place, shared, lane, mi.Bool(True))
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
-    walk = replace(walk, sds=None, partial=replace(walk.partial, d_vm=0))
     side = subpaths.camera_side(kernel, sample, shared, walk)
     delta = undersampled is None
     if not delta:

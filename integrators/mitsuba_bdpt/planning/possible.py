@@ -45,7 +45,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     arrival = skip("t=0", "impossible", why) if why else True
     specular = prepared.delta or bool(prepared.near_specular)
     merging = settings.merging is True
-    if merging and (why := _why_not_merging(emitters, specular, bool(direct), "specular")):
+    if merging and (why := _why_not_merging(emitters, specular, bool(direct))):
         merging = skip("merging", "impossible", why)
     why = _why_not_guided(prepared, settings, bool(hit), bool(direct), specular)
     if why and settings.guiding == "always":
@@ -172,12 +172,14 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     return _why_no_light(emitters, settings)
 
 
-def _why_not_merging(emitters: Emitters, some: bool, direct: bool, kind: str) -> str:
-    """Why no vertex can be merged, or empty. ``some``: there are BSDFs with lobes of this ``kind``."""
+def _why_not_merging(emitters: Emitters, specular: bool, direct: bool) -> str:
+    """Why no vertex can be merged, or empty. ``specular``: there are BSDFs with such lobes."""
     if not emitters.traced:
         return _UNTRACED
-    if direct and not (some or emitters.beams):
-        return f"without {kind} surfaces next-event estimation connects all that light meets first"
+    if emitters.contrast <= EVEN:
+        return "s=0 finds a uniform environment by itself"
+    if direct and not (specular or emitters.beams):
+        return "without specular surfaces next-event estimation connects all that light meets first"
     return ""
 
 
@@ -197,9 +199,7 @@ def _why_not_guided(
         return "no emitter that a ray can hit"
     if settings.max_depth < SHORTEST:
         return f"max_depth={settings.max_depth} allows no such path"
-    if prepared.emitters.contrast <= EVEN:
-        return "s=0 finds a uniform environment by itself"
-    return _why_not_merging(prepared.emitters, specular, direct, "specular")
+    return _why_not_merging(prepared.emitters, specular, direct)
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:

@@ -116,8 +116,8 @@ class Render:
         self.merging = None
         if self.plan.merging:
             pixels = int(self.prepared.camera.region.size.prod())
-            hard = bool(near_specular)
-            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels, hard)
+            narrow = bool(near_specular)
+            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels, narrow)
         features = None
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
@@ -133,8 +133,6 @@ class Render:
         self._guides: tuple[Guide | None] | None = None
         # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette.
         self._small_first: bool | None = None
-        # Passes of the parts before, see `BDPTIntegrator.part`.
-        self._passes_before = 0
         self._error: float | None = None
         # State of the newest report, see `_freeze`.
         self._state: tuple[tuple[int, ...], Progress, dict] | None = None
@@ -258,7 +256,6 @@ class Render:
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
             self._small_first = long and self.planner.threshold is None and self._plays_roulette()
         steps = schedule(self.spp, self._longest, self.settings, self._small_first)
-        self._passes_before = self.part * len(steps)
         earlier = sum(self.passes)
         for step in steps:
             done, end = step.done, step.done + step.size
@@ -305,7 +302,7 @@ class Render:
         """Trace the photons of a pass; returns their merging."""
         start = self.points.wavelengths(step) if mi.is_spectral else None
         points = self.points.of_photons(step, passes_since(self.passes, step.done))
-        earlier = self._passes_before + len(self.passes)
+        earlier = self.part * self.spp + sum(self.passes)
         with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
             photons, counts = merging.trace(self.kernel, points, step.size, earlier, start)
         self.meter.launched(counts)

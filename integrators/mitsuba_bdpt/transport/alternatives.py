@@ -56,21 +56,22 @@ def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk, vertex) -> mi.Bo
     return possible if isolated is None else possible & isolated
 
 
-def hard_merges(
-    kernel: Kernel, vertex, coefficient: mis.Coefficient, pdf_rev_w, pdf_a, own: mis.Coefficient
+def merges_up_to(
+    kernel: Kernel, vertex, first: mis.Coefficient, pdf_rev_w, pdf_a, own: mis.Coefficient
 ) -> mis.PartialSum:
-    """Merges on hard paths at the vertices up to ``vertex``, which a strategy connects; see `mis.merges`.
+    """Merges at the vertices up to ``vertex``, which a strategy connects; see `mis.merges`.
 
-    The number 0 if hard paths are not merged.
+    ``first``: as in `newest_coefficient`, of the rival of merges. The number 0 without merging.
     """
     sds = kernel.sds
-    if sds is None or not sds.hard:
+    if sds is None or not sds.merges:
         return 0
     ratio = kernel.heuristic.start(sds.weighed(vertex.si.p))
+    coefficient = newest_coefficient(kernel, first, vertex.edges)
     return mis.merges(kernel.heuristic, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
 
 
-def hard_merges_before_end(
+def merges_before_end(
     kernel: Kernel, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
 ) -> mis.PartialSum:
     """The same before the end of a subpath, on an emitter or the sensor.
@@ -78,7 +79,7 @@ def hard_merges_before_end(
     ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the connection of
     the last edge, times the density of the end if ``pdf`` contains it.
     """
-    if not kernel.merges_hard:
+    if not kernel.merges:
         return 0
     connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
     return mis.older_merges(kernel.heuristic, partial, connection, pdf)

@@ -11,7 +11,7 @@ from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from . import mis, path_layers, scattering, spectra
-from .alternatives import direct_coefficient, hard_merges, newest_coefficient
+from .alternatives import direct_coefficient, merges_up_to, newest_coefficient
 from .contribution import (
     Contribution,
     Counters,
@@ -58,7 +58,10 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     sides, own = (kernel.kappa.inner, light_side, camera_side), kernel.kappa.inner
     if kernel.guides_near_specular:
         active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
-    merges = h.combine(hard_merges(kernel, y, *at_y, own), hard_merges(kernel, z, *at_z, own))
+    merges = h.combine(
+        merges_up_to(kernel, y, kernel.kappa.direct, *at_y[1:], own),
+        merges_up_to(kernel, z, kernel.kappa.splat_count, *at_z[1:], own),
+    )
     weight, shares = h.weigh(*sides, merges=merges)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
     path_layer = path_layers.connected(z, f_z, y, f_y) if kernel.path_layers else None

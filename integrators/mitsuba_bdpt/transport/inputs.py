@@ -32,7 +32,8 @@ KEPT = 64
 class Coefficients:
     """kappa of each class of strategies in all weights, see `plan.Plan`.
 
-    The Python number 0 for classes that are not in use.
+    The Python number 0 for classes that are not in use. ``splat_count``: ``splat`` without
+    `Plan.kappa_light`.
     """
 
     hit: mi.Float | mi.Vector4f | int
@@ -41,6 +42,7 @@ class Coefficients:
     endpoints: mi.Float | mi.Vector4f | int
     arrival: mi.Float | mi.Vector4f | int
     inner: mi.Float | mi.Vector4f | int
+    splat_count: mi.Float | mi.Vector4f | int
 
 
 @dataclass
@@ -119,7 +121,7 @@ class Kernel:
         self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
-        # Longest hard path: weights of merges do not tell s = 0 and s = 1, alone beyond, from the others.
+        # Longest merged path: weights of merges do not tell s = 0 and s = 1, alone beyond, from the others.
         self.last_merged = self.last_inner if plan.light else self.max_depth
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
@@ -147,9 +149,9 @@ class Kernel:
         return other
 
     @property
-    def merges_hard(self) -> bool:
-        """Whether hard paths are merged."""
-        return self.sds is not None and self.sds.hard
+    def merges(self) -> bool:
+        """Whether vertices are merged."""
+        return self.sds is not None and self.sds.merges
 
     @property
     def guides_near_specular(self) -> bool:
@@ -202,6 +204,7 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         arrival=entry("light", light, plan.arrival),
         # One of M candidates is not M independent samples (experiments, "Several light subpaths per lane").
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
+        splat_count=entry("light", count, plan.splat),
     )
 
 

@@ -233,7 +233,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
     # t = 0 samples SDS paths; other strategies do so with near-specular events.
-    near_specular = kernel.merges_hard or kernel.guides_near_specular
+    near_specular = kernel.merges or kernel.guides_near_specular
     sds = kernel.sds if plan.arrival or near_specular else None
     walk = subpaths.light_walk(kernel, e, stream, shared, sds)
     active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)

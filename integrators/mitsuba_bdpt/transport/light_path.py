@@ -106,7 +106,7 @@ class LightPath:
 
     ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
     offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vm_newest``, where
-    hard paths are merged; ``s``: light vertices up to and including each; ``count``: of stored vertices;
+    vertices are merged; ``s``: light vertices up to and including each; ``count``: of stored vertices;
     ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
     ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`; ``flags``: of its
     ``sds``, where near-specular events count as specular.
@@ -137,7 +137,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
         d_vcm=dr.alloc_local(mi.Float, size),
         d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
-        merges=[dr.alloc_local(mi.Float, size) for _ in range(2 if kernel.merges_hard else 0)],
+        merges=[dr.alloc_local(mi.Float, size) for _ in range(2 if kernel.merges else 0)],
         rounding=dr.alloc_local(mi.Vector2f, size),
         s=dr.alloc_local(mi.UInt32, size),
         # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.

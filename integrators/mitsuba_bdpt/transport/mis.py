@@ -11,12 +11,14 @@ the weight of any strategy follows:
 
 With vertex merging (see `merging`) a third number, ``d_vm``, stands for merges at older vertices, and is used
 like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share one scale. ``d_vc``
-does not contain eta: paths that are not merged keep their weights. Merged are SDS paths (see `sds`), or, in
-scenes with nearly specular lobes, *hard* paths: with V the sum of kappa p of merges, and S that of all other
-strategies, a path is hard if V >= B S (`HARD`). A merge counts in V if it also has B times the kappa p of the
-connection of either edge at its vertex, since bounds from one side are then exact at that vertex; a fourth
-number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. Both conditions depend on the
-path alone, so that all strategies agree on them.
+does not contain eta: paths that are not merged keep their weights. Paths are merged where merges
+dominate: with V the sum of kappa p of merges, and S that of all other strategies, where V >= B S
+(`MERGE_DOMINATED`). On SDS paths (see `sds`) of delta emitters S is 0. A merge counts in V if it also has B
+times the kappa p of the connection of either edge at its vertex, since bounds from one side are then exact at
+that vertex; a fourth number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. There
+t = 1 has its number of samples for kappa (`Coefficients.splat_count`): a small coefficient says that
+other strategies are better, not that merges, which blur, are. All conditions depend on the path alone, so
+that all strategies agree on them.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
@@ -52,9 +54,8 @@ CLASSES = ("hit", "direct", "light", "inner")
 # reverse density of zero would be NaN.
 SATURATION = 1e37
 
-# B: a path is hard where merges are at least this many times as likely as all other strategies (experiments,
-# "Hard paths"). 0 merges all paths.
-HARD = 1.0
+# B: how many times as likely merges have to be as all other strategies. 0 merges all paths.
+MERGE_DOMINATED = 1.0
 
 
 @dataclass
@@ -72,12 +73,13 @@ class Merge:
     """A merge at a vertex, or another strategy that samples SDS paths there.
 
     ``ratio``: its partial sum, kappa times the number of photon subpaths times the area of the disc;
-    ``isolated``: no edge of the path up to the event there is connected by a strategy in use; None where hard
-    paths are merged.
+    ``isolated``: no edge of the path up to the event there is connected by a strategy in use; None of a
+    merge, which has instead the coefficient of the ``rival`` that connects the edge to the vertex.
     """
 
     ratio: mi.Float | mi.Vector4f
     isolated: mi.Bool | None
+    rival: mi.Float | mi.Vector4f | int = 0
 
 
 def is_connectible(partial: Partial, coefficient: Coefficient):
@@ -157,13 +159,13 @@ class Heuristic:
         """`weight`, and the shares of the classes (only `ByClass`, else None).
 
         ``tr``: T~ of the connected edge, which the other strategies sample; None without media. ``merges``:
-        V, which counts on hard paths.
+        V, which counts where merges dominate.
         """
         if tr is not None:
             light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
         if not is_absent(merges):
             others = self.combine(self.combine(light_side, camera_side), coefficient)
-            camera_side = self.combine(camera_side, dr.select(is_hard(merges, others), merges, 0))
+            camera_side = self.combine(camera_side, dr.select(is_merge_dominated(merges, others), merges, 0))
         return self._weigh(coefficient, light_side, camera_side)
 
     def _weigh(
@@ -249,9 +251,9 @@ def scatter(
         )
     d_vm = d_vm_newest = 0
     if merge is not None and merge.isolated is not None:
-        d_vm = _scattered_merges(heuristic, partial, step, merge)
+        d_vm = _scattered_on_sds_path(heuristic, partial, step, merge)
     elif merge is not None:
-        d_vm, d_vm_newest = _scattered_hard(heuristic, partial, coefficient, step, merge)
+        d_vm, d_vm_newest = _scattered_merges(heuristic, partial, step, merge)
     return Partial(
         d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
         d_vc=kept,
@@ -260,7 +262,7 @@ def scatter(
     )
 
 
-def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
+def _scattered_on_sds_path(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
     """``d_vm`` after an event on SDS paths: earlier merges, and this vertex's unless delta."""
     merges = heuristic.combine(
         heuristic.scale(partial.d_vm, step.pdf_rev_w),
@@ -274,14 +276,14 @@ def _scattered_merges(heuristic: Heuristic, partial: Partial, step: Step, merge:
     return dr.select(merge.isolated, kept, 0)
 
 
-def is_hard(merges: PartialSum, others: PartialSum):
-    """Mask: a path with these sums V and S of ``merges`` and ``others``, in one scale, is hard."""
-    return merges >= HARD * others
+def is_merge_dominated(merges: PartialSum, others: PartialSum):
+    """Mask: these sums V and S of ``merges`` and ``others`` are those of a merged path."""
+    return merges >= MERGE_DOMINATED * others
 
 
 def exceeds(merge: PartialSum, connection: PartialSum):
     """Mask: a ``merge`` counts beside the ``connection`` of an edge at its vertex, both in one scale."""
-    return merge >= HARD * connection
+    return merge >= MERGE_DOMINATED * connection
 
 
 def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev_w: mi.Float) -> PartialSum:
@@ -294,12 +296,12 @@ def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev
     return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
 
 
-def _scattered_hard(h: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge):
-    """``d_vm`` and ``d_vm_newest`` after an event where hard paths are merged.
+def _scattered_merges(h: Heuristic, partial: Partial, step: Step, merge: Merge):
+    """``d_vm`` and ``d_vm_newest`` after an event, with merging.
 
     Next to a delta event no edge is connected: the newest merge counts.
     """
-    connection, ratio = h.scale(partial.d_vcm, coefficient), step.cos_out / step.pdf_fwd_w
+    connection, ratio = h.scale(partial.d_vcm, merge.rival), step.cos_out / step.pdf_fwd_w
     older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), ratio)
     newest = h.scale(dr.select(exceeds(merge.ratio, connection), merge.ratio, 0), ratio)
     through = h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)
@@ -317,7 +319,8 @@ def merges(
 ) -> PartialSum:
     """Merges at the vertices of a subpath whose last vertex is connected, as `alternatives`.
 
-    ``own``: coefficient of the strategy that connects it; ``ratio`` of a merge there, see `Merge`.
+    ``coefficient`` and ``own``: of the rivals that connect the edges to it and from it, see `Merge`;
+    ``ratio`` of a merge there.
     """
     connection = h.scale(partial.d_vcm, coefficient)
     there = h.scale(ratio, pdf_a)
@@ -341,20 +344,21 @@ def alternatives(
     return heuristic.scale(total, pdf_a)
 
 
-def weigh_merge(h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple) -> mi.Float:
-    """Weight of a merge of this ``ratio`` (see `Merge`); 0 on paths that are not hard.
+def weigh_merge(
+    h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple, connections: PartialSum
+) -> mi.Float:
+    """Weight of a merge of this ``ratio`` (see `Merge`); 0 where merges do not dominate.
 
-    ``light`` and ``camera`` subpath: `Partial`, its ``d_vcm`` times the coefficient of the connection of the
-    last edge, ``pdf_rev_w`` of that edge.
+    ``light`` and ``camera`` subpath: `Partial`, its ``d_vcm`` times the coefficient of the rival that
+    connects the last edge (see `Merge`), ``pdf_rev_w`` of that edge; ``connections``: sum of both.
     """
-    connections, older = h.combine(light[1], camera[1]), 0
-    v = ratio
+    older, v = 0, ratio
     for partial, connection, pdf_rev_w in (light, camera):
         older = h.combine(older, h.scale(partial.d_vc, pdf_rev_w))
         v = h.combine(v, older_merges(h, partial, connection, pdf_rev_w))
     possible = exceeds(ratio, light[1]) & exceeds(ratio, camera[1])
     others = h.present(h.combine(connections, older))
-    possible &= is_hard(v, others)
+    possible &= is_merge_dominated(v, others)
     # v contains the merge itself.
     weight = ratio / h.combine(v, others)
     return dr.select(possible, dr.square(weight) if h.name == "power" else weight, 0)

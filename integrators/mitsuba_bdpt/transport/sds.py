@@ -1,12 +1,12 @@
-"""Hooks of the strategies that sample SDS or hard paths: vertex merging, and photon-guided BSDF sampling.
+"""Hooks of the strategies that sample SDS paths: vertex merging, and photon-guided BSDF sampling.
 
 An edge is *connectible* if a strategy in use connects its ends: neither end is a delta event, and the
 strategy's class has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to
 the sensor, inner connections for the others). An *SDS path* (specular-diffuse-specular) has no connectible
 edge: emitter, glass, wall, glass, camera. Of the classes of `Plan` only s = 0 and t = 0 sample it. The kernel
 has at most one further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at
-fixed points. In scenes with near-specular lobes it samples *hard* paths instead, see `mis`: connectible, but
-too rarely. Which these are is decided by densities, without a `State`.
+fixed points. Vertex merging also samples paths that are connectible, but too rarely; which these are is
+decided by densities, see `mis`, without a `State`.
 
 In such scenes photon-guided BSDF sampling takes for specular every event that is delta or near-specular from
 both sides (`is_specular`), a function of the path on which all strategies agree. Unlike delta events, these
@@ -37,7 +37,7 @@ class State:
 
     ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were delta;
     ``guided``, on camera subpaths with guiding: the densities of guided directions over those of the BSDF;
-    ``survived``, on photon subpaths of hard paths: the probability with which `PhotonStrategy.survival` let
+    ``survived``, on photon subpaths with merging: the probability with which `PhotonStrategy.survival` let
     it go on. Where near-specular events count as specular ``specular``: the last event was; on camera
     subpaths ``diffuse``: one was not; ``newest``: as ``guided``, of the last vertex, which is not in that: it
     does not guide if the next vertex is the end.
@@ -139,36 +139,36 @@ class PhotonStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``hard``: it samples hard paths, and `weighed`, `may_merge`, `kept` and `survival`
+    subpaths use, or None; ``merges``: it merges vertices, and `weighed`, `may_merge`, `kept` and `survival`
     are defined; ``near_specular``: near-specular events count as specular, and `counts` is defined.
     """
 
     counters: tuple[str, ...] = ()
     wavelengths = None
-    hard = False
+    merges = False
     near_specular = False
 
     def weighed(self, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.Merge`."""
-        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def may_merge(self, kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
         """Mask: a merge at ``vertex`` may count, as far as its side knows.
 
         ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def kept(self, kernel, vertex, survived: mi.Float | float) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
-        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def survival(self, state: State, partial: mis.Partial, p: mi.Point3f) -> tuple[mi.Float, State]:
         """Probability with which a photon subpath goes on, and its new ``state``.
 
         ``partial`` after the event at ``p``.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not merge hard paths")
+        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def begin_light(self, kernel, walk):
         """The light subpath ``walk`` with its `State`, on its first edge."""
@@ -205,10 +205,6 @@ class PhotonStrategy:
     def counts(self, active: mi.Bool, on_sds_path: mi.Bool) -> mi.Bool:
         """Mask: contributions of s = 0 and s = 1 that count."""
         raise NotImplementedError(f"{type(self).__name__} does not guide through near-specular events")
-
-    def arrive(self, kernel, merges: mis.PartialSum, emission) -> mis.PartialSum:
-        """Alternatives of t = 0; ``merges``: ``d_vm`` times the density from the sensor."""
-        return merges
 
 
 def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **more):

@@ -19,8 +19,8 @@ from ..sensors.records import CameraConnection, SensorHit
 from . import bsdf, mis, path_layers, spectra
 from .alternatives import (
     direct_coefficient,
-    hard_merges,
-    hard_merges_before_end,
+    merges_before_end,
+    merges_up_to,
     newest_coefficient,
     where_lit,
 )
@@ -70,7 +70,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
     elif sds is not None:
         connectible = mis.is_connectible(z.partial, newest)
         sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
-    merges = hard_merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
+    merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
     merges = mis.choose(z.edges <= kernel.last_merged, merges, 0)
     weight, shares = h.weigh(kernel.kappa.hit, *sides, merges=merges)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
@@ -132,7 +132,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
     newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
     densities = f.pdf_rev_w, e.emission_ratio * z.cosine(e.d)
-    merges = hard_merges(kernel, z, newest, *densities, kernel.kappa.direct)
+    merges = merges_up_to(kernel, z, kernel.kappa.splat_count, *densities, kernel.kappa.direct)
     merges = mis.choose(k <= kernel.last_merged, merges, 0)
     newest = mis.choose(kernel.within_store(k), newest, 0)
     camera_side = mis.alternatives(h, mis.Partial(z.partial.d_vcm, older), newest, *densities)
@@ -243,7 +243,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     sides = kernel.kappa.splat, light_side, camera_side
     if kernel.guides_near_specular:
         active &= ~y.sds.meets_end(y.edges, f)
-    merges = hard_merges(kernel, y, newest, *densities, kernel.kappa.splat)
+    merges = merges_up_to(kernel, y, kernel.kappa.direct, *densities, kernel.kappa.splat_count)
     weight, shares = h.weigh(*sides, merges=merges)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
@@ -291,14 +291,15 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    hard = h.scale(hard_merges_before_end(kernel, partial, newest, z.pdf_w), z.pdf_a)
+    rival = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_count)
+    merged = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
     if kernel.guides_near_specular:
         active &= ~walk.sds.ends(walk.edges, newest)
-    elif kernel.sds is not None and walk.sds is not None and not kernel.merges_hard:
-        merges = kernel.sds.arrive(kernel, h.scale(partial.d_vm, z.pdf_w * z.pdf_a), emission)
+    elif kernel.sds is not None and walk.sds is not None and not kernel.merges:
+        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
         # The last edge is not connected either.
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))
-    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=hard)
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=merged)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         asked = active & emission.infinite & directly
         active &= ~asked | kernel.space.clear(z.surroundings, kernel.sensor_medium, asked)

@@ -379,8 +379,11 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     ``coefficient``: that of the class that connects the edge to it.
     """
     state, strategy = walk.sds, side.sds
-    if strategy is not None and strategy.hard:
-        return state, strategy.merge(kernel, vertex, None)
+    if strategy is not None and strategy.merges:
+        rival = coefficient
+        if not side.adjoint:
+            rival = newest_coefficient(kernel, kernel.kappa.splat_count, walk.edges)
+        return state, replace(strategy.merge(kernel, vertex, None), rival=rival)
     if state is None:
         return None, None
     state = state.after(kernel.heuristic, vertex, coefficient, step)

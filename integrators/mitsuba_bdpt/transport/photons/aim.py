@@ -4,7 +4,7 @@ Most SDS paths begin with delta events, but an emitter's own density samples few
 shape of glass. Half of the first directions are uniform in cones about bounding spheres of the shapes with
 delta lobes (over all directions from within one); the density is that of the mixture. Light from infinity is
 not aimed: its emission disks cover details (`emitters.disks`). Uniform environments emit no photons: s = 0
-samples their light well. Light subpaths are not aimed: only merges use `Aim.density`, not the emitter's.
+samples their light well. Light subpaths are not aimed, and weights do not know of the aim.
 """
 
 from __future__ import annotations
@@ -79,10 +79,6 @@ class Aim:
         """
         mixed = dr.select(_aimable(e), self._mixed(e.si.p, e.d, e.pdf_second, number), e.pdf_second)
         return dr.select(e.infinite & ~e.delta, 0, mixed) if self.no_sky else mixed
-
-    def density_at(self, hit: mi.Bool, p, d, pdf_second: mi.Float) -> mi.Float:
-        """`density` at ``p`` in direction ``d``; the environment where not ``hit``."""
-        return dr.select(hit, self._mixed(p, d, pdf_second), mi.Float(0) if self.no_sky else pdf_second)
 
     def _mixed(self, p, d, pdf_second, number=None):
         if not self.spheres:

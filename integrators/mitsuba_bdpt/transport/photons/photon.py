@@ -93,8 +93,8 @@ class GuidingPhoton(Photon):
 
 
 @dataclass
-class HardPhoton(Photon):
-    """A photon of hard paths, see `mis`; ``older`` is its ``d_vc``.
+class MergedPhoton(Photon):
+    """A photon for merging, see `mis`; ``older`` is its ``d_vc``.
 
     ``connection`` as of a `ConnectedPhoton`; ``d_vm``, ``d_vm_newest``: its partial sums of merges.
     """

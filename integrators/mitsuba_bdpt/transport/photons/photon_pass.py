@@ -1,4 +1,4 @@
-"""The photon pass: traces SDS paths from the light and stores their vertices."""
+"""The photon pass: traces photon subpaths and stores their vertices."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..near_specular import GUIDED, NARROW
 from ..sds import PhotonStrategy, State, begun_near_specular
 from ..walk import random_walk
 from .aim import Aim
-from .photon import ConnectedPhoton, GuidingPhoton, HardPhoton, Photon
+from .photon import ConnectedPhoton, GuidingPhoton, MergedPhoton, Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
@@ -36,7 +36,7 @@ def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
 class PhotonPolicy(Enum):
     """Vertices of photon subpaths that are stored."""
 
-    MERGED = "all diffuse vertices of SDS paths"
+    MERGED = "all vertices where merges may count"
     GUIDED = "the first vertex of a non-specular event, if s = 0 can sample the path through it"
     UNSAMPLED = "the first non-delta vertex, if no strategy can sample the path through it"
     UNDERSAMPLED = "all vertices with a non-delta lobe behind delta and near-specular events"
@@ -86,7 +86,7 @@ def trace(
     """Trace ``count`` photon subpaths; ``sds``: the strategy that merges them, None for a guide."""
     kernel = kernel.bound(points, 1.0, Observer())
     kernel.sds = sds
-    kernel.last_light = kernel.last_merged if kernel.merges_hard else kernel.max_depth
+    kernel.last_light = kernel.last_merged if kernel.merges else kernel.max_depth
     capacity = max(int(count * _CAPACITY), 1)
     while True:
         out = _kind(kernel, kept).zeros(capacity, kernel.path_layers)
@@ -103,19 +103,19 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: PhotonPolicy, out: Photo
     lanes = dr.arange(mi.UInt32, count)
     stream = kernel.points.stream("light", mi.UInt64(lanes))
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
-    merges, undersampled = kept is PhotonPolicy.MERGED, kept is PhotonPolicy.UNDERSAMPLED
+    merges, undersampled = kernel.merges, kept is PhotonPolicy.UNDERSAMPLED
     near_specular = kept is PhotonPolicy.GUIDED and kernel.near_specular
     sds = kernel.sds if merges else _Unconnected() if near_specular else None
     e, aimed, finite, walk = _begun(kernel, aim, kept, sds, stream, shared)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
-    side = replace(side, connect=None, isolated=merges)
     specular = GUIDED * near_specular + NARROW * undersampled
-    side = replace(side, only_delta=not merges and not specular, only_specular=specular)
+    only_delta = not merges and not specular
+    side = replace(side, connect=None, only_delta=only_delta, only_specular=specular)
 
     def visit(y, counters, walk):
         older, more = kernel.heuristic.combine(y.partial.d_vc, y.partial.d_vm), ()
         flux = y.throughput
-        if sds is not None and sds.hard:
+        if merges and sds is not None:
             older, connection = y.partial.d_vc, _connection(kernel, y)
             more = connection, y.partial.d_vm, y.partial.d_vm_newest
             keep = sds.may_merge(kernel, y, connection)
@@ -172,13 +172,13 @@ def _begun(kernel: Kernel, aim: Aim, kept: PhotonPolicy, sds: PhotonStrategy | N
     if kept.estimates:  # traced, to see where their light arrives
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
-    # These weights do not know of the aim, see `merging.hard_paths`.
-    unaimed = kernel.merges_hard or kept is PhotonPolicy.UNDERSAMPLED or isinstance(sds, _Unconnected)
+    # These weights do not know of the aim, see `merging.merging`.
+    unaimed = kernel.merges or kept is PhotonPolicy.UNDERSAMPLED or isinstance(sds, _Unconnected)
     start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
     if kept is PhotonPolicy.UNDERSAMPLED:
         walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
-    elif sds is not None and sds.hard:
+    elif kernel.merges:
         walk = replace(walk, sds=State(survived=mi.Float(1)))
     elif kept.estimates:  # s = 0 samples the others
         walk = replace(walk, active=walk.active & e.delta)
@@ -187,8 +187,8 @@ def _begun(kernel: Kernel, aim: Aim, kept: PhotonPolicy, sds: PhotonStrategy | N
 
 def _kind(kernel: Kernel, kept: PhotonPolicy) -> type[Photon]:
     """The record of its photons."""
-    if kernel.merges_hard:
-        return HardPhoton
+    if kernel.merges:
+        return MergedPhoton
     if kept is PhotonPolicy.GUIDED and kernel.near_specular:
         return GuidingPhoton
     return ConnectedPhoton if kept is PhotonPolicy.UNDERSAMPLED else Photon

@@ -1,4 +1,4 @@
-"""Merges on hard paths: near-specular lobes, between what is a delta lobe and what is none.
+"""Merges through near-specular lobes, between what is a delta lobe and what is none.
 
 The scenes are those of `test_merging` with a rough plate. Large lamps are found by s = 0 and by connections
 too: all strategies must give one mean. Photons in discs of a quarter of a pixel, whose blur is below noise.
@@ -13,8 +13,7 @@ import pytest
 import variants
 import welch as st
 from mitsuba_bdpt.geometry import rays
-from mitsuba_bdpt.merging import hard_paths, passes
-from mitsuba_bdpt.scene.prepared import PreparedScene
+from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.transport import light_path, mis
 from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
@@ -39,13 +38,13 @@ import drjit as dr  # isort: skip
 MERGED = {"merging": True, "merging_radius": 0.25}
 
 # By default merges would have little of the weight beside a large lamp, which others find.
-PHOTONS = passes.SAMPLES_PER_HARD_PHOTON
+PHOTONS = passes.SAMPLES_PER_PHOTON
 
 
 @pytest.fixture(autouse=True)
 def many_photons(monkeypatch):
     """One photon subpath for each sample: merges have 0.4 to 0.65 of the images, 0.14 to 0.45 with B = 0."""
-    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", 1)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
 
 
 def merged(case, seeds=8, spp=128, **parameters):
@@ -72,8 +71,8 @@ def test_images_are_those_without_merging(case):
     ids=str,
 )
 def test_any_choice_of_strategies_has_the_same_mean(parameters):
-    """Rationale: S is the sum of the strategies in use, so that another choice makes other paths hard; beyond
-    the stored vertices of light subpaths no path is hard. Expected: the same tiles by Welch's test.
+    """Rationale: S is the sum of the strategies in use, so that with another choice other paths are merged;
+    beyond the stored vertices of light subpaths none are. Expected: the same tiles by Welch's test.
     """
     found = merged("alpha .03", **parameters)
     st.assert_agree(st.compare_images(found, without_photons("alpha .03")), at_least=12)
@@ -96,7 +95,7 @@ LIGHTS = {
 @pytest.mark.parametrize("light", LIGHTS)
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
 def test_all_vertices_merged(light, kind, monkeypatch):
-    """Rationale: with B = 0 every path is hard, also by diffuse surfaces alone, and no bound leaves out a
+    """Rationale: with B = 0 every path is merged, also by diffuse surfaces alone, and no bound leaves out a
     photon: every strategy shares every path with merges, from each kind of emitter and to both kinds of
     sensors. Expected: the tiles without merging, of a floor under rough glass of which connections find all.
     """
@@ -106,7 +105,7 @@ def test_all_vertices_merged(light, kind, monkeypatch):
     described = mi.load_dict(described)
     parameters = {"max_depth": 5, "skip": "none", "guiding": "never"}
     b = images(described, 64, 8, first=100, **parameters)
-    monkeypatch.setattr(mis, "HARD", 0.0)
+    monkeypatch.setattr(mis, "MERGE_DOMINATED", 0.0)
     a = images(described, 64, 8, **MERGED, **parameters)
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
 
@@ -144,7 +143,7 @@ def through_a_lens():
 @pytest.mark.parametrize(
     "described, slack, ended",
     [
-        (near_pane, hard_paths.SLACK, True),
+        (near_pane, merging.SLACK, True),
         (near_pane, 0.2, True),
         (near_pane, 0.2, False),
         (through_a_lens, 0.05, True),
@@ -159,13 +158,13 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
     Expected: without bounds, with the same seeds, the same merged light within 8 % (a few standard errors of
     the roulette).
     """
-    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", PHOTONS)
     if not ended:
         never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
-        monkeypatch.setattr(hard_paths.HardMerging, "survival", never)
+        monkeypatch.setattr(merging.Merging, "survival", never)
     built, found = mi.load_dict(described()), []
     for least in (slack, 1e30):
-        monkeypatch.setattr(hard_paths, "SLACK", least)
+        monkeypatch.setattr(merging, "SLACK", least)
         _, layers = strategy_images(built, 32, 8, merging_radius=1.0, skip="none")
         found.append(layers["weighted.merged"].mean())
     assert found[0] == pytest.approx(found[1], rel=0.08)
@@ -178,7 +177,7 @@ def test_the_limit_of_small_roughness(kind, monkeypatch):
     least roughness the tiles of ideal glass, but for those with the lamp's reflection, which rough glass
     shows: the median ratio is 1 within 3 % (a few standard errors of a tile's mean are 1 %).
     """
-    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", PHOTONS)
     plate = rough(1e-4) if kind == "roughdielectric" else principled(0.0)
     found = st.tiles(images(under_glass(point(), plate=plate), 256, 8, **MERGED)).mean(0)
     expected = st.tiles(images(under_glass(point()), 256, 8, first=100, **MERGED)).mean(0)
@@ -190,7 +189,7 @@ def test_few_photons_far_from_what_is_sharp(monkeypatch):
     behind a room of matte walls, and no light reaches it, 1 % of photon subpaths leave a photon (corners,
     where connections are few), and no vertex is merged.
     """
-    monkeypatch.setattr(passes, "SAMPLES_PER_HARD_PHOTON", PHOTONS)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", PHOTONS)
     described = mi.cornell_box() | {
         "far": {"type": "sphere", "center": [0, 0, -8], "radius": 0.2, "bsdf": rough(0.01)}
     }
@@ -198,23 +197,11 @@ def test_few_photons_far_from_what_is_sharp(monkeypatch):
     described = mi.load_dict(described)
     method = internals.bdpt(max_depth=6, merging=True, skip="none")
     mi.render(described, integrator=method, spp=16)
-    merging = method.statistics["merging"]
-    assert merging["merges"] == 0
-    assert merging["photons"] < 0.02 * photon_pass.FEWEST_PHOTONS
+    found = method.statistics["merging"]
+    assert found["merges"] == 0
+    assert found["photons"] < 0.02 * photon_pass.FEWEST_PHOTONS
     a, b = (images(described, 16, 1, merging=m, skip="none") for m in (True, False))
     np.testing.assert_allclose(a, b, **ROUNDING)
-
-
-@pytest.mark.parametrize("plate", [None, rough(0.5), matte()], ids=["ideal", "rough", "matte"])
-def test_other_scenes_merge_as_before(plate, monkeypatch):
-    """Expected: without a near-specular lobe no path is merged as hard, and none has a ``d_vm_newest``."""
-    described = mi.load_dict(under_glass(ball(), plate=plate))
-    assert not PreparedScene(described, described.sensors()[0]).near_specular
-    monkeypatch.setattr(passes, "HardMerging", None)
-    found, older = [], mis.older_merges
-    monkeypatch.setattr(mis, "older_merges", lambda *arguments: found.append(0) or older(*arguments))
-    images(described, 4, 1, merging=True)
-    assert not found
 
 
 def test_stored_vertices_keep_their_merges():
@@ -238,7 +225,7 @@ def test_stored_vertices_keep_their_merges():
     )
     kernel = SimpleNamespace(
         store_size=2,
-        merges_hard=True,
+        merges=True,
         guides_near_specular=False,
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
@@ -259,7 +246,7 @@ def test_stored_vertices_keep_their_merges():
     ("plate", "parameters", "expected"),
     [
         (rough(0.01), {"skip": "none"}, [16] * 3),
-        (None, {"skip": "none"}, [48]),
+        (None, {"skip": "none"}, [32, 16]),
         (None, {"light_paths": 0}, [16] * 3),
     ],
     ids=["rough", "ideal", "ideal, no light subpaths"],
@@ -267,8 +254,8 @@ def test_stored_vertices_keep_their_merges():
 def test_passes_are_short_where_many_paths_are_merged(plate, parameters, expected, monkeypatch):
     """Rationale: merges grow with the product of a pass's photons and queries: at 256 samples per pixel a
     prism took 19 times as long with merging as without, and `glass_caustics` at 64 without light subpaths
-    9.5 times. Expected: passes of 16 samples per pixel (here of any number of samples) where hard paths are
-    merged, or without light subpaths; of ideal glass with them as long as before.
+    9.5 times. Expected: passes of 16 samples per pixel (here of any number of samples) with near-specular
+    lobes, or without light subpaths; else of 32.
     """
     monkeypatch.setattr(passes, "_LEAST_SAMPLES", 1)
     integrator = internals.bdpt(max_depth=5, **parameters, **MERGED)
