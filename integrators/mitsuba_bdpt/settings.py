@@ -76,7 +76,7 @@ class Internals:
     """Values of the method that no parameter sets; tests, makers of references and clusters vary them."""
 
     merging_radius: float = 1.0
-    """Radius of vertex merging in the first pass, in pixels as they are seen directly."""
+    """Radius of vertex merging after 64 samples per pixel, in pixels as they are seen directly."""
     stored_vertices: int | None = None
     """Longest path in edges that uses all strategies; None: `DEFAULT_STORED`, with media `MAX_STORED`."""
     decisions: tuple[Any, ...] | None = None

@@ -91,7 +91,7 @@ def test_connections_to_several_light_subpaths_know_their_emitter():
 @pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
 def test_a_merge_knows_its_emitter(plate):
     """Rationale: merges alone sample a point light seen through a plate; through one that is nearly smooth
-    they are those of hard paths. A red and a blue light. Expected: each layer has its light's colour alone.
+    they are those of merged paths. A red and a blue light. Expected: each layer has its light's colour alone.
     """
     glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
     glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}

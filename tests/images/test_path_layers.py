@@ -64,7 +64,7 @@ def divided(method, target, **more):
         "path tracing",
         "pilot",
         "merging",
-        "hard paths",
+        "merged paths",
         "other layers",
         "strategies",
     ]

@@ -84,7 +84,7 @@ class Passes:
         count = photons_of_pass(samples * self._pixels, self._pixels, radius)
         sets, wavelengths = 1, None
         if start is not None:
-            sets, wavelengths = SETS, WavelengthSets.of(start, done)
+            sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)
             count = max(count // sets, 1) * sets
         kappa = coefficient(samples / sets, radius)
         # Photons beyond those of the samples would make ordinary paths merge-dominated.

@@ -32,8 +32,8 @@ class WavelengthSets:
     offset: mi.Float
 
     @staticmethod
-    def of(start: mi.Float, done: int) -> WavelengthSets:
-        """The sets of pass ``done`` (from 0); ``start`` in [0, 1) is fixed for an image."""
+    def of(start: mi.Float, done: float) -> WavelengthSets:
+        """The sets after ``done`` passes; ``start`` in [0, 1) is fixed for an image."""
         offset = start + (done * _GOLDEN) % 1 * _TURN / SETS
         dr.make_opaque(offset)
         return WavelengthSets(offset)

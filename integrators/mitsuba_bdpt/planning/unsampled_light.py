@@ -185,7 +185,7 @@ def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Ker
     """A kernel whose subpaths follow delta lobes only; weights are not computed."""
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
     kernel.reverse, kernel.traits = False, prepared.traits.of_delta_lobes()
-    kernel.last_light = kernel.last_arrival = kernel.max_depth
+    kernel.last_light = kernel.last_arrival = kernel.last_merged = kernel.max_depth
     return kernel
 
 
@@ -194,7 +194,7 @@ def counting_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> 
     counts = replace(plan, kappa_light=1.0, kappa_direct=1.0)
     kernel = Kernel(prepared, counts, settings, mis.Heuristic("balance"))
     kernel.reverse, kernel.traits = True, prepared.traits
-    kernel.last_light = kernel.last_arrival = kernel.max_depth
+    kernel.last_light = kernel.last_arrival = kernel.last_merged = kernel.max_depth
     return kernel
 
 

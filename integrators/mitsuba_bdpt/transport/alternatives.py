@@ -76,8 +76,8 @@ def merges_before_end(
 ) -> mis.PartialSum:
     """The same before the end of a subpath, on an emitter or the sensor.
 
-    ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the connection of
-    the last edge, times the density of the end if ``pdf`` contains it.
+    ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the rival that
+    connects the last edge, times the density of the end if ``pdf`` contains it.
     """
     if not kernel.merges:
         return 0

@@ -11,14 +11,14 @@ the weight of any strategy follows:
 
 With vertex merging (see `merging`) a third number, ``d_vm``, stands for merges at older vertices, and is used
 like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share one scale. ``d_vc``
-does not contain eta: paths that are not merged keep their weights. Paths are merged where merges
-dominate: with V the sum of kappa p of merges, and S that of all other strategies, where V >= B S
-(`MERGE_DOMINATED`). On SDS paths (see `sds`) of delta emitters S is 0. A merge counts in V if it also has B
-times the kappa p of the connection of either edge at its vertex, since bounds from one side are then exact at
-that vertex; a fourth number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. There
-t = 1 has its number of samples for kappa (`Coefficients.splat_count`): a small coefficient says that
-other strategies are better, not that merges, which blur, are. All conditions depend on the path alone, so
-that all strategies agree on them.
+does not contain eta: paths that are not merged keep their weights. Paths are merged where merges dominate:
+with V the sum of kappa p of merges, and S that of all other strategies, where V >= B S (`MERGE_DOMINATED`).
+On SDS paths (see `sds`) of delta emitters S is 0 without t = 0. A merge counts in V if it also has B times
+the kappa p of the connection of either edge at its vertex, since bounds from one side are then exact at that
+vertex; a fourth number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. There t = 1
+has its number of samples for kappa (`Coefficients.splat_count`): a small coefficient says that other
+strategies are better, not that merges, which blur, are. All conditions depend on the path alone, so that all
+strategies agree on them.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
