@@ -1375,14 +1375,14 @@ MUTANTS = (
         "transport/mis.py",
         "heuristic.scale(partial.d_vm, step.cos_out),",
         "partial.d_vm,",
-        ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-4]",),
+        ("tests/transport/test_oracle.py::test_sums_of_guiding_pass_delta_events",),
     ),
     Mutant(
         "guiding: a path is isolated again after an edge that is connectible",
         "transport/sds.py",
         "isolated = isolated & (step.delta",
         "isolated = (step.delta",
-        ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-4]",),
+        ("tests/images/test_guided_hits.py::test_glass_caustics_under_a_large_lamp[guided]",),
     ),
     Mutant(
         "merging: walks compare merges with the coefficient of t = 1, merges with its count",

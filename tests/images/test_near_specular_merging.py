@@ -143,7 +143,6 @@ def through_a_lens():
 @pytest.mark.parametrize(
     "described, slack, ended",
     [
-        (near_pane, merging.SLACK, True),
         (near_pane, 0.2, True),
         (near_pane, 0.2, False),
         (through_a_lens, 0.05, True),

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1557,  # top files
 }
-OUTSIDE = {"scripts": 6095, "tests": 44965}
+OUTSIDE = {"scripts": 6095, "tests": 44975}
 MOST_WORDS = 70600
 
 

@@ -131,6 +131,16 @@ def test_recursion_with_merges(name, classes, least, monkeypatch):
     assert total > 200 and plain > 200
 
 
+def test_sums_of_guiding_pass_delta_events():
+    """Expected: at a delta event ``d_vm``, here of a guided technique, changes as ``d_vc`` does."""
+    step = SimpleNamespace(
+        pdf_fwd_w=mi.Float(0), pdf_rev_w=mi.Float(0), cos_out=mi.Float(0.5), delta=mi.Bool(True)
+    )
+    before = mis.Partial(mi.Float(1), mi.Float(3), mi.Float(3))
+    after = mis.scatter(mis.Heuristic("balance"), before, 1, step, mis.Merge(mi.Float(7), mi.Bool(True)))
+    assert after.d_vm[0] == after.d_vc[0] == 1.5
+
+
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", ["n1c1", "odd", "n0c0"])
 def test_recursion_extreme_densities(name, classes):
