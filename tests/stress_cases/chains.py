@@ -20,7 +20,7 @@ from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coeffic
 COEFFICIENTS = {
     "n1c1": Coefficients(1, 1, 1, 1),
     "quarter": Coefficients(0.25, 0.0625, 1, 0.25, 1.0),
-    "odd": Coefficients(3.7, 0.013, 42.0, 0.21, 0.05),
+    "odd": Coefficients(3.7, 0.013, 42.0, 0.21, 0.02),
     "n1c0": Coefficients(1, 1, 0, 1),
     "n1c0-half": Coefficients(0.5, 0.3, 0, 0, 0.6),
     "n0c1": Coefficients(0, 0, 0.7, 0, 0),

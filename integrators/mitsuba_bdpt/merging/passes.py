@@ -95,7 +95,7 @@ class Passes:
 
 
 def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
-    """Number of photon subpaths of a pass of so many ``samples``; ``radius`` in pixels."""
+    """Number of photon subpaths of a pass; ``samples`` of the whole film, ``radius`` in pixels."""
     most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
     return min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most)
 
