@@ -25,7 +25,7 @@ MOST = {
     "": 1557,  # top files
 }
 OUTSIDE = {"scripts": 6095, "tests": 44975}
-MOST_WORDS = 70600
+MOST_WORDS = 69376
 
 
 def _lines(files):
