@@ -289,7 +289,7 @@ MUTANTS = (
     Mutant(
         "unsampled light: said after the last pass",
         "run/rendering.py",
-        "messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())",
+        "messages.warn_of_unsampled_light(self.prepared, self.plan, self.missing())",
         "pass",
         ("tests/planning/test_unsampled_light.py::test_it_is_said_before_the_samples_are_traced[pilot]",),
     ),

@@ -14,10 +14,9 @@ import mitsuba as mi
 
 from .emitters.kinds import third_party_elsewhere
 from .emitters.light_groups import parsed
-from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
+from .errors import UnsupportedError, UsageTypeError, did_you_mean
 from .host import tracebacks
 from .image.layers import film_layers
-from .planning.budget import is_open
 from .planning.explain import explain
 from .properties import check_variant, integer, read_settings
 from .run import messages
@@ -212,19 +211,20 @@ class BDPTIntegrator(metaclass=ABCMeta):
             render = render.decided()
         planner, table = render.planner, render.table
         confidence, invalid = planner.confidence(), planner.decided.non_finite
-        warning = render.explained_warning(spp is not None).removeprefix(UsageError.prefix)
+        missing = render.missing() if spp else None
+        warning = f"{missing.cause}; {missing.remedy}" if missing else ""
         plan = replace(render.plan, skipped=(*render.plan.skipped, *render.skipped))
         if plan.merging:
             warning = f"merging: {render.why_merged}"
         text = explain(render.prepared, plan, self.settings, table, confidence, invalid, warning)
         if render.light_groups is not None:
             text = "\n".join([text, *render.light_groups.explained()])
-        if spp is None and is_open(render.plan, self.settings):
+        if spp is None:
             return (
-                f"{text}\nno spp given: this is the plan before the pilot; with spp=..., the scene or a "
-                "pilot may choose other numbers of light subpaths, other weights and guided emission"
+                f"{text}\nno spp given: this is the plan before the pilot; with spp=..., it may become "
+                "another, with guided emission or merging, and unsampled light is estimated"
             )
-        return text if table or spp is None else f"{text}\n{planner.why_no_pilot()}"
+        return text if table else f"{text}\n{planner.why_no_pilot()}"
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:

@@ -568,7 +568,7 @@ def test_merging_where_light_is_missing(spp):
         assert default.statistics["unbiased"] != merged
     default.render(hidden, spp=spp)
     why = default.statistics["merging"]["why"]
-    assert "nearly all of the image's light: point light 'light' shines through glass" in why
+    assert "about 99 % of the image's light: that of emitter 'light', through or off shape" in why
     assert why in default.explain(hidden, spp=spp)
 
 

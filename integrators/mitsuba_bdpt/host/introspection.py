@@ -28,10 +28,10 @@ def given_id(owner) -> str:
 
 def named(owner) -> str:
     """Identify an object in a message: by its id, its shape's id or its class name."""
-    if owner.id():
+    if given_id(owner):
         return f"'{owner.id()}'"
     shape = owner.get_shape() if isinstance(owner, (mi.Emitter, mi.Sensor)) else None
-    if shape is not None and shape.id():
+    if shape is not None and given_id(shape):
         return f"without id on shape '{shape.id()}'"
     return f"without id ({owner.class_name()})"
 

@@ -18,7 +18,8 @@ import mitsuba as mi
 import numpy as np
 
 from .. import components
-from ..host.introspection import all_shapes, given_id
+from ..errors import listed
+from ..host.introspection import all_shapes, given_id, named
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
@@ -46,20 +47,17 @@ NARROW = 100.0
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
 
-# Most lamps named in a message.
+# Most emitters and shapes named in a message.
 NAMED = 3
 
 SEED = 0x6C6F7374
 
-# Key under which dictionaries hold the BSDF of a shape, its id there.
-_KEY = "bsdf"
+_SMALL_AREA = "give it a small area: an area light on a small sphere or disk"
 
-_PLUGINS = {
-    "PointLight": "point light",
-    "SpotLight": "spot",
-    "Projector": "projector",
-    "DirectionalEmitter": "directional light",
-    "DirectionalArea": "directionalarea",
+# What to do about an emitter, by class; else it can be made larger.
+_REMEDIES = {
+    **dict.fromkeys(("PointLight", "SpotLight", "Projector", "DirectionalArea"), _SMALL_AREA),
+    "DirectionalEmitter": "give the sun a disk: sunsky, an envmap, or an area light far away",
 }
 
 
@@ -67,17 +65,15 @@ _PLUGINS = {
 class UnsampledLight:
     """Unsampled and undersampled light: mean over the film by emitter index.
 
-    ``through``: names of the shapes through which most of it is seen, the brightest first. In scenes with
-    near-specular lobes ``never``: share of it of which no sample is expected; ``few``: light of which more
-    samples are expected, but few, over it; ``sharp``: names of the objects with such lobes through which it
-    is seen; of all if it is seen through none.
+    ``objects``: names of the shapes through which most of it is seen, or whose near-specular lobes leave it
+    undersampled. ``never``: share of it of which no sample is expected; ``few``: light of which more samples
+    are expected, but few, over it.
     """
 
     colours: dict[int, np.ndarray]
-    through: tuple[str, ...] = ()
+    objects: tuple[str, ...] = ()
     never: float = 1.0
     few: float = 0.0
-    sharp: tuple[str, ...] = ()
 
     @property
     def radiance(self) -> dict[int, float]:
@@ -87,15 +83,64 @@ class UnsampledLight:
         scale = brightest / max(sum(single.values()), np.finfo(float).tiny)
         return {i: radiance * scale for i, radiance in single.items()}
 
-    @property
-    def intensity(self) -> float:
-        """Mean over the colours, the measure of images in pilots."""
-        return float(sum(colour.mean() for colour in self.colours.values()))
+    def shares(self, mean: float, of_pilot: bool = False) -> dict[int, float]:
+        """Shares of the image's light by emitter index.
+
+        ``mean`` of the image's brightest colour; ``of_pilot``: over the colours, a median without rare light.
+        """
+        radiance = self.radiance
+        size = sum(radiance.values())
+        if of_pilot:
+            intensity = float(sum(colour.mean() for colour in self.colours.values()))
+            mean = (mean / intensity + 1 + self.few - self.never) * size
+        whole = max(mean + self.never * size, size)
+        return {i: each / whole for i, each in radiance.items()}
+
+
+@dataclass(frozen=True)
+class Missing:
+    """What a render lacks: ``shares`` of the image's light by emitter index, with cause and remedy."""
+
+    shares: dict[int, float]
+    cause: str
+    remedy: str
 
     @property
-    def is_undersampled(self) -> bool:
-        """Whether a few samples are expected of most of it."""
-        return self.never < 0.5
+    def share(self) -> float:
+        return sum(self.shares.values())
+
+
+def missing(
+    prepared: PreparedScene, plan: Plan, light: UnsampledLight, shares: dict[int, float], samples: int
+) -> Missing:
+    """Describe the ``light`` that a render of ``samples`` per pixel lacks, given its `shares`."""
+    whole = sum(shares.values())
+    order = sorted(shares, key=shares.__getitem__, reverse=True)
+    lamps = [prepared.emitters.objects[i] for i in order if shares[i] >= WARN_SHARE * whole]
+    undersampled = light.never < 0.5
+    if undersampled:
+        why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
+    elif plan.splat:
+        why = "no ray hits an emitter without area"
+    else:
+        why = prepared.camera.reason or "the render does without light tracing (t=1)"
+    through = ""
+    if prepared.delta or prepared.near_specular:
+        through = f", through or off {listed(light.objects, NAMED) or 'specular surfaces'}"
+    cause = (
+        f"{'undersampled' if undersampled else 'not sampled'}, about {min(100 * whole, 99):.2g} % of the "
+        f"image's light: that of {_called(lamps)}{through} ({why})"
+    )
+    by_hand = any(skipped["why"] == "light_paths=0" for skipped in plan.skipped)
+    mergeable = not components.merging.why_not(prepared.camera.sensor, prepared.space is not None)
+    remedies = ["leave light_paths to the integrator"] * by_hand + ["set merging=true"] * mergeable
+    remedies.append(_REMEDIES.get(lamps[0].class_name(), "make the emitter larger"))
+    remedies += ["make the surfaces rougher"] * undersampled
+    return Missing(shares, cause, ", or ".join(remedies))
+
+
+def _called(emitters: Iterable[mi.Emitter]) -> str:
+    return listed([f"emitter {named(emitter.get_shape() or emitter)}" for emitter in emitters], NAMED)
 
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
@@ -125,15 +170,6 @@ def _is_left_to_arrival(prepared: PreparedScene, plan: Plan) -> bool:
     return plan.arrival and prepared.delta and bool(emitters.unhittable or emitters.beams)
 
 
-def key(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> tuple:
-    """All that the estimate for a render of ``samples`` per pixel depends on besides the scene."""
-    known = plan.splat, plan.direct, settings.max_depth, settings.hide_emitters, _subpaths(prepared, samples)
-    if not is_undersampling_possible(prepared, plan, settings):
-        return known
-    strategies = plan.arrival, plan.endpoints, plan.connections, plan.joined, plan.camera_paths_per_light_path
-    return *known, *strategies, plan.emission is None, plan.guided > 0, max(samples, PREVIEW)
-
-
 def estimate(
     prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW
 ) -> UnsampledLight:
@@ -147,9 +183,9 @@ def estimate(
     batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         undersampled = is_undersampling_possible(prepared, plan, settings)
-        kernel = (counting_kernel if undersampled else delta_kernel)(prepared, plan, settings)
+        kernel = _kernel(prepared, plan, settings, undersampled)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if undersampled else ())
-        drawn = points("sobol"), points("independent")
+        drawn = (Points(kind, dr.opaque(mi.UInt32, SEED)) for kind in ("sobol", "independent"))
         of = max(samples, PREVIEW) if undersampled else None
         found = components.merging.estimate(kernel, batch, count, *drawn, aim, of)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
@@ -160,19 +196,25 @@ def estimate(
         total[np.array(found.broken)] = np.nan
     finite = np.isfinite(total).all(axis=1)
     if not finite.all():
-        _warn_of_not_finite(prepared, np.flatnonzero(~finite))
+        lamps = _called(prepared.emitters.objects[i] for i in np.flatnonzero(~finite))
+        text = (
+            f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or "
+            "infinite; look for such numbers, or very large ones, in the emitter and in the BSDFs that its "
+            "light meets"
+        )
+        warn_once(prepared.scene, prepared.camera.sensor, text)
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    through = _names(shapes)
-    if found.kinds is None or not colours:
-        return UnsampledLight(colours, through)
-    never, rare, few = np.array(found.kinds)
+    never, rare, few = np.array([1, 0, 0] if found.kinds is None else found.kinds)
     size = max(never + rare, np.finfo(np.float32).tiny)
-    meant = {id(bsdf) for bsdf in prepared.near_specular}
-    seen, others = ([s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene)))
-    sharp = seen if _is_left_to_arrival(prepared, plan) else seen or others
-    return UnsampledLight(colours, through, float(never / size), float(few / size), _names(sharp)[:NAMED])
+    if never < rare:
+        meant = {id(bsdf) for bsdf in prepared.near_specular}
+        seen, others = (
+            [s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene))
+        )
+        shapes = seen or (shapes if _is_left_to_arrival(prepared, plan) else others)
+    return UnsampledLight(colours, _names(shapes), float(never / size), float(few / size))
 
 
 def _subpaths(prepared: PreparedScene, samples: int) -> int:
@@ -181,26 +223,18 @@ def _subpaths(prepared: PreparedScene, samples: int) -> int:
     return max(SUBPATHS, min(1 << (whole // SAMPLES_OF_ONE).bit_length(), MOST_SUBPATHS))
 
 
-def delta_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
-    """A kernel whose subpaths follow delta lobes only; weights are not computed."""
+def _kernel(prepared: PreparedScene, plan: Plan, settings: Settings, undersampled: bool) -> Kernel:
+    """A kernel whose subpaths follow delta lobes only; weights are not computed.
+
+    ``undersampled``: all lobes, and partial sums of coefficients 1, which are numbers of samples.
+    """
+    if undersampled:
+        plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
-    kernel.reverse, kernel.traits = False, prepared.traits.of_delta_lobes()
+    kernel.reverse = undersampled
+    kernel.traits = prepared.traits if undersampled else prepared.traits.of_delta_lobes()
     kernel.last_light = kernel.last_arrival = kernel.last_merged = kernel.max_depth
     return kernel
-
-
-def counting_kernel(prepared: PreparedScene, plan: Plan, settings: Settings) -> Kernel:
-    """A kernel whose partial sums are those of numbers of samples: coefficients that are counts."""
-    counts = replace(plan, kappa_light=1.0, kappa_direct=1.0)
-    kernel = Kernel(prepared, counts, settings, mis.Heuristic("balance"))
-    kernel.reverse, kernel.traits = True, prepared.traits
-    kernel.last_light = kernel.last_arrival = kernel.last_merged = kernel.max_depth
-    return kernel
-
-
-def points(kind: str) -> Points:
-    """Random numbers of an estimate, the same for all renders."""
-    return Points(kind, dr.opaque(mi.UInt32, SEED))
 
 
 def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
@@ -211,162 +245,13 @@ def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
 
 
 def _names(shapes: Iterable[mi.Shape]) -> tuple[str, ...]:
-    """Names of the ``shapes`` that have one, once each."""
-    return tuple(dict.fromkeys(filter(None, map(_called_shape, shapes))))
+    """Names of the ``shapes``, once each."""
+    return tuple(dict.fromkeys(map(_name, shapes)))
 
 
-def _called_shape(shape: mi.Shape) -> str:
-    """Name a shape by its id and that of its BSDF; empty if neither has one."""
+def _name(shape: mi.Shape) -> str:
+    """Name a shape by its id, else by that of its BSDF: Mitsuba merges the meshes of a BSDF."""
     bsdf = shape.bsdf()
-    name = "" if bsdf is None else given_id(bsdf)
-    if given_id(shape):
-        return f"'{shape.id()}'" + (f" (BSDF '{name}')" if name not in ("", _KEY) else "")
-    if not name:
-        return ""
-    if shape.class_name() == "Mesh":
-        merged = "Mitsuba merges meshes of a BSDF unless optimize=False"
-        return f"meshes without id (BSDF '{name}', {bsdf.class_name()}; {merged})"
-    return f"a {shape.class_name().lower()} without id (BSDF '{name}')"
-
-
-def _warn_of_not_finite(prepared: PreparedScene, indices: np.ndarray):
-    """Warn of emitters whose unsampled light cannot be estimated."""
-    emitters = prepared.emitters.objects
-    lamps = " and ".join(called(emitters[i]) for i in indices[:NAMED])
-    text = (
-        f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or infinite; "
-        "look for such numbers, or very large ones, in the lamp and in the BSDFs that its light meets"
-    )
-    warn_once(prepared.scene, prepared.camera.sensor, text)
-
-
-def shares(unsampled: UnsampledLight, mean: float) -> dict[int, float]:
-    """Shares of the image's light by emitter index.
-
-    ``mean`` of the image's brightest colour, which includes light that is not absent.
-    """
-    size = sum(unsampled.radiance.values())
-    whole = max(mean + unsampled.never * size, size)
-    return {i: radiance / whole for i, radiance in unsampled.radiance.items()}
-
-
-def predicted_shares(unsampled: UnsampledLight, mean: float) -> dict[int, float]:
-    """`shares` before the first pass, from the ``mean`` intensity of a pilot, a median without rare light."""
-    share = unsampled.intensity / (mean + (1 + unsampled.few) * unsampled.intensity)
-    whole = sum(unsampled.radiance.values())
-    return {i: share * radiance / whole for i, radiance in unsampled.radiance.items()}
-
-
-def in_words(
-    prepared: PreparedScene, plan: Plan, shares: dict[int, float], unsampled: UnsampledLight, samples: int
-) -> str:
-    """Warning about unsampled light with its remedy; empty where it is not worth a word.
-
-    ``shares`` of the image's light by emitter index, in a render of ``samples`` per pixel.
-    """
-    all_of_it = sum(shares.values())
-    if all_of_it < WARN_SHARE:
-        return ""
-    cause, remedy = _in_words(prepared, plan, shares, unsampled, samples, _share(all_of_it))
-    return f"bdpt: {cause}; {remedy}"
-
-
-def _share(share: float) -> str:
-    return ("nearly all" if share > 0.99 else f"about {100 * share:.0f} %") + " of the image's light"
-
-
-def reason(
-    prepared: PreparedScene, plan: Plan, shares: dict[int, float], unsampled: UnsampledLight, samples: int
-) -> str:
-    """Why light with these ``shares`` is merged; arguments as of `in_words`."""
-    cause, _ = _in_words(prepared, plan, shares, unsampled, samples, _share(sum(shares.values())))
-    return f"without it {cause}"
-
-
-def explained(
-    prepared: PreparedScene,
-    plan: Plan,
-    unsampled: UnsampledLight,
-    samples: int,
-    shares: dict[int, float] | None,
-) -> str:
-    """`in_words` of light of any share; its radiance if the ``shares`` are not known."""
-    parts = unsampled.radiance if shares is None else shares
-    all_of_it = sum(parts.values())
-    share = f"light of mean radiance {all_of_it:.2g}"
-    if shares is not None:
-        share = f"{max(100 * all_of_it, 0.01):.2g} % of the image's light"
-    cause, remedy = _in_words(prepared, plan, parts, unsampled, samples, share)
-    return f"bdpt: {cause}; {remedy}"
-
-
-def _in_words(
-    prepared: PreparedScene,
-    plan: Plan,
-    parts: dict[int, float],
-    unsampled: UnsampledLight,
-    samples: int,
-    share: str,
-) -> tuple[str, str]:
-    """What is lacking of this ``share`` and why, and the remedy; ``parts`` of it by emitter index."""
-    emitters = prepared.emitters.objects
-    order = sorted(parts, key=parts.__getitem__, reverse=True)
-    least = WARN_SHARE * sum(parts.values())
-    lamps = [emitters[i] for i in order if parts[i] >= least][:NAMED]
-    what = " and ".join(map(called, lamps)) + (" shine" if len(lamps) > 1 else " shines")
-    if unsampled.is_undersampled:
-        remedy = _remedy(prepared, lamps)
-        if any(skipped["why"] == "light_paths=0" for skipped in plan.skipped):  # no pilot's choice
-            remedy = f"leave light_paths to the integrator, {remedy}"
-        by_arrival = _is_left_to_arrival(prepared, plan)
-        cause, remedy = _undersampled(what, unsampled, samples, remedy, by_arrival)
-        return f"undersampled, {share}: {cause}", remedy
-    what += " through glass or mirrors" if prepared.delta else " on what is seen"
-    why, remedy = "no ray hits a lamp without area", _remedy(prepared, lamps)
-    if plan.splat:
-        what += f" on what is seen through {' and '.join(unsampled.through) or 'them'}"
-    elif not prepared.camera.connectible:
-        why = f"no light can be traced to the sensor: {prepared.camera.reason}"
-    else:
-        why = "the render does without light tracing (t=1)"
-        remedy = f"leave light_paths to the integrator, or {remedy}"
-    return f"not sampled, {share}: {what} ({why})", remedy
-
-
-def _undersampled(
-    what: str, unsampled: UnsampledLight, samples: int, remedy: str, by_arrival: bool
-) -> tuple[str, str]:
-    """Cause and remedy of light of which a few samples are expected; ``by_arrival``: by t = 0 alone."""
-    why = f"in a render of {max(samples, PREVIEW)} samples per pixel most pixels have no sample of it"
-    objects = " and ".join(unsampled.sharp)
-    if by_arrival and not objects:
-        through = " and ".join(unsampled.through) or "glass or mirrors"
-        return f"{what} on what is seen through {through}; few light subpaths hit the sensor ({why})", remedy
-    off = f"off {objects}, whose narrow lobes" if objects else "off surfaces whose narrow lobes"
-    rougher = f"or make the {'surface' if len(unsampled.sharp) == 1 else 'surfaces'} rougher"
-    return f"{what} through or {off} connections rarely sample ({why})", f"{remedy}, {rougher}"
-
-
-def called(emitter: mi.Emitter) -> str:
-    """Name an emitter by its kind and nearest id."""
-    kind, shape = _PLUGINS.get(emitter.class_name(), "emitter"), emitter.get_shape()
-    on_shape = shape is not None and given_id(shape)
-    if emitter.class_name() == "AreaLight":  # its id says little: a dictionary's key
-        return (
-            f"the area light on shape '{shape.id()}'" if on_shape else "an area light on a shape without id"
-        )
-    if emitter.id():
-        return f"{kind} '{emitter.id()}'"
-    return f"the {kind} on shape '{shape.id()}'" if on_shape else f"a {kind} without id"
-
-
-def _remedy(prepared: PreparedScene, emitters: Iterable[mi.Emitter]) -> str:
-    emitters = list(emitters)
-    remedy = "give it a small area: an area light on a small sphere or disk"
-    if not any(emitter.class_name() in _PLUGINS for emitter in emitters):
-        remedy = "make the emitter larger"
-    if any(emitter.class_name() == "DirectionalEmitter" for emitter in emitters):
-        remedy = "give the sun a disk: sunsky, an envmap, or an area light far away"
-    media = prepared.space is not None
-    mergeable = not components.merging.why_not(prepared.camera.sensor, media)
-    return f"set merging=true, or {remedy}" if mergeable else remedy
+    if bsdf is not None and given_id(bsdf) and not given_id(shape):
+        return f"shape with BSDF {named(bsdf)}"
+    return f"shape {named(shape)}"

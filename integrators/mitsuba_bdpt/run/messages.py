@@ -12,6 +12,7 @@ from ..errors import listed
 from ..host.notices import warn_once
 from ..planning.explain import words
 from ..planning.possible import Rest, unsampled_paths
+from ..planning.unsampled_light import WARN_SHARE, Missing
 from ..scene.diagnostics import NAMED, not_finite, spoilt
 from ..sensors.checks import called
 
@@ -68,9 +69,10 @@ def warn_of_media(prepared, sensor):
         warn_once(prepared.scene, sensor, f"bdpt: {text}")
 
 
-def warn_of_unsampled_light(prepared, plan, text: str):
-    """Warn once per scene and ``plan`` of unsampled light, unless ``text`` is empty."""
-    if text:
+def warn_of_unsampled_light(prepared, plan, missing: Missing | None):
+    """Warn once per scene and ``plan`` of unsampled light, unless it is little."""
+    if missing and missing.share >= WARN_SHARE:
+        text = f"bdpt: {missing.cause}; {missing.remedy}"
         warn_once(prepared.scene, prepared.camera.sensor, text, ("unsampled light", plan.splat, plan.direct))
 
 

@@ -27,7 +27,7 @@ from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE, NOT_WORTH
 from ..planning.findings import SceneCache
 from ..planning.planner import Planner
-from ..planning.unsampled_light import UnsampledLight
+from ..planning.unsampled_light import WARN_SHARE, Missing, UnsampledLight
 from ..progress import Report
 from ..properties import check_film, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
@@ -162,7 +162,7 @@ class Render:
                 if not number:
                     if self._is_exact_enough():  # the snapshot is exact enough already
                         break
-                    messages.warn_of_unsampled_light(self.prepared, self.plan, self.predicted_warning())
+                    messages.warn_of_unsampled_light(self.prepared, self.plan, self.missing())
                     messages.warn_of_missing_direct(self.prepared, self.plan, self.settings)
                 self._pass(step)
                 # Records the second pass while the first, a short one, runs.
@@ -194,20 +194,18 @@ class Render:
 
     def _why_to_merge(self) -> str:
         """Why this render has to merge; empty, with an entry of `skipped`, if it does not."""
-        unsampled = self._unsampled()
-        if unsampled is None:
+        missing = self.missing()
+        if missing is None:
             return ""
-        shares = self._shares(unsampled)
         level, why = "impossible", components.merging.why_not(self.sensor, self.prepared.space is not None)
         if not why and self.settings.strategy_images:
             why = "layers=strategies shows merges with merging=true only"
-        share = sum(shares.values())
-        if share < unsampled_light.WARN_SHARE:
-            level, why = NOT_WORTH, f"the other strategies lack {100 * share:.2g} % of the image's light"
+        if missing.share < WARN_SHARE:
+            level, why = NOT_WORTH, f"the other strategies lack {missing.share:.2%} of the image's light"
         if why:
             self.skipped = ({"class": "merging", "level": level, "why": why},)
             return ""
-        return unsampled_light.reason(self.prepared, self.plan, shares, unsampled, self._samples())
+        return f"without it {missing.cause}"
 
     @contextmanager
     def _finished(self):
@@ -393,13 +391,10 @@ class Render:
 
         Warns of large shares, once per scene and plan.
         """
-        unsampled = self._unsampled() if self.passes else None
-        if unsampled is None:
-            return {}
-        shares = unsampled_light.shares(unsampled, number(self.accumulator.mean()))
-        text = unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
-        messages.warn_of_unsampled_light(self.prepared, self.plan, text)
+        missing = self.missing() if self.passes else None
+        messages.warn_of_unsampled_light(self.prepared, self.plan, missing)
         emitters, of_scene = self.prepared.emitters.objects, self.prepared.scene.emitters()
+        shares = missing.shares if missing else {}
         return {of_scene.index(emitters[i]): share for i, share in shares.items()}
 
     def _unsampled(self) -> UnsampledLight | None:
@@ -412,41 +407,27 @@ class Render:
             return None
         samples = self._samples()
         look = partial(unsampled_light.estimate, prepared, plan, settings, samples)
-        key = unsampled_light.key(prepared, plan, settings, samples)
+        key = replace(plan, skipped=(), emission=None), plan.emission is None, settings, samples
         unsampled, _ = self.findings.find("unsampled light", key, look)
         return unsampled if unsampled.colours else None
 
-    def predicted_warning(self) -> str:
-        """Return the warning about unsampled light before the first pass.
+    def missing(self) -> Missing | None:
+        """Return what the strategies in use do not sample, or hardly ever; None if nothing.
 
-        Empty if there is none.
+        Shares are of the image so far; before the first pass, of its mean as a decision has estimated it,
+        else as one sample per pixel does.
         """
         unsampled = self._unsampled()
         if unsampled is None:
-            return ""
-        shares = self._shares(unsampled)
-        return unsampled_light.in_words(self.prepared, self.plan, shares, unsampled, self._samples())
-
-    def explained_warning(self, decided: bool) -> str:
-        """Return `predicted_warning`, or what is not sampled though there is no warning."""
-        unsampled = self._unsampled()
-        if unsampled is None or not (decided or unsampled.is_undersampled):
-            return ""
-        if decided and (text := self.predicted_warning()):
-            return text
-        shares = self._shares(unsampled) if decided else None
-        return unsampled_light.explained(self.prepared, self.plan, unsampled, self._samples(), shares)
-
-    def _shares(self, unsampled: UnsampledLight) -> dict[int, float]:
-        """Predict shares of ``unsampled`` light by emitter index.
-
-        From the image's mean as a decision has estimated it, else as one sample per pixel does.
-        """
+            return None
         made = self.planner.decided.decisions
-        if made and made[-1].mean > 0:
-            return unsampled_light.predicted_shares(unsampled, made[-1].mean)
-        mean, _ = self.findings.find("mean", self.settings, self._first_mean)
-        return unsampled_light.shares(unsampled, mean)
+        if self.passes:
+            shares = unsampled.shares(number(self.accumulator.mean()))
+        elif made and made[-1].mean > 0:
+            shares = unsampled.shares(made[-1].mean, of_pilot=True)
+        else:
+            shares = unsampled.shares(self.findings.find("mean", self.settings, self._first_mean)[0])
+        return unsampled_light.missing(self.prepared, self.plan, unsampled, shares, self._samples())
 
     def _first_mean(self) -> float:
         """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
