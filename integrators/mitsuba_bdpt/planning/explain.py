@@ -2,46 +2,15 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 from ..scene.diagnostics import spoilt
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import Plan
 from .choice import NEAR, Prediction, why_not
 from .configuration import Configuration
-from .possible import Rest, Start, UnsampledPaths, unsampled_paths
-
-_STARTS = {
-    Start.DELTA_EMITTER: "delta emitter - specular",
-    Start.BEAM: "directionalarea",
-    Start.DIRECT_DELTA_EMITTER: "delta emitter",
-}
-_RESTS = {
-    Rest.SEEN_VERTEX: "one non-specular vertex{where} - sensor",
-    Rest.VERTICES: "two or more non-specular vertices{where} - specular or nothing - sensor",
-    Rest.VERTEX_BETWEEN_DELTA: "one non-specular vertex{where} - specular - sensor (SDS: no connectible "
-    "edge{share})",
-    Rest.SENSOR: "sensor",
-    Rest.LONG: "any path of more than {longest} edges",
-}
-
-
-def words(unsampled: UnsampledPaths) -> str:
-    """Describe paths that no strategy in use can sample, from the emitter to the sensor."""
-    starts = " or ".join(_STARTS[start] for start in unsampled.starts)
-    where = " (on a surface or in a medium)" if unsampled.volumes else ""
-    share = "; an estimate of its share leaves out vertices in media" if unsampled.volumes else ""
-    rest = _RESTS[unsampled.rest].format(longest=unsampled.longest, where=where, share=share)
-    return f"{starts} - {rest} (needs {unsampled.needs})" if unsampled.needs else f"{starts} - {rest}"
-
-
-def fraction(light_paths: float) -> str:
-    """Number of light subpaths per camera subpath as the parameter has it: ``0``, ``1/4``, ``1``."""
-    return f"1/{round(1 / light_paths)}" if 0 < light_paths < 1 else f"{light_paths:g}"
-
-
-def subpaths(count: int) -> str:
-    """Number of camera subpaths as text."""
-    return f"{count} camera subpaths" if count > 1 else "camera subpath"
+from .possible import unsampled_paths
 
 
 def explain(
@@ -58,37 +27,32 @@ def explain(
     ``table``: a pilot's predictions (`choice.choose`), with `choice.confidence`; empty without a pilot.
     ``invalid``: number of non-finite values of the pilot; ``not_sampled``: sentence about unsampled light.
     """
-    used = [
-        name
-        for name, on in (
-            ("s=0 (camera subpath hits an emitter)", p.hit),
-            ("s=1 (next-event estimation)", p.direct),
-            ("t=1 (light vertex seen by the sensor)", p.splat),
-            ("(1,1) (emitter point seen by the sensor)", p.endpoints),
-            ("t=0 (light subpath hits the sensor)", p.arrival),
-            (
-                f"guided s=0 ({p.guided} per vertex of SDS paths)",
-                p.guided,
-            ),
-            (f"inner connections s,t>=2 ({p.connections})", p.connections != "none"),
-            (_guided_emission(p), p.emission is not None),
-        )
-        if on
-    ]
+    light = "no light subpaths"
+    if p.light:
+        count = p.camera_paths_per_light_path
+        light = f"one light subpath per {f'{count} camera subpaths' if count > 1 else 'camera subpath'}"
+        light += f", each of which is connected with {p.joined} of them" * (p.joined > 1)
+    merged = "SDS paths" + " and of paths that connections rarely sample" * bool(prepared.near_specular)
+    used = {
+        "s=0 (camera subpath hits an emitter)": p.hit,
+        "s=1 (next-event estimation)": p.direct,
+        "t=1 (light vertex seen by the sensor)": p.splat,
+        "(1,1) (emitter point seen by the sensor)": p.endpoints,
+        "t=0 (light subpath hits the sensor)": p.arrival,
+        f"guided s=0 ({p.guided} per vertex of SDS paths)": p.guided,
+        f"inner connections s,t>=2 ({p.connections})": p.connections != "none",
+        _guided_emission(p): p.emission,
+        f"vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)": p.merging,
+    }
     lines = [
-        f"heuristic {settings.heuristic}, one light subpath per {subpaths(p.camera_paths_per_light_path)}"
-        + (f", each of which is connected with {p.joined} of them" if p.joined > 1 else "")
-        if p.light
-        else f"heuristic {settings.heuristic}, no light subpaths"
+        f"heuristic {settings.heuristic}, {light}",
+        *(f"used: {name}" for name, on in used.items() if on),
     ]
-    lines += [f"used: {name}" for name in used]
-    if p.merging:
-        lines.append(f"used: {_merging(prepared)}")
     lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
-    lines += [f"not sampled: {words(unsampled)}" for unsampled in unsampled_paths(prepared, p, settings)]
+    lines += [f"not sampled: {unsampled}" for unsampled in unsampled_paths(prepared, p, settings)]
     if not_sampled:
         lines.append(not_sampled)
     lines += [f"warning: {text}" for text in spoilt(prepared, settings)]
@@ -102,13 +66,6 @@ def explain(
             f"invalid samples (NaN or infinite): {invalid} of the pilot, which decided from the rest"
         )
     return "\n".join(lines + _pilot(settings, table, confidence))
-
-
-def _merging(prepared: PreparedScene) -> str:
-    merged = (
-        "SDS paths and of paths that connections rarely sample" if prepared.near_specular else "SDS paths"
-    )
-    return f"vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)"
 
 
 def _guided_emission(p: Plan) -> str:
@@ -125,7 +82,7 @@ def _named(candidate: Configuration) -> str:
     if not candidate.light_paths:
         return f"light_paths=0, coefficient of s=1: {candidate.kappa_direct:g}"
     guided = f", guided={candidate.guided}" if candidate.guided else ""
-    light = f"light_paths={fraction(candidate.light_paths)}, connections={candidate.connections}"
+    light = f"light_paths={Fraction(candidate.light_paths)}, connections={candidate.connections}"
     lane = f", {candidate.joined} light subpaths per lane" if candidate.joined > 1 else ""
     return f"{light}{guided}{lane}, coefficient of t<=1: {candidate.kappa_light:g}"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import mitsuba as mi
@@ -13,7 +13,6 @@ from ..emitters.emitters import Emitters
 from ..geometry.boxes import scene_box
 from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
-from ..sensors.records import Sensor
 from ..settings import Settings
 from ..transport.plan import GUIDED, Plan
 from .budget import EVEN
@@ -21,56 +20,50 @@ from .budget import EVEN
 
 def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     """Rule out impossible strategies and apply parameters set by hand."""
-    emitters, camera = prepared.emitters, prepared.camera
+    emitters, camera, depth = prepared.emitters, prepared.camera, settings.max_depth
     skipped: list[dict[str, str]] = []
 
-    def skip(name: str, level: str, why: str) -> bool:
-        skipped.append({"class": name, "level": level, "why": why})
-        return False
+    def possible(name: str, why: str, level: str = "impossible") -> bool:
+        """Whether there is no reason against a class; a reason is noted."""
+        if why:
+            skipped.append({"class": name, "level": level, "why": why})
+        return not why
 
-    hit = emitters.hittable or skip("s=0", "impossible", "no emitter that a ray can hit")
+    def connected(needed: int, *reasons: str) -> str:
+        """Why no path of ``needed`` edges can be connected: the first reason."""
+        return _why_no_path(prepared, depth, needed) or next(filter(None, reasons), "")
 
-    def possible(name: str, needed: int, where: bool, why: str) -> bool:
-        """Whether a class that connects vertices is possible, on ``needed`` edges or more."""
-        why = _why_not(prepared, settings.max_depth, needed) or ("" if where else why)
-        return skip(name, "impossible", why) if why else True
-
-    connectible = camera.connectible and emitters.traced
-    direct = possible("s=1", 2, emitters.direct, "next-event estimation can choose no emitter")
-    splat = possible("t=1", 2, connectible, camera.reason or _UNTRACED)
-    inner = possible("inner", 3, emitters.traced, _UNTRACED)
-    why = _why_not_endpoints(emitters, camera, settings)
-    endpoints = skip("(1,1)", "impossible", why) if why else True
-    why = _why_not_arrival(prepared, settings)
-    arrival = skip("t=0", "impossible", why) if why else True
+    untraced = "" if emitters.traced else _UNTRACED
+    hit = possible("s=0", "" if emitters.hittable else "no emitter that a ray can hit")
+    no_choice = "" if emitters.direct else "next-event estimation can choose no emitter"
+    direct = possible("s=1", connected(2, no_choice))
+    splat = possible("t=1", connected(2, camera.reason, untraced))
+    inner = possible("inner", connected(3, untraced))
+    endpoints = possible("(1,1)", _why_not_endpoints(prepared, settings))
+    arrival = possible("t=0", _why_not_arrival(prepared, settings))
     specular = prepared.delta or bool(prepared.near_specular)
-    merging = settings.merging is True
-    if merging and (why := _why_not_merging(emitters, specular, bool(direct))):
-        merging = skip("merging", "impossible", why)
-    why = _why_not_guided(prepared, settings, bool(hit), bool(direct), specular)
-    if why and settings.guiding == "always":
-        skip("guided s=0", "impossible", why)
+    merging = settings.merging is True and possible("merging", _why_not_merging(emitters, specular, direct))
+    why = _why_not_guided(prepared, settings, hit, direct, specular)
+    if settings.guiding == "always":
+        possible("guided s=0", why)
     guidable = not why
     if merging:  # a pilot may choose not to merge where s = 0 samples that light too
         unguidable = emitters.unhittable or emitters.beams or bool(prepared.near_specular)
         guidable = guidable and not unguidable
     elif guidable and settings.guiding in ("emission", "never"):
-        guidable = skip("guided s=0", "by hand", f"guiding={settings.guiding}")
+        guidable = possible("guided s=0", f"guiding={settings.guiding}", BY_HAND)
     for name, why in emitters.left_out:
-        skip(name, "impossible", why)
+        possible(name, why)
 
     light_paths, connections = _defaults(settings)
-    if light_paths == 0:
-        splat = endpoints = arrival = inner = False
-        skip("t=0, t=1, (1,1), inner", "by hand", "light_paths=0")
-    if inner and connections == "none":
-        inner = skip("inner", "by hand", "connections=none")
     contradiction = prepared.light_media.contradiction if prepared.light_media else ""
-    if contradiction and (splat or endpoints or arrival or inner):
-        splat = endpoints = arrival = inner = skip("t=0, t=1, (1,1), inner", "impossible", contradiction)
-    light = bool(splat or endpoints or arrival or inner)
-    why = _why_not_guided_emission(emitters, settings) if light else ""
-    teachable = light and (skip("guided emission", *why) if why else True)
+    traced = possible(_ALL_LIGHT, "" if light_paths else "light_paths=0", BY_HAND)
+    traced = traced and possible(_ALL_LIGHT, contradiction)
+    splat, endpoints, arrival, inner = (each and traced for each in (splat, endpoints, arrival, inner))
+    if inner and connections == "none":
+        inner = possible("inner", "connections=none", BY_HAND)
+    light = splat or endpoints or arrival or inner
+    teachable = light and possible("guided emission", *_why_not_guided_emission(emitters, settings))
     return Plan(
         hit=hit,
         direct=direct,
@@ -96,12 +89,12 @@ def may_join(prepared: PreparedScene, merging: bool) -> bool:
     return prepared.space is None and not merging and not prepared.emitters.shape_errors.small
 
 
-def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str] | None:
-    """Level and reason why emission cannot be guided; None if it can."""
+def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str]:
+    """Why emission cannot be guided, empty if it can, and the level of the reason."""
     if settings.guiding in ("photons", "never"):
-        return "by hand", f"guiding={settings.guiding}"
+        return f"guiding={settings.guiding}", BY_HAND
     why = components.why_absent("guided_emission") or components.guided_emission.why_not(emitters)
-    return ("impossible", why) if why else None
+    return why or "", "impossible"
 
 
 def _defaults(settings: Settings) -> tuple[float, str]:
@@ -118,30 +111,26 @@ def _defaults(settings: Settings) -> tuple[float, str]:
 
 
 _UNTRACED = "no light subpath can start from the emitters"
+_ALL_LIGHT = "t=0, t=1, (1,1), inner"
+BY_HAND = "by hand"
 
 
-def _why_not(prepared: PreparedScene, depth: int, needed: int) -> str:
-    """Why no path of ``needed`` edges can be connected; empty if one can."""
+def _why_no_path(prepared: PreparedScene, depth: int, needed: int = 1) -> str:
+    """Why no path has ``needed`` edges, empty if one may; from 2 on it is connected at a vertex."""
     if depth < needed:
         return f"max_depth={depth} allows no such path"
     if prepared.emitters.count == 0:
         return "the scene has no emitter"
-    if prepared.space is not None and prepared.space.media.scatters:
+    if needed == 1 or (prepared.space is not None and prepared.space.media.scatters):
         return ""
     if not prepared.surfaces:
         return "the scene has no surface"
     return "" if prepared.smooth else "no surface has a lobe that is not delta"
 
 
-def _why_no_light(emitters: Emitters, settings: Settings) -> str:
-    """Why no path reaches the sensor; empty if one may."""
-    if settings.max_depth < 1:
-        return "max_depth=0 allows no path"
-    return "" if emitters.count else "the scene has no emitter"
-
-
-def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -> str:
+def _why_not_endpoints(prepared: PreparedScene, settings: Settings) -> str:
     """Why (1,1) is impossible; empty if it is possible."""
+    emitters, camera = prepared.emitters, prepared.camera
     if not camera.connectible:
         return camera.reason
     if settings.hide_emitters:
@@ -152,7 +141,7 @@ def _why_not_endpoints(emitters: Emitters, camera: Sensor, settings: Settings) -
         return "delta emitters are not seen by a pinhole (delta) sensor (measure zero)"
     if emitters.count and camera.parallel and not emitters.finite_hittable:
         return "a direction of the surroundings is not that of the sensor's rays (measure zero)"
-    return _why_no_light(emitters, settings)
+    return _why_no_path(prepared, settings.max_depth)
 
 
 def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
@@ -169,7 +158,7 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
         return "what a flight through a grid carries of each colour is known at its end, not at the sensor"
     if media is not None and emitters.at_infinity and _reaches_behind(prepared, camera.sensor):
         return "what lies behind the far plane meets light from infinity, but no camera ray"
-    return _why_no_light(emitters, settings)
+    return _why_no_path(prepared, settings.max_depth)
 
 
 def _why_not_merging(emitters: Emitters, specular: bool, direct: bool) -> str:
@@ -215,41 +204,39 @@ def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
 class Start(Enum):
     """Starts of paths that camera subpaths sample neither by a hit nor by next event."""
 
-    DELTA_EMITTER = "a delta emitter seen through delta surfaces"
-    BEAM = "directionalarea, which emits into one direction"
-    DIRECT_DELTA_EMITTER = "a delta emitter"
+    DELTA_EMITTER = "delta emitter - specular"
+    BEAM = "directionalarea"
+    DIRECT_DELTA_EMITTER = "delta emitter"
 
 
 class Rest(Enum):
     """Continuations of such a start that only some strategies sample."""
 
-    SEEN_VERTEX = "a vertex that is not delta, seen by the sensor"
-    VERTICES = "two vertices or more that are not delta, then delta surfaces or none"
-    VERTEX_BETWEEN_DELTA = "a single vertex that is not delta, then delta surfaces"
-    SENSOR = "the sensor itself"
-    LONG = "any, on paths longer than light subpaths are stored"
+    SEEN_VERTEX = "one non-specular vertex - sensor"
+    VERTICES = "two or more non-specular vertices - specular or nothing - sensor"
+    VERTEX_BETWEEN_DELTA = "one non-specular vertex - specular - sensor"
+    SENSOR = "sensor"
+    LONG = "any longer path"
 
 
 @dataclass(frozen=True)
 class UnsampledPaths:
     """Paths that no strategy in use samples: from one of ``starts`` by ``rest``.
 
-    ``needs``: the strategy that would sample them, empty if none would; ``longest``, for `Rest.LONG`: the
-    number of edges up to which they are sampled; ``volumes``: non-delta vertices may lie in media.
+    ``note``: the strategy that would sample them, or why none does.
     """
 
     starts: tuple[Start, ...]
     rest: Rest
-    needs: str = ""
-    longest: int = 0
-    volumes: bool = False
+    note: str
+
+    def __str__(self) -> str:
+        """The vertices from the emitter to the sensor."""
+        return f"{' or '.join(start.value for start in self.starts)} - {self.rest.value} ({self.note})"
 
 
 def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnsampledPaths, ...]:
-    """Paths that no strategy in use samples, in a fixed order.
-
-    `explain.words` describes them.
-    """
+    """Paths that no strategy in use samples, in a fixed order."""
     emitters, camera = prepared.emitters, prepared.camera
     unsampled: list[UnsampledPaths] = []
     deltas = prepared.delta and emitters.unhittable
@@ -257,21 +244,21 @@ def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tup
     if not p.arrival:  # t = 0 samples all that follow
         for start in starts:
             if not p.splat:
-                unsampled.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "t=1"))
+                unsampled.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "needs t=1"))
             if p.connections == "none":
-                unsampled.append(UnsampledPaths((start,), Rest.VERTICES, "inner connections"))
+                unsampled.append(UnsampledPaths((start,), Rest.VERTICES, "needs inner connections"))
         if deltas:
-            unsampled.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA))
+            note = "SDS: no connectible edge"
+            unsampled.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA, note))
         if not camera.delta and starts:
-            unsampled.append(UnsampledPaths(starts, Rest.SENSOR, "t=0"))
+            unsampled.append(UnsampledPaths(starts, Rest.SENSOR, "needs t=0"))
         # With hide_emitters this light is hidden on purpose.
         direct = bool(emitters.unhittable_connectible) and not settings.hide_emitters
         if direct and not camera.delta and not p.endpoints and settings.max_depth:
-            unsampled.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "(1,1)"))
+            unsampled.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "needs (1,1)"))
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
-        unsampled.append(UnsampledPaths(starts, Rest.LONG, longest=longest))
+        unsampled.append(UnsampledPaths(starts, Rest.LONG, f"more than {longest} edges"))
     if p.merging:  # samples all paths with a vertex for merging
         unsampled = [paths for paths in unsampled if paths.rest in (Rest.SENSOR, Rest.LONG)]
-    volumes = prepared.space is not None and prepared.space.media.scatters
-    return tuple(replace(paths, volumes=volumes) for paths in unsampled)
+    return tuple(unsampled)

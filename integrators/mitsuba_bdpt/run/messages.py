@@ -10,7 +10,6 @@ import mitsuba as mi
 from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.notices import warn_once
-from ..planning.explain import words
 from ..planning.possible import Rest, unsampled_paths
 from ..planning.unsampled_light import WARN_SHARE, Missing
 from ..scene.diagnostics import NAMED, not_finite, spoilt
@@ -86,7 +85,7 @@ def warn_of_missing_direct(prepared, plan, settings):
     for paths in unsampled_paths(prepared, plan, settings):
         if paths.rest is Rest.SENSOR:
             text = (
-                f"bdpt: not sampled: {words(paths)}: light on {called(prepared.camera.sensor)} itself is "
+                f"bdpt: not sampled: {paths}: light on {called(prepared.camera.sensor)} itself is "
                 "missing; leave light_paths at auto, render views of a batch one by one, or use an area light"
             )
             warn_once(prepared.scene, prepared.camera.sensor, text)
