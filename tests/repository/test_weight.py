@@ -25,7 +25,7 @@ MOST = {
     "": 1557,  # top files
 }
 OUTSIDE = {"scripts": 6095, "tests": 44935}
-MOST_WORDS = 68543
+MOST_WORDS = 68547
 
 
 def _lines(files):
