@@ -334,7 +334,7 @@ MUTANTS = (
     Mutant(
         "pilots of an edited scene",
         "planning/findings.py",
-        "(self._scene_state(), key), compiled_quickly",
+        "(self._state, key), compiled_quickly",
         "key, compiled_quickly",
         ("tests/host/test_edits.py::test_edits_are_seen",),
     ),

@@ -213,7 +213,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         confidence, invalid = planner.confidence(), planner.decided.non_finite
         missing = render.missing() if spp else None
         warning = f"{missing.cause}; {missing.remedy}" if missing else ""
-        plan = replace(render.plan, skipped=(*render.plan.skipped, *render.skipped))
+        plan = replace(render.plan, skipped=(*planner.full.skipped, *planner.decided.left_out))
         if plan.merging:
             warning = f"merging: {render.why_merged}"
         text = explain(render.prepared, plan, self.settings, table, confidence, invalid, warning)

@@ -218,12 +218,12 @@ def test_names_of_objects():
     assert lost_in(slab(frosted(0.01), ball=ball)).objects == ("shape 'slab'",)
     satin = frosted(0.01) | {"id": "satin"}
     assert lost_in(slab(satin, slab=PLATE | {"id": "", "bsdf": satin})).objects == (
-        "shape with BSDF 'satin'",
+        "shape without id with BSDF 'satin'",
     )
     one = {"type": "ref", "id": "satin"}
     other = {"type": "cube", "to_world": T().translate([0, 0, -9]), "bsdf": one}
     merged = slab(one, optimize=True, satin=frosted(0.01), other=other)
-    assert lost_in(merged).objects == ("shape with BSDF 'satin'",)
+    assert lost_in(merged).objects == ("shape without id with BSDF 'satin'",)
 
 
 @pytest.mark.parametrize("alpha, spp, lowest, highest", [(0.01, 64, 50, 99), (0.03, 4096, 0, 1)])

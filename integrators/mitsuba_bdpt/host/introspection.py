@@ -27,12 +27,13 @@ def given_id(owner) -> str:
 
 
 def named(owner) -> str:
-    """Identify an object in a message: by its id, its shape's id or its class name."""
+    """Identify an object in a message: by its id, that of its shape or BSDF, or its class name."""
     if given_id(owner):
         return f"'{owner.id()}'"
-    shape = owner.get_shape() if isinstance(owner, (mi.Emitter, mi.Sensor)) else None
-    if shape is not None and given_id(shape):
-        return f"without id on shape '{shape.id()}'"
+    of = owner.get_shape() if isinstance(owner, (mi.Emitter, mi.Sensor)) else None
+    of = owner.bsdf() if isinstance(owner, mi.Shape) else of  # Mitsuba merges the meshes of a BSDF
+    if of is not None and given_id(of):
+        return f"without id {'on shape' if isinstance(of, mi.Shape) else 'with BSDF'} '{of.id()}'"
     return f"without id ({owner.class_name()})"
 
 
@@ -62,10 +63,7 @@ def registry_index(shape: mi.Shape) -> int:
 
 
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
-    """Return the shapes in the scene's shape groups, which instances do not expose.
-
-    Empty without instances: no ray hits them.
-    """
+    """Return the shapes in the scene's shape groups, which are hit by instances only."""
     if not any(map(is_instance, scene.shapes())):
         return []
     return [shape for group in shape_groups(scene) for shape in shapes_in(group)]

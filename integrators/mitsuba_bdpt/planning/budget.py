@@ -31,7 +31,7 @@ PROVISIONAL_SAMPLES = 1 << 20
 
 # Largest ratio of maximum to mean radiance of an environment that s = 0 samples well by itself (a clear sky
 # without its sun has about ten): light subpaths and guided samples do not pay, but in long renders. Tighter
-# bounds: `aim.EVEN_SKY` of photons, `candidates.UNIFORM` of weights.
+# bounds: `aim.EVEN_SKY` of photons, `configuration.UNIFORM` of weights.
 EVEN = 100
 
 # Films of fewer pixels run no pilot, whose variance of splats assumes an image of many pixels. They trace a

@@ -1,7 +1,7 @@
 """Configurations of a render: light subpaths, connections, coefficients.
 
-A pilot estimates the variance of each of `CANDIDATES`. A `Decision` is a configuration in use with its
-predictions; it has a JSON form.
+A pilot estimates the variance of each of `CANDIDATES`; `without_pilot` decides under a uniform environment.
+A `Decision` is a configuration in use with its predictions; it has a JSON form.
 """
 
 from __future__ import annotations
@@ -11,7 +11,11 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from .. import components
+from ..scene.prepared import PreparedScene
+from ..settings import Settings
 from ..transport.plan import JOINED, EmissionTables, Plan
+from .budget import CHEAP_SAMPLES, EVEN
+from .possible import unsampled_paths
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,55 @@ class Decision(Configuration):
         return Decision(kappa_light=coefficients["t<=1"], kappa_direct=coefficients["s=1"], **values)
 
 
-def replayed(decision: Decision) -> list[dict[str, str]]:
-    """What a decision that is handed over leaves out, as in ``statistics["skipped"]``."""
-    names = ["t<=1"] * (not decision.light_paths) + ["inner"] * (decision.connections == "none")
-    return [{"class": name, "level": "by hand", "why": "decisions"} for name in names]
+# kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
+# has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
+UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 0.7, 2, 1 << 20
+
+# Multiple of the samples that a pilot's kernel takes (`budget.samples_of_kernel`) from which on the pilot's
+# gain there pays for it.
+UNIFORM_TIMES = 10
+
+LEFT_OUT = [
+    not_worth(name, "all light comes from a uniform environment, and the render is too short for a pilot")
+    for name in ("t<=1", "inner")
+]
+
+
+def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
+    """Those of `CANDIDATES` that sample the light that ``full`` samples."""
+
+    def without_arrival(plan: Plan) -> tuple[str, ...]:
+        """Paths that are not sampled, when neither t = 0 nor merging counts.
+
+        A small lens rarely samples such paths, and merging is not unbiased: neither replaces connections.
+        """
+        return unsampled_paths(prepared, replace(plan, arrival=False, merging=False), settings)
+
+    def is_possible(candidate: Configuration) -> bool:
+        if candidate.connections != "none" and full.connections == "none":
+            return False
+        return (candidate.light_paths > 0 or not tied) and without_arrival(candidate.plan(full)) == unsampled
+
+    unsampled = without_arrival(full)
+    # A sensor with area sees delta emitters only by light subpaths.
+    tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
+    return [candidate for candidate in CANDIDATES if is_possible(candidate)]
+
+
+def without_pilot(
+    prepared: PreparedScene, full: Plan, settings: Settings, samples: int, of_kernel: int
+) -> Decision | None:
+    """Decision for a render of ``samples`` samples that needs no pilot, or None.
+
+    Path tracing alone under a uniform environment in a render too short for a pilot, whose kernel takes as
+    long as ``of_kernel`` samples: camera subpaths hit the environment wherever its light enters, caustics
+    included, and light subpaths rarely find the way in.
+    """
+    contrast = prepared.emitters.contrast
+    most = max(UNIFORM_TIMES * of_kernel, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
+    if samples >= most or not contrast <= EVEN:  # also if it is NaN
+        return None
+    if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
+        return None
+    alone = Configuration(0.0, "none", 1.0, UNIFORM_DIRECT if contrast <= UNIFORM else 1.0)
+    return Decision.of(alone, cost=1.0, variance=0.0, mean=0.0)

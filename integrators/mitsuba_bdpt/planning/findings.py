@@ -26,20 +26,16 @@ class SceneCache:
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
         """Return the result of ``look()``, whose kernels run once, and whether it was cached for ``key``."""
+        if self._state is None:  # detects edits
+            state = State.of([self._prepared.scene, self._sensor])
+            self._state = state, self._prepared.camera.region.border
 
         def compiled_quickly():
             with quick_compilation():
                 return look()
 
-        return cached(self._prepared.scene, self._sensor, kind, (self._scene_state(), key), compiled_quickly)
+        return cached(self._prepared.scene, self._sensor, kind, (self._state, key), compiled_quickly)
 
     def expire(self):
         """Read the parameters again before the next lookup: they may have been edited."""
         self._state = None
-
-    def _scene_state(self) -> tuple[State, int]:
-        """Fingerprint of all parameters of scene and sensor; detects edits."""
-        if self._state is None:
-            state = State.of([self._prepared.scene, self._sensor])
-            self._state = state, self._prepared.camera.region.border
-        return self._state

@@ -16,8 +16,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import JOINED
 from . import budget, choice, pilot
-from .candidates import LEFT_OUT, candidates, without_pilot
-from .configuration import Decision, not_worth, replayed
+from .configuration import LEFT_OUT, Decision, candidates, not_worth, without_pilot
 from .findings import SceneCache
 from .moments import Moments
 from .possible import may_join, plan
@@ -96,7 +95,7 @@ class Planner:
         Returns whether a pilot is to run.
         """
         for given in self._settings.internals.decisions or ():
-            self.adopt(given, replayed(given))
+            self.adopt(given, ())
         settled, decision = self._settled()
         if self._settings.internals.decisions is None:
             self.decided = replace(self.decided, no_pilot=settled)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import Enum
-
 import mitsuba as mi
 import numpy as np
 
@@ -48,8 +45,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         possible("guided s=0", why)
     guidable = not why
     if merging:  # a pilot may choose not to merge where s = 0 samples that light too
-        unguidable = emitters.unhittable or emitters.beams or bool(prepared.near_specular)
-        guidable = guidable and not unguidable
+        guidable = guidable and not (emitters.unhittable or prepared.near_specular)
     elif guidable and settings.guiding in ("emission", "never"):
         guidable = possible("guided s=0", f"guiding={settings.guiding}", BY_HAND)
     for name, why in emitters.left_out:
@@ -201,64 +197,41 @@ def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
     return bool(((corners - origin) @ forwards / np.linalg.norm(forwards) > sensor.far_clip()).any())
 
 
-class Start(Enum):
-    """Starts of paths that camera subpaths sample neither by a hit nor by next event."""
-
-    DELTA_EMITTER = "delta emitter - specular"
-    BEAM = "directionalarea"
-    DIRECT_DELTA_EMITTER = "delta emitter"
-
-
-class Rest(Enum):
-    """Continuations of such a start that only some strategies sample."""
-
-    SEEN_VERTEX = "one non-specular vertex - sensor"
-    VERTICES = "two or more non-specular vertices - specular or nothing - sensor"
-    VERTEX_BETWEEN_DELTA = "one non-specular vertex - specular - sensor"
-    SENSOR = "sensor"
-    LONG = "any longer path"
-
-
-@dataclass(frozen=True)
-class UnsampledPaths:
-    """Paths that no strategy in use samples: from one of ``starts`` by ``rest``.
-
-    ``note``: the strategy that would sample them, or why none does.
-    """
-
-    starts: tuple[Start, ...]
-    rest: Rest
-    note: str
-
-    def __str__(self) -> str:
-        """The vertices from the emitter to the sensor."""
-        return f"{' or '.join(start.value for start in self.starts)} - {self.rest.value} ({self.note})"
-
-
-def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[UnsampledPaths, ...]:
-    """Paths that no strategy in use samples, in a fixed order."""
-    emitters, camera = prepared.emitters, prepared.camera
-    unsampled: list[UnsampledPaths] = []
-    deltas = prepared.delta and emitters.unhittable
-    starts = (Start.DELTA_EMITTER,) * deltas + (Start.BEAM,) * emitters.beams
-    if not p.arrival:  # t = 0 samples all that follow
+def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tuple[str, ...]:
+    """Paths that no strategy in use samples, from the emitter to the sensor, and what they need."""
+    starts, found = _unsampled_starts(prepared), list[str]()
+    if not (p.arrival or p.merging):  # t = 0 samples all paths, merging those with a vertex that is not delta
         for start in starts:
             if not p.splat:
-                unsampled.append(UnsampledPaths((start,), Rest.SEEN_VERTEX, "needs t=1"))
+                found.append(f"{start} - one non-specular vertex - sensor (needs t=1)")
             if p.connections == "none":
-                unsampled.append(UnsampledPaths((start,), Rest.VERTICES, "needs inner connections"))
-        if deltas:
-            note = "SDS: no connectible edge"
-            unsampled.append(UnsampledPaths((Start.DELTA_EMITTER,), Rest.VERTEX_BETWEEN_DELTA, note))
-        if not camera.delta and starts:
-            unsampled.append(UnsampledPaths(starts, Rest.SENSOR, "needs t=0"))
-        # With hide_emitters this light is hidden on purpose.
-        direct = bool(emitters.unhittable_connectible) and not settings.hide_emitters
-        if direct and not camera.delta and not p.endpoints and settings.max_depth:
-            unsampled.append(UnsampledPaths((Start.DIRECT_DELTA_EMITTER,), Rest.SENSOR, "needs (1,1)"))
+                rest = "two or more non-specular vertices - specular or nothing - sensor"
+                found.append(f"{start} - {rest} (needs inner connections)")
+        if prepared.delta and prepared.emitters.unhittable:
+            rest = "one non-specular vertex - specular - sensor"
+            found.append(f"delta emitter - specular - {rest} (SDS: no connectible edge)")
+    found += unsampled_at_sensor(prepared, p, settings)
     longest = prepared.stored_vertices(settings)
     if starts and p.light and longest < settings.max_depth:
-        unsampled.append(UnsampledPaths(starts, Rest.LONG, f"more than {longest} edges"))
-    if p.merging:  # samples all paths with a vertex for merging
-        unsampled = [paths for paths in unsampled if paths.rest in (Rest.SENSOR, Rest.LONG)]
-    return tuple(unsampled)
+        found.append(f"{' or '.join(starts)} - any path of more than {longest} edges")
+    return tuple(found)
+
+
+def unsampled_at_sensor(prepared: PreparedScene, p: Plan, settings: Settings) -> list[str]:
+    """`unsampled_paths` without a vertex between emitter, delta surfaces and a sensor with area."""
+    if p.arrival or prepared.camera.delta:
+        return []
+    starts = _unsampled_starts(prepared)
+    found = [f"{' or '.join(starts)} - sensor (needs t=0)"] if starts else []
+    # With hide_emitters this light is hidden on purpose.
+    direct = bool(prepared.emitters.unhittable_connectible) and not settings.hide_emitters
+    if direct and not p.endpoints and settings.max_depth:
+        found.append("delta emitter - sensor (needs (1,1))")
+    return found
+
+
+def _unsampled_starts(prepared: PreparedScene) -> list[str]:
+    """Starts of paths that camera subpaths sample neither by a hit nor by next event."""
+    emitters = prepared.emitters
+    is_delta = prepared.delta and emitters.unhittable
+    return ["delta emitter - specular"] * is_delta + ["directionalarea"] * emitters.beams

@@ -1,11 +1,10 @@
 """Estimates the share of an image's light on SDS paths that no strategy samples, or hardly ever.
 
 Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
-reaches the sensor; no two neighbouring vertices can be connected. `possible.unsampled_paths` decides
-whether such paths are possible. Through near-specular lobes in place of delta lobes a few samples find such
-light: it is *undersampled* if a render expects too few of them, see `merging.undersampled`. The estimate
-merges camera subpaths with as many photons, see `merging.unsampled` for what it leaves out,
-and lamps seen in a mirror.
+reaches the sensor; no two neighbouring vertices can be connected. Through near-specular lobes in
+place of delta lobes a few samples find such light: it is *undersampled* if a render expects too few of them,
+see `merging.undersampled`. The estimate merges camera subpaths with as many photons, see `merging.unsampled`
+for what it leaves out, and lamps seen in a mirror.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import numpy as np
 
 from .. import components
 from ..errors import listed
-from ..host.introspection import all_shapes, given_id, named
+from ..host.introspection import all_shapes, named
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
@@ -30,7 +29,7 @@ from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
-from .possible import SHORTEST, Start, unsampled_paths
+from .possible import SHORTEST
 
 # Subpaths from either end: the fewest, the most, and samples of the render per subpath. The noise of the
 # estimate suffices for `WARN_SHARE`, not for a figure to rely on; see experiments, "Vertex merging". Few
@@ -151,23 +150,21 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
         return False
     if plan.merging or components.why_absent("merging"):  # which samples or estimates it
         return False
-    if is_undersampling_possible(prepared, plan, settings):
-        return True
-    # Light without a vertex in between: see `messages.warn_of_missing_direct`.
-    unsampled = () if plan.arrival else unsampled_paths(prepared, plan, settings)
-    return any(Start.DIRECT_DELTA_EMITTER not in paths.starts for paths in unsampled)
+    beams = prepared.emitters.beams and not plan.splat
+    never = not plan.arrival and (_has_sds_paths(prepared) or beams)
+    return never or is_undersampling_possible(prepared, plan, settings)
 
 
 def is_undersampling_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether near-specular lobes, or a sensor that light subpaths must hit, may leave light undersampled."""
     narrow = prepared.narrowest >= NARROW and prepared.has_small_emitter
-    return settings.max_depth >= SHORTEST and (narrow or _is_left_to_arrival(prepared, plan))
+    by_arrival = plan.arrival and _has_sds_paths(prepared)
+    return settings.max_depth >= SHORTEST and (narrow or by_arrival)
 
 
-def _is_left_to_arrival(prepared: PreparedScene, plan: Plan) -> bool:
-    """Whether t = 0 alone samples SDS paths."""
-    emitters = prepared.emitters
-    return plan.arrival and prepared.delta and bool(emitters.unhittable or emitters.beams)
+def _has_sds_paths(prepared: PreparedScene) -> bool:
+    """Whether there are SDS paths that s = 0 does not sample: t = 0 alone may."""
+    return prepared.delta and prepared.emitters.unhittable
 
 
 def estimate(
@@ -213,8 +210,9 @@ def estimate(
         seen, others = (
             [s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene))
         )
-        shapes = seen or (shapes if _is_left_to_arrival(prepared, plan) else others)
-    return UnsampledLight(colours, _names(shapes), float(never / size), float(few / size))
+        shapes = seen or (shapes if _has_sds_paths(prepared) else others)
+    objects = tuple(dict.fromkeys(f"shape {named(shape)}" for shape in shapes))
+    return UnsampledLight(colours, objects, float(never / size), float(few / size))
 
 
 def _subpaths(prepared: PreparedScene, samples: int) -> int:
@@ -242,16 +240,3 @@ def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
     amounts = np.bincount(shapes, np.where(np.isfinite(found), found, 0))
     order = [i for i in np.argsort(-amounts) if i and amounts[i] > WARN_SHARE * amounts.sum()]
     return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0] for i in order[:NAMED]]
-
-
-def _names(shapes: Iterable[mi.Shape]) -> tuple[str, ...]:
-    """Names of the ``shapes``, once each."""
-    return tuple(dict.fromkeys(map(_name, shapes)))
-
-
-def _name(shape: mi.Shape) -> str:
-    """Name a shape by its id, else by that of its BSDF: Mitsuba merges the meshes of a BSDF."""
-    bsdf = shape.bsdf()
-    if bsdf is not None and given_id(bsdf) and not given_id(shape):
-        return f"shape with BSDF {named(bsdf)}"
-    return f"shape {named(shape)}"

@@ -10,7 +10,7 @@ import mitsuba as mi
 from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.notices import warn_once
-from ..planning.possible import Rest, unsampled_paths
+from ..planning.possible import unsampled_at_sensor
 from ..planning.unsampled_light import WARN_SHARE, Missing
 from ..scene.diagnostics import NAMED, not_finite, spoilt
 from ..sensors.checks import called
@@ -82,13 +82,12 @@ def warn_of_missing_direct(prepared, plan, settings):
     """
     if isinstance(prepared.camera.sensor, mi.ProjectiveCamera):
         return
-    for paths in unsampled_paths(prepared, plan, settings):
-        if paths.rest is Rest.SENSOR:
-            text = (
-                f"bdpt: not sampled: {paths}: light on {called(prepared.camera.sensor)} itself is "
-                "missing; leave light_paths at auto, render views of a batch one by one, or use an area light"
-            )
-            warn_once(prepared.scene, prepared.camera.sensor, text)
+    for paths in unsampled_at_sensor(prepared, plan, settings):
+        text = (
+            f"bdpt: not sampled: {paths}: light on {called(prepared.camera.sensor)} itself is missing; leave "
+            "light_paths at auto, render views of a batch one by one, or use an area light"
+        )
+        warn_once(prepared.scene, prepared.camera.sensor, text)
 
 
 def warn_of_non_finite(statistics: dict, scene):

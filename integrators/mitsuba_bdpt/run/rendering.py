@@ -76,7 +76,7 @@ class Render:
 
     ``prepared``: the scene; ``planner``: decides the ``plan`` of the ``kernel``; ``points``: random numbers
     of the passes; ``accumulator``: sums of the image; ``meter``: counts of work and times; ``why_merged``:
-    why it merges, or empty; ``skipped``: what it leaves out beside its plan. Renders with ``merging=auto`` do
+    why it merges, or empty. Renders with ``merging=auto`` do
     not merge, see `decided`. ``part``: see `BDPTIntegrator.part`; ``like``: see `_like`.
     """
 
@@ -97,7 +97,7 @@ class Render:
         self.meter, self.part = Meter(), 0
         self._is_open = settings.merging == "auto"
         settings = replace(settings, merging=settings.merging is True)
-        self.why_merged, self.skipped = "merging=true" if settings.merging else "", ()
+        self.why_merged = "merging=true" if settings.merging else ""
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = like.prepared if like else PreparedScene(scene, sensor)
         messages.warn_of_light_groups(scene, sensor, self.light_groups)
@@ -193,7 +193,7 @@ class Render:
         return Render(self.prepared.scene, self.sensor, settings, seed, spp, self)
 
     def _why_to_merge(self) -> str:
-        """Why this render has to merge; empty, with an entry of `skipped`, if it does not."""
+        """Why this render has to merge; empty, and noted as left out, if it does not."""
         missing = self.missing()
         if missing is None:
             return ""
@@ -203,7 +203,9 @@ class Render:
         if missing.share < WARN_SHARE:
             level, why = NOT_WORTH, f"the other strategies lack {missing.share:.2%} of the image's light"
         if why:
-            self.skipped = ({"class": "merging", "level": level, "why": why},)
+            decided = self.planner.decided
+            left_out = (*decided.left_out, {"class": "merging", "level": level, "why": why})
+            self.planner.decided = replace(decided, left_out=left_out)
             return ""
         return f"without it {missing.cause}"
 
@@ -338,8 +340,8 @@ class Render:
         The state is consistent even if an interruption comes while the next pass is recorded.
         """
         passes, arrays = self.accumulator.store()
-        state = self._small_first, self.why_merged, self.skipped
-        progress = Progress(self.planner.decided, self.meter.work, self.accumulator.halves, *state)
+        state = self.accumulator.halves, self._small_first, self.why_merged
+        progress = Progress(self.planner.decided, self.meter.work, *state)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
@@ -383,8 +385,7 @@ class Render:
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
         self.accumulator.restore(snapshot.passes, arrays, progress.halves)
         self.meter.resume(progress.work, snapshot.spp)
-        self._small_first = progress.small_first
-        self.why_merged, self.skipped = progress.why_merged, progress.skipped
+        self._small_first, self.why_merged = progress.small_first, progress.why_merged
 
     def unsampled_light(self) -> dict[int, float]:
         """Return shares of the image's light that are not sampled, by index in ``scene.emitters()``.

@@ -27,7 +27,7 @@ class Progress:
 
     ``decided``: decisions so far; ``work``: counts; ``halves``: those of the replicates, ``None`` without
     `variance` (see `image.replicates`); ``small_first``: whether the first pass has one sample per pixel,
-    ``None`` if not yet known; ``why_merged`` and ``skipped``: see `Render`; ``whole``: whether a render can
+    ``None`` if not yet known; ``why_merged``: see `Render`; ``whole``: whether a render can
     continue from it; ``scene``: optional digest of the scene's files.
     """
 
@@ -36,7 +36,6 @@ class Progress:
     halves: tuple[Spread, ...] | None = None
     small_first: bool | None = None
     why_merged: str = ""
-    skipped: tuple[dict[str, str], ...] = ()
     whole: bool = True
     scene: str | None = None
 
@@ -72,7 +71,7 @@ class Progress:
         """Inverse of `stored`; removes its arrays from ``arrays``."""
         values = dict(values)
         values["decisions"] = tuple(map(Decision.read, values["decisions"]))
-        values |= {name: tuple(values[name]) for name in ("left_out", "skipped")}
+        values["left_out"] = tuple(values["left_out"])
         replicates, values["halves"] = values.pop("replicates"), None
         if replicates is not None:
             values["halves"] = tuple(
@@ -103,7 +102,7 @@ def _arrays(arrays: dict, name: str) -> dict:
 
 
 # Version of the stored format; increase with every change.
-FORMAT = 10
+FORMAT = 11
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:

@@ -189,7 +189,7 @@ def statistics(render) -> Statistics:
         "rays": rays(render),
         "connections": connections,
         "unbiased": not render.plan.merging,
-        "skipped": [dict(left_out) for left_out in (*render.plan.skipped, *render.skipped)],
+        "skipped": [dict(left_out) for left_out in (*planner.full.skipped, *decided.left_out)],
         "decisions": [decision.record() for decision in decided.decisions],
         "no_pilot": decided.no_pilot,
         "pilots": {name: int(decided.pilot == name) for name in ("rendered", "cached")},

@@ -26,7 +26,7 @@ from ...host.introspection import grouped_shapes, is_instance
 MOST_SPHERES = 8
 
 # Largest ratio of maximum to mean radiance of an environment that emits no photons: light that s = 0 does not
-# find by itself must be brighter. (`budget.EVEN` is of light subpaths, `candidates.UNIFORM` of weights.)
+# find by itself must be brighter. (`budget.EVEN` is of light subpaths, `configuration.UNIFORM` of weights.)
 EVEN_SKY = 16
 
 # Relative enlargement of the spheres, for rounding.
