@@ -924,15 +924,15 @@ MUTANTS = (
     Mutant(
         "media: the near side's medium where a connection starts",
         "media/space.py",
-        "vertex.si.target_medium(d)",
-        "vertex.si.target_medium(-d)",
+        "self.media.beyond(vertex.si, d, vertex.medium)",
+        "self.media.beyond(vertex.si, -d, vertex.medium)",
         ("tests/images/test_media_identities.py::test_joins_start_on_the_right_side_of_a_boundary",),
     ),
     Mutant(
         "media: the near side's medium beyond a null surface",
         "media/transmittance.py",
-        "si.target_medium(ray.d)",
-        "si.target_medium(-ray.d)",
+        "media.beyond(si, ray.d, medium)",
+        "media.beyond(si, -ray.d, medium)",
         ("tests/images/test_media_known_answers.py::test_fog_between_a_lamp_and_a_matte_wall[gray-camera]",),
     ),
     Mutant(
@@ -991,8 +991,8 @@ MUTANTS = (
     Mutant(
         "media: one channel's density",
         "media/flight.py",
-        "mean = dr.mean(edge.ratio * densities)",
-        "mean = at(edge.ratio * densities, edge.channel)",
+        "mean = dr.mean(densities)",
+        "mean = sum(dr.select(self.channel == i, x, 0) for i, x in enumerate(densities))",
         ("tests/images/test_media_identities.py::test_flights_by_all_channels",),
     ),
     Mutant(
@@ -1026,7 +1026,7 @@ MUTANTS = (
     Mutant(
         "media: lamps start outside",
         "media/light_media.py",
-        "dr.select(met.found, met.number, unless_found)",
+        "dr.select(found, near, unless_found)",
         "unless_found",
         ("tests/images/test_media.py::test_unweighted_strategies_agree[lamp in milk]",),
     ),
@@ -1040,8 +1040,8 @@ MUTANTS = (
     Mutant(
         "media: grids have no end",
         "media/tracking.py",
-        "return low, high, active & meets & (low < high)",
-        "return low * 0, end, active",
+        "inside = active & meets & (low < high)",
+        "low, high, inside = low * 0, mi.Float(end), active",
         ("tests/images/test_media_identities.py::test_nothing_is_lost_outside_of_a_dense_grid",),
     ),
     Mutant(
@@ -1176,16 +1176,16 @@ MUTANTS = (
     ),
     Mutant(
         "media: rays of lamps leave through walls",
-        "media/boundaries.py",
-        "opaque = hit & ~bounds & ~_transmits(si)",
+        "media/light_media.py",
+        "opaque = hit & ~bounds & ~transmits",
         "opaque = mi.Bool(False)",
         ("tests/images/test_media_boundaries.py::test_fog_between_opaque_walls[each-plain-apart]",),
     ),
     Mutant(
         "media: objects are told apart",
         "media/equal.py",
-        "if keys[i] == key",
-        "if False",
+        "return keys[i] == keys[j] and",
+        "return False and",
         (
             "tests/images/test_media_boundaries.py::test_fog_between_opaque_walls[each-tagged-apart]",
             "tests/images/test_media_boundaries.py::test_media_are_told_apart_by_what_they_are[llvm_ad_rgb]",
@@ -1435,9 +1435,9 @@ MUTANTS = (
     ),
     Mutant(
         "merging: merges without their coefficient in the sums of subpaths",
-        "merging/merging.py",
-        "mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), None)",
-        "mis.Merge(kernel.heuristic.start(self.eta(vertex.si.p)), None)",
+        "transport/walk.py",
+        "mis.Merge(strategy.ratio(kernel, vertex.si.p), None, rival)",
+        "mis.Merge(strategy.ratio(kernel, vertex.si.p) / strategy.kappa, None, rival)",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-odd-True-1.0]",),
     ),
     Mutant(

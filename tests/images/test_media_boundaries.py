@@ -14,9 +14,9 @@ import pytest
 import scene_parts
 import variants
 from mitsuba_bdpt.geometry import rays
-from mitsuba_bdpt.media import boundaries
 from mitsuba_bdpt.media.equal import representatives
-from mitsuba_bdpt.media.media import _answers
+from mitsuba_bdpt.media.media import Look
+from mitsuba_bdpt.media.transmittance import through_surfaces
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport.inputs import Shared
 from test_media_edges import ALL, CAMERA, assert_agree, means
@@ -105,7 +105,7 @@ def test_fog_between_opaque_walls(medium, tagged, optimize):
     for lamp in (None, {}, up):
         scene = box(medium, (lambda: {"exterior": medium()}) if tagged else None, lamp, optimize=optimize)
         media, light = prepared(scene)
-        assert (len(media.objects), light.contradiction, light.outside) == (1, "", 0)
+        assert (len(media.looks), light.contradiction, light.outside) == (1, "", 0)
         assert (starts(scene) != 1).mean() < 5e-3  # rays that stay between the lamp and the ceiling
 
 
@@ -190,7 +190,7 @@ def test_a_lamp_in_a_room_seen_from_outside():
     lamp, eye = parts.lamp(center=[2, 1, 2], radius=0.5), parts.sensor(origin=(0, 5.1, 0.01), near=1e-3)
     _, light = prepared(windowed(0.75, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0])))
     light.settle()
-    assert (light.contradiction, sorted(light._front), light._any_asked) == ("", [0, 1], False)
+    assert (light.contradiction, sorted(light._starts[:, 0]), light._any_asked) == ("", [0, 1], False)
 
 
 def test_light_from_infinity_over_an_open_sea():
@@ -282,14 +282,14 @@ def test_media_are_told_apart_by_what_they_are(variant):
     mi.set_variant(variant)
     for name, (one, other, equal) in PAIRS.items():
         media = [mi.load_dict(fog(0.1)), mi.load_dict(one()), mi.load_dict(other())]
-        assert representatives(media, _answers) == [0, 1, 1 if equal else 2], name
+        assert representatives([Look(m) for m in media]) == [0, 1, 1 if equal else 2], name
 
 
 def test_media_that_hold_one_grid():
     """As above. Expected: two media that hold the same volume are equal, if all else is."""
     volume = mi.load_dict(grid()["sigma_t"])
     media = [mi.load_dict(grid(scale=scale) | {"sigma_t": volume}) for scale in (3.0, 3.0, 2.9)]
-    assert representatives(media, _answers) == [0, 0, 2]
+    assert representatives([Look(m) for m in media]) == [0, 0, 2]
 
 
 def test_media_of_python_are_equal_to_themselves_only():
@@ -302,7 +302,7 @@ def test_media_of_python_are_equal_to_themselves_only():
         fog() | {"phase": {"type": "own_phase", "a": 0.3}},
     )
     for medium in own:
-        assert representatives([mi.load_dict(medium) for _ in range(2)], _answers) == [0, 1]
+        assert representatives([Look(mi.load_dict(medium)) for _ in range(2)]) == [0, 1]
 
 
 # -- connections: the medium that a shadow ray arrives in at a lamp -------------------------------------
@@ -371,7 +371,7 @@ def test_shadow_rays_arrive_in_the_medium_that_light_starts_in(name):
     u = rng.random((8, count))
     ray, _ = scene.sensors()[0].sample_ray(0, 0.5, mi.Point2f(u[:2]), mi.Point2f(u[2:4]))
     ray = mi.Ray3f(ray.o, ray.d, mi.Float(4 * u[4]), 0, ray.wavelengths)
-    number, seen = boundaries.behind(found.space, ray, mi.UInt32(found.space.media.sensor))
+    seen = through_surfaces(found.space, ray, found.space.media.sensor, mi.Bool(True))
     q = rays.free_anchor(ray(ray.maxt))
     shared = Shared(mi.Float(0), ray.wavelengths, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     e = found.emitters.sample_emission(mi.Point2f(u[5:7]), mi.Point2f(u[[7, 0]]), shared, mi.Bool(True))
@@ -380,8 +380,8 @@ def test_shadow_rays_arrive_in_the_medium_that_light_starts_in(name):
     emits = e.infinite | (dr.squared_norm(e.anchor.n) == 0)
     emits |= dr.dot(e.anchor.n, d) * dr.dot(e.anchor.n, e.d) > 0
     shadow = mi.Ray3f(q.p, -d, dr.select(e.infinite, dr.inf, shadow.maxt), 0, ray.wavelengths)
-    arrives, clear = boundaries.behind(found.space, shadow, number)
-    connected = np.array(seen & clear & emits)
-    wrong = np.array(arrives != found.light_media.at(replace(e, d=d)))
+    arrives = through_surfaces(found.space, shadow, seen.medium, mi.Bool(True))
+    connected = np.array(seen.clear & arrives.clear & emits)
+    wrong = np.array(arrives.medium != found.light_media.at(replace(e, d=d)))
     assert connected.sum() > count / 50
     assert wrong[connected].mean() < 1e-3

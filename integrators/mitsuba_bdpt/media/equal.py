@@ -6,39 +6,36 @@ declares a medium.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
-from functools import cache
+from collections.abc import Hashable, Iterator
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from ..host.introspection import children, own_parameters
 
+if TYPE_CHECKING:
+    from .media import Look
+
 # Relative difference due to rounding (sigma_t 0.4 with scale 2, and 0.8).
 _ROUNDING = 1e-5
 
 
-def representatives(media: list[mi.Medium], answers: Callable[[mi.Medium], np.ndarray]) -> list[int]:
-    """Return for each of ``media`` the index of the first one that is equal to it.
-
-    ``answers(medium)``: extinction, scattering and phase function at random points and directions.
+def representatives(looks: list[Look]) -> list[int]:
+    """Return for the medium of each of ``looks`` the index of the first one that is equal to it.
 
     Equal media have the same classes and parameters, and the same answers up to rounding. Constants count by
     the answers alone, since only their product matters. Varying volumes and plugins in Python equal only
     themselves: Mitsuba exposes neither a grid's filter nor its wrap mode.
     """
-    keys = [(medium.use_emitter_sampling(), *_key(medium)) for medium in media]
-    answered = cache(lambda index: answers(media[index]))
-    found: list[int] = []
-    for index, key in enumerate(keys):
-        equal = (
-            i
-            for i in range(index)
-            if keys[i] == key
-            and np.allclose(answered(i), answered(index), rtol=_ROUNDING, atol=0, equal_nan=True)
+    keys = [(look.medium.use_emitter_sampling(), *_key(look.medium)) for look in looks]
+
+    def are_equal(i: int, j: int) -> bool:
+        return keys[i] == keys[j] and np.allclose(
+            looks[i].answers, looks[j].answers, rtol=_ROUNDING, atol=0, equal_nan=True
         )
-        found.append(next(equal, index))
-    return found
+
+    return [next((j for j in range(i) if are_equal(j, i)), i) for i in range(len(looks))]
 
 
 def _key(owner: mi.Object) -> Iterator[Hashable]:

@@ -12,7 +12,7 @@ from ..geometry import polarization, rays
 from ..sampling.points import Purpose
 from ..transport.vacuum import Arrival
 from . import tracking
-from .media import Media, coefficients, depth_of, interaction, of_depth
+from .media import OTHER_LOBES, Media, coefficients, depth_of, interaction, of_depth
 
 if TYPE_CHECKING:
     from ..sampling.points import Stream
@@ -47,14 +47,22 @@ class Edge:
 
     def weight_transmittance(self, further: mi.Float | mi.UnpolarizedSpectrum | int = 0):
         """T~ of the edge so far, and of a ``further`` optical depth."""
-        return of_depth(self.depth if isinstance(further, int) else self.depth + further)
+        return of_depth(self.depth + further)
 
     def without_collision(self, throughput: mi.Spectrum, depth) -> mi.Spectrum:
-        """Throughput after homogeneous ``depth`` without collision; see `_weighted`."""
-        if self.ratio is None:
-            return throughput
+        """Throughput after homogeneous ``depth`` without collision."""
+        return throughput if self.ratio is None else polarization.scaled(throughput, self.flown(depth)[0])
+
+    def flown(self, depth, sigma_s=1, sigma_t=1) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
+        """Estimate f / p after homogeneous ``depth`` in a chromatic medium, and `ratio`.
+
+        The coefficients are those of a collision there, if any. The densities of all channels count: the
+        balance heuristic over the sampled channel (A. Wilkie et al. 2014).
+        """
         transmittance = dr.exp(-depth)
-        return polarization.scaled(throughput, transmittance / dr.mean(self.ratio * transmittance))
+        densities = self.ratio * (sigma_t * transmittance)
+        mean = dr.mean(densities)
+        return sigma_s * transmittance / mean, densities / mean
 
 
 @dataclass
@@ -73,18 +81,14 @@ class Landing:
     throughput: mi.Spectrum
 
 
-def choose_channel(u: mi.Float) -> mi.UInt32:
-    count = len(mi.UnpolarizedSpectrum(0))
-    return dr.minimum(mi.UInt32(u * count), count - 1)
-
-
-def begin(space: Space, kernel: Kernel, side: str, stream: Stream, medium: mi.UInt32, ray: mi.Ray3f) -> Edge:
-    """First edge of a subpath along ``ray`` from ``medium``; ``side`` and ``stream``: its random numbers."""
+def begin(space: Space, kernel: Kernel, side: str, stream: Stream, ray: mi.Ray3f, emission=None) -> Edge:
     media, points = space.media, kernel.points
+    medium = kernel.sensor_medium if emission is None else kernel.light_media.at(emission)
     channel = ratio = None
     if not media.gray:
-        channel = choose_channel(points.draw_1d(side, stream, Purpose.CHANNEL))
         ratio = mi.UnpolarizedSpectrum(1)
+        u = points.draw_1d(side, stream, Purpose.CHANNEL)
+        channel = dr.minimum(mi.UInt32(u * len(ratio)), len(ratio) - 1)
     return Edge(
         medium=mi.UInt32(medium),
         maxt=mi.Float(ray.maxt),
@@ -128,7 +132,7 @@ def depart(
     space: Space, kernel: Kernel, side: Side, vertex: Vertex, passes: mi.Bool, ray: mi.Ray3f
 ) -> tuple[Edge, mi.Ray3f]:
     """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
-    before, lit = vertex.edge, space.allows_next_event(vertex)
+    before = vertex.edge
     u = kernel.points.draw_1d(side.name, side.stream, Purpose.FLIGHT, vertex.event + 1)
     edge = replace(
         before,
@@ -137,7 +141,7 @@ def depart(
         depth=dr.select(passes, before.depth, 0),
         rest=dr.select(passes, before.rest, tracking.exponential(u)),
         event=before.event + 1,
-        lit=None if lit is None else dr.select(passes, before.lit, lit),
+        lit=None if before.lit is None else dr.select(passes, before.lit, space.allows_next_event(vertex)),
         rays=before.rays + 1,
     )
     return edge, mi.Ray3f(ray.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
@@ -150,7 +154,7 @@ def _swallowed(media: Media, ray, landing: Landing, active) -> Landing:
     """
     number = landing.edge.medium
     endless = active & ~landing.collided & ~landing.pi.is_valid() & media.is_homogeneous(number)
-    dark = endless & (mi.UnpolarizedSpectrum(media.extinction(number, ray.d, ray, endless)) > 0)
+    dark = endless & (mi.UnpolarizedSpectrum(media.extinction(number, ray, endless)) > 0)
     return replace(landing, throughput=polarization.darkened(landing.throughput, dark))
 
 
@@ -174,26 +178,22 @@ def _segment(media: Media, ray, landing: Landing, word, active):
     throughput = landing.throughput
     if media.grids:
         grid = active & (edge.medium != 0) & ~media.is_homogeneous(edge.medium)
-        found = tracking.delta(media, edge.medium, segment, end, edge.rest, throughput, word, grid)
-        t = dr.select(grid, found.t, t)
-        depth, rest = dr.select(grid, found.depth, depth), dr.select(grid, found.rest, rest)
-        throughput, word = found.throughput, found.word
-        before = 0 if edge.collisions is None else edge.collisions
-        edge = replace(edge, collisions=before + found.collisions)
+        *found, throughput, word, collisions = tracking.delta(
+            media, edge.medium, segment, end, edge.rest, throughput, word, grid
+        )
+        t, depth, rest = dr.select(grid, tuple(found), (t, depth, rest))
+        edge = replace(edge, collisions=collisions + edge.collisions)
     collided = active & (t < end)
     edge = replace(edge, depth=edge.depth + depth, rest=rest)
     throughput, edge = _weighted(media, segment, t, collided, throughput, edge, depth, active)
-    return (
-        si,
-        replace(landing, t=dr.minimum(t, end), collided=collided, edge=edge, throughput=throughput),
-        word,
-    )
+    t = dr.minimum(t, end)
+    return si, replace(landing, t=t, collided=collided, edge=edge, throughput=throughput), word
 
 
 def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     """Distance of the collision (infinite if none), optical depths travelled and left."""
-    sigma = media.extinction(edge.medium, ray.d, ray, active)
-    own = sigma if media.gray else at(sigma, edge.channel)
+    sigma = media.extinction(edge.medium, ray, active)
+    own = sigma if media.gray else sum(dr.select(edge.channel == i, s, 0) for i, s in enumerate(sigma))
     t = edge.rest / own
     collides = t < end  # NaN or infinite in vacuum
     travelled = dr.select(collides, t, end)
@@ -202,18 +202,10 @@ def _through_homogeneous(media: Media, ray, edge: Edge, end, active):
     return dr.select(collides, t, dr.inf), depth, rest
 
 
-def at(spectrum: mi.UnpolarizedSpectrum, channel: mi.UInt32):
-    value = spectrum[0]
-    for i in range(1, len(spectrum)):
-        value = dr.select(channel == i, spectrum[i], value)
-    return value
-
-
 def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, active):
     """Throughput and edge after a segment with a collision at ``t``, or none.
 
-    In gray media all but the albedo cancels. In chromatic media the densities of all channels count: the
-    balance heuristic over the sampled channel (A. Wilkie et al. 2014).
+    In gray media, and grids, all but the albedo cancels.
     """
     if media.gray and not media.scatters:
         return dr.select(collided, 0, throughput), edge
@@ -223,12 +215,9 @@ def _weighted(media: Media, ray, t, collided, throughput, edge: Edge, depth, act
     if media.gray:
         return dr.select(collided, polarization.scaled(throughput, albedo), throughput), edge
     homogeneous = media.is_homogeneous(edge.medium) & active
-    transmittance = dr.exp(-depth)
-    densities = dr.select(collided, sigma_t, 1) * transmittance
-    mean = dr.mean(edge.ratio * densities)
-    estimate = dr.select(collided, sigma_s, 1) * transmittance / mean
+    estimate, ratio = edge.flown(depth, dr.select(collided, sigma_s, 1), dr.select(collided, sigma_t, 1))
     estimate = dr.select(homogeneous, estimate, dr.select(collided, albedo, 1))
-    ratio = dr.select(homogeneous, edge.ratio * densities / mean, edge.ratio)
+    ratio = dr.select(homogeneous, ratio, edge.ratio)
     return polarization.scaled(throughput, estimate), replace(edge, ratio=ratio)
 
 
@@ -241,7 +230,8 @@ def _passes(media: Media, si, hidden) -> mi.Bool:
     emits = si.shape.emitter() != dr.zeros(mi.EmitterPtr)
     passes = mi.Bool(False)
     if media.see_through:
-        passes = si.is_valid() & media.is_null(si) & ~emits & ~si.is_sensor()
+        null = (si.bsdf().flags() & mi.UInt32(OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(mi.BSDFFlags.Null)
+        passes = si.is_valid() & null & ~emits & ~si.is_sensor()
     if hidden is not None:
         passes |= si.is_valid() & emits & hidden
     return passes
@@ -249,18 +239,11 @@ def _passes(media: Media, si, hidden) -> mi.Bool:
 
 def _onwards(space: Space, ray, si, landing: Landing, going) -> Landing:
     """Continue on the other side of the surface ``si`` where ``going``."""
-    edge, media = landing.edge, space.media
+    edge = landing.edge
     segment = mi.Ray3f(landing.o, ray.d, edge.maxt, ray.time, ray.wavelengths)
     onwards = rays.passed(segment, si, space.shape_errors)
-    beyond = media.number(si.target_medium(ray.d))
-    crossed = replace(
-        edge,
-        medium=dr.select(si.is_medium_transition(), beyond, edge.medium),
-        maxt=edge.maxt - onwards,
-        rays=edge.rays + 1,
-    )
-    o = mi.Point3f(segment(onwards))
-    onward = mi.Ray3f(o, ray.d, crossed.maxt, ray.time, ray.wavelengths)
+    onward = mi.Ray3f(segment(onwards), ray.d, edge.maxt - onwards, ray.time, ray.wavelengths)
     pi = space.scene.ray_intersect_preliminary(onward, coherent=False, active=going)
-    passed = replace(landing, o=o, pi=pi, edge=crossed)
-    return dr.select(going, passed, landing)
+    beyond = space.media.beyond(si, ray.d, edge.medium)
+    edge = replace(edge, medium=beyond, maxt=mi.Float(onward.maxt), rays=edge.rays + 1)
+    return dr.select(going, replace(landing, o=mi.Point3f(onward.o), pi=pi, edge=edge), landing)

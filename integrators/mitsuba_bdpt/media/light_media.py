@@ -7,7 +7,6 @@ surrounds the scene. Kernels trace it only for emitters whose rays start in seve
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 
 import drjit as dr
@@ -18,11 +17,12 @@ from ..emitters.emitters import Emitters
 from ..geometry import rays
 from ..geometry.boxes import known_box, points_in, scene_box
 from ..geometry.directions import random_directions
+from ..host import renamed
 from ..host.introspection import is_instance, named
 from ..transport.inputs import Shared
-from . import boundaries
 from .phase import asymmetry
 from .space import Space
+from .transmittance import through_surfaces
 
 # Rays around the sensor, lines from outside of the scene, rays that may end at the far plane.
 _AROUND, _LINES, _CAMERA_RAYS = 64, 1 << 12, 1 << 12
@@ -38,6 +38,9 @@ _TOLERATED = 0.01
 
 # Largest mean relative difference of sigma_t rho and its reverse due to rounding.
 _SYMMETRIC = 1e-3
+
+# Most reflections at opaque surfaces; among walls without a boundary a ray would never end.
+_REFLECTIONS = 64
 
 
 class LightMedia:
@@ -55,32 +58,33 @@ class LightMedia:
         self.outside = outside = _outside(space, around, lines)
         self._outside = dr.opaque(mi.UInt32, outside)
         # An endless homogeneous medium absorbs all light from infinity.
-        endless = space.media.objects[outside - 1] if outside else None
-        self.hides_infinity = (
-            endless is not None and endless.is_homogeneous() and space.media.looks[outside - 1].least > 0
-        )
+        endless = space.media.looks[outside - 1] if outside else None
+        self.hides_infinity = endless is not None and endless.homogeneous and endless.least > 0
         self.contradiction = (
             _contradiction_of_sensor(space, sensor, around)
             or _contradiction_of_phases(space)
             or (_contradiction_at_infinity(space, outside, lines) if emitters.at_infinity else "")
             or _contradiction_at_far_plane(space, sensor, 0 if far == outside else far)
         )
-        shapes = [emitter.get_shape() for emitter in emitters.objects]
-        declared = [shape is not None and shape.is_medium_transition() for shape in shapes]
-        number_of, bounds = space.media.number_of, list(zip(shapes, declared, strict=True))
-        unknown = space.media.sensor if lines is not None else outside
-        front = [number_of(shape.exterior_medium()) if known else unknown for shape, known in bounds]
-        back = [number_of(shape.interior_medium()) if known else unknown for shape, known in bounds]
-        self._front, self._back = mi.UInt32(front or [0]), mi.UInt32(back or [0])
-        infinite = (mi.has_flag(e.flags(), mi.EmitterFlags.Infinite) for e in emitters.objects)
-        chosen = (emitter.sampling_weight() > 0 for emitter in emitters.objects)
-        bounded = lines is not None  # else all is in one medium
-        asked = [
-            bounded and may and not (known or away)
-            for known, away, may in zip(declared, infinite, chosen, strict=True)
-        ]
-        self._settled, self._any_asked, self._asked = False, any(asked), mi.Bool(asked or [False])
-        dr.make_opaque(self._front, self._back, self._asked)
+        number_of, bounded = space.media.number_of, lines is not None  # else all is in one medium
+
+        def start(emitter: mi.Emitter) -> tuple[int, int, bool]:
+            """Its medium in front and at the back, and whether rays decide instead."""
+            shape = emitter.get_shape()
+            if shape is not None and shape.is_medium_transition():
+                return number_of(shape.exterior_medium()), number_of(shape.interior_medium()), False
+            infinite = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
+            unknown = space.media.sensor if bounded else outside
+            return unknown, unknown, bounded and not infinite and emitter.sampling_weight() > 0
+
+        self._settled = False
+        self._tabulate(np.array([start(emitter) for emitter in emitters.objects] or [(0, 0, False)]))
+
+    def _tabulate(self, starts: np.ndarray):
+        """Store the results of `start`, one row per emitter."""
+        self._starts, self._any_asked = starts, bool(starts[:, 2].any())
+        self._sides, self._asked = mi.UInt32(starts[:, :2].ravel()), mi.Bool(starts[:, 2] != 0)
+        dr.make_opaque(self._sides, self._asked)
 
     def settle(self):
         """Find the emitters whose emissions all start in one medium; to be called before `at` is recorded."""
@@ -91,19 +95,14 @@ class LightMedia:
         wavelengths = dr.zeros(mi.UnpolarizedSpectrum, u.shape[1]) + 550 if mi.is_spectral else mi.Color0f()
         shared = Shared(mi.Float(0), wavelengths, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), shared, mi.Bool(True))
-        number, known = self._traced(e)
-        dr.eval(number, known, e.index)  # one kernel
-        known = np.broadcast_to(np.array(known), u.shape[1])
-        index, number = (np.broadcast_to(np.array(x), u.shape[1])[known] for x in (e.index, number))
-        media = len(self._space.media.objects) + 1
-        found = np.bincount(index * media + number, minlength=count * media).reshape(count, media)
-        front, back, asked = (np.array(table) for table in (self._front, self._back, self._asked))
-        total, told = found.sum(axis=1), asked & found.any(axis=1)
-        front[told] = back[told] = found.argmax(axis=1)[told]
-        asked &= (total < _FEWEST) | (found.max(axis=1) < total)
-        self._front, self._back, self._asked = mi.UInt32(front), mi.UInt32(back), mi.Bool(asked)
-        self._any_asked = bool(asked.any())
-        dr.make_opaque(self._front, self._back, self._asked)
+        number, known, index = _arrays(u.shape[1], *self._traced(e), e.index)
+        media = len(self._space.media.looks) + 1
+        found = np.bincount((index * media + number)[known], minlength=count * media).reshape(count, media)
+        starts, total, most = self._starts.copy(), found.sum(axis=1), found.max(axis=1)
+        told = (starts[:, 2] != 0) & (total > 0)
+        starts[told, :2] = found.argmax(axis=1)[told, None]
+        starts[told & (total >= _FEWEST) & (most == total), 2] = False
+        self._tabulate(starts)
 
     def at(self, e) -> mi.UInt32:
         """Number of the medium in which the first ray of an `emitters.Emission` starts.
@@ -118,24 +117,71 @@ class LightMedia:
         """The medium of an emission, and whether it is known."""
         known = mi.Bool(True)
         outwards = dr.dot(e.anchor.n, e.d) >= 0
-        number = dr.select(
-            outwards, dr.gather(mi.UInt32, self._front, e.index), dr.gather(mi.UInt32, self._back, e.index)
-        )
+        number = dr.gather(mi.UInt32, self._sides, 2 * e.index + dr.select(outwards, mi.UInt32(0), 1))
         if self._any_asked:
             asked = dr.gather(mi.Bool, self._asked, e.index)
-            met = boundaries.near_side(self._space, mi.Ray3f(e.anchor.towards(e.d), e.d), asked)
-            known = ~asked | met.found | met.escaped
-            unless_found = dr.select(met.escaped, self._outside, number)
-            number = dr.select(asked, dr.select(met.found, met.number, unless_found), number)
+            ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
+            near, found, escaped = near_side(self._space, ray, asked)
+            known = ~asked | found | escaped
+            unless_found = dr.select(escaped, self._outside, number)
+            number = dr.select(asked, dr.select(found, near, unless_found), number)
         return dr.select(e.infinite, self._outside, number), known
 
 
-def _near_sides(space: Space, ray: mi.Ray3f) -> boundaries.NearSide:
-    """Near sides of rays as NumPy arrays."""
-    side, count = boundaries.near_side(space, ray, mi.Bool(True)), dr.width(ray.o)
-    dr.eval(side)  # one kernel
-    parts = (getattr(side, part.name) for part in dataclasses.fields(side))
-    return boundaries.NearSide(*(np.broadcast_to(np.array(part), count) for part in parts))
+@dr.syntax
+def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool, mi.Bool]:
+    """Find the first boundary along ``ray`` whose near side light may leave.
+
+    Returns the number of the medium before it, and two masks: it was found; the ray left the scene without
+    meeting one. Neither holds for a ray that stays among opaque surfaces.
+
+    Scenes leave other sides undeclared, such as that within a wall or at the back of a light. Rays pass
+    straight through such sides and surfaces that bound no medium if they transmit. Opaque ones reflect the
+    ray as a mirror, so that it stays where light can go.
+    """
+    o, d, number = mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.UInt32(0)
+    found, escaped, reflections = mi.Bool(False), mi.Bool(False), mi.UInt32(0)
+    going = mi.Bool(active)
+    while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
+        segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
+        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
+        hit = going & si.is_valid()
+        bounds = hit & si.is_medium_transition() & _may_leave(si, -d)
+        number = dr.select(bounds, space.media.number(si.target_medium(-d)), number)
+        found |= bounds
+        escaped |= going & ~hit
+        transmits = (si.bsdf().flags() & int(mi.BSDFFlags.Transmission)) != 0
+        opaque = hit & ~bounds & ~transmits
+        d = dr.select(opaque, d - si.n * (2 * dr.dot(d, si.n)), d)
+        straight = segment(rays.passed(segment, si, space.shape_errors))
+        mirrored = rays.surface_anchor(si, segment, space.shape_errors).towards(d)
+        o = dr.select(opaque, mirrored, straight)
+        reflections += dr.select(opaque, mi.UInt32(1), 0)
+        going = hit & ~bounds & (reflections < _REFLECTIONS)
+    return number, found, escaped
+
+
+def _may_leave(si, d) -> mi.Bool:
+    """Mask: light may leave the surface ``si`` along ``d``, by emission or scattering.
+
+    A BSDF without side flags may scatter to both sides.
+    """
+    front = dr.dot(si.sh_frame.n, d) > 0
+    sides = mi.UInt32(int(mi.BSDFFlags.FrontSide)), mi.UInt32(int(mi.BSDFFlags.BackSide))
+    flags = si.bsdf().flags()
+    scatters = (flags & dr.select(front, *sides)) != 0
+    unstated = (flags & (sides[0] | sides[1])) == 0
+    return scatters | unstated | (front & (si.shape.emitter() != dr.zeros(mi.EmitterPtr)))
+
+
+def _arrays(count: int, *values) -> list[np.ndarray]:
+    """``values`` of ``count`` lanes as NumPy arrays; one kernel."""
+    dr.eval(values)
+    return [np.broadcast_to(np.array(value), count) for value in values]
+
+
+def _near_sides(space: Space, ray: mi.Ray3f) -> list[np.ndarray]:
+    return _arrays(dr.width(ray.o), *near_side(space, ray, mi.Bool(True)))
 
 
 def _lines(space: Space, about: Callable) -> mi.Ray3f | None:
@@ -151,16 +197,16 @@ def _lines(space: Space, about: Callable) -> mi.Ray3f | None:
     return mi.Ray3f(through - d * (size * 1.1), d)
 
 
-def _outside(space: Space, around: boundaries.NearSide, lines: mi.Ray3f | None) -> int:
+def _outside(space: Space, around: list[np.ndarray], lines: mi.Ray3f | None) -> int:
     """The medium that surrounds the scene.
 
     The most frequent medium of two sets of rays: rays from the sensor that escape (the sensor's medium), and
     ``lines`` from outside (the near side of the first boundary). The sensor's if there are none.
     """
-    numbers = np.full(around.escaped.sum(), space.media.sensor)
+    numbers = np.full(around[2].sum(), space.media.sensor)
     if lines is not None:
-        met = _near_sides(space, lines)
-        numbers = np.concatenate([numbers, met.number[met.found]])
+        near, found, _ = _near_sides(space, lines)
+        numbers = np.concatenate([numbers, near[found]])
     return int(np.bincount(numbers).argmax()) if len(numbers) else space.media.sensor
 
 
@@ -180,9 +226,10 @@ def _camera_rays(sensor: mi.Sensor, count: int, seed: int):
     return ray, u
 
 
-def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: boundaries.NearSide) -> str:
+def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: list[np.ndarray]) -> str:
     """Why the sensor is not in the medium of the boundaries ``around`` it; empty if it is."""
-    numbers = around.number[around.found]
+    near, found, _ = around
+    numbers = near[found]
     others = numbers[numbers != space.media.sensor]
     if len(others) <= _TOLERATED * len(numbers):
         return ""
@@ -194,12 +241,12 @@ def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: boundaries
 
 
 def _called(space: Space, number: int) -> str:
-    return f"the medium {named(space.media.objects[number - 1])}" if number else "no medium"
+    return f"the medium {named(space.media.looks[number - 1].medium)}" if number else "no medium"
 
 
 def _contradiction_of_phases(space: Space) -> str:
     """Why scattering is not reciprocal; empty if it is."""
-    for medium in space.media.objects:
+    for medium in (look.medium for look in space.media.looks):
         if asymmetry(medium) > _SYMMETRIC:
             return (
                 f"the phase function of medium {named(medium)} ({medium.phase_function().class_name()}) "
@@ -214,8 +261,8 @@ def _contradiction_at_infinity(space: Space, outside: int, lines: mi.Ray3f | Non
         si = space.scene.ray_intersect(lines)
         number = space.media.number(si.target_medium(lines.d))
         onwards = mi.Ray3f(lines(rays.passed(lines, si, space.shape_errors)), lines.d)
-        entered, number = (np.array(x) for x in (si.is_valid() & si.is_medium_transition(), number))
-        escaped = entered & _near_sides(space, onwards).escaped
+        entered, number = _arrays(_LINES, si.is_valid() & si.is_medium_transition(), number)
+        escaped = entered & _near_sides(space, onwards)[2]
         wrong = number[escaped & (number != outside)]
         if len(wrong) > _TOLERATED * entered.sum():
             return (
@@ -224,15 +271,16 @@ def _contradiction_at_infinity(space: Space, outside: int, lines: mi.Ray3f | Non
             )
     if not outside:
         return ""
-    medium, look = space.media.objects[outside - 1], space.media.looks[outside - 1]
-    if not medium.is_homogeneous():
+    look = space.media.looks[outside - 1]
+    name = named(look.medium)
+    if not look.homogeneous:
         return (
-            f"the grid of medium {named(medium)} has no boundary, so that light from infinity starts within "
+            f"the grid of medium {name} has no boundary, so that light from infinity starts within "
             "it: put a shape with a null BSDF around it"
         )
     if look.least == 0 and look.majorant.max() > 0:
         return (
-            f"medium {named(medium)} has no end and lets some wavelengths of light from infinity through, "
+            f"medium {name} has no end and lets some wavelengths of light from infinity through, "
             "but not others: put a shape with a null BSDF around it"
         )
     return ""
@@ -247,9 +295,8 @@ def medium_at_far_plane(space: Space, sensor: mi.Sensor) -> int:
     if not infinite or not isinstance(sensor, mi.ProjectiveCamera):
         return 0
     ray, _ = _camera_rays(sensor, _CAMERA_RAYS, 3)
-    number, arrived = (
-        np.array(x) for x in boundaries.behind(space, mi.Ray3f(ray), mi.UInt32(space.media.sensor))
-    )
+    end = through_surfaces(space, mi.Ray3f(ray), mi.UInt32(space.media.sensor), mi.Bool(True))
+    number, arrived = _arrays(_CAMERA_RAYS, end.medium, end.clear)
     clipped = arrived & (number > 0)
     return int(np.bincount(number[clipped]).argmax()) if clipped.any() else 0
 
@@ -259,6 +306,6 @@ def _contradiction_at_far_plane(space: Space, sensor: mi.Sensor, far: int) -> st
     if not far:
         return ""
     return (
-        f"the far plane of sensor {named(sensor)} lies in the medium {named(space.media.objects[far - 1])}, "
+        f"the far plane of sensor {named(sensor)} lies in {_called(space, far)}, "
         "through the rest of which light from infinity has to come: raise far_clip"
     )

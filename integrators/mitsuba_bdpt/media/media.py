@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import drjit as dr
@@ -30,57 +30,46 @@ _PROBES = 4096
 class Media:
     """Media that rays of a scene and sensor may be in, numbered from 1; 0 is vacuum.
 
-    Equal media (`equal.representatives`) share a number (``UInt32``). Raises ``UnsupportedError`` for media
-    for which Mitsuba's own calls disagree, ``UsageError`` for invalid coefficients.
+    Equal media (`equal.representatives`) share a number (``UInt32``).
 
-    * ``objects``, ``looks``: one medium and its `_Look` per number; ``sensor``: number of the sensor's
-      medium.
+    * ``looks``: the `Look` of each number; ``sensor``: number of the sensor's medium.
     * ``grids``: some medium is heterogeneous; ``coloured_grids``: the extinction of one depends on
       wavelength.
-    * ``scatters``: some albedo is not 0; ``directional``: extinction depends on direction (microflakes).
+    * ``scatters``: some albedo is not 0.
     * ``gray``: no homogeneous medium's extinction depends on wavelength; optical depths are then ``Float``,
       else ``Spectrum``.
     * ``see_through``: surfaces of plugin ``null`` are passed without a vertex; ``null_lobes``: shadow rays
       have to evaluate surfaces.
-    * ``all_lit``: next-event estimation is allowed in all media (``sample_emitters``).
+    * ``lit``, by number: next-event estimation is allowed in the medium (``sample_emitters``); ``all_lit``:
+      in all.
     """
 
     def __init__(self, found: dict[int, mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
-        media = list(found.values())
-        firsts = representatives(media, _answers)
+        looks = [Look(medium) for medium in found.values()]
+        firsts = representatives(looks)
         distinct = sorted(set(firsts))
-        self.objects = objects = [media[i] for i in distinct]
         self._number_of = {place: distinct.index(i) + 1 for place, i in zip(found, firsts, strict=True)}
-        homogeneous = [m.is_homogeneous() for m in objects]
-        self.grids = not all(homogeneous)
+        self.looks = looks = [looks[i] for i in distinct]
         self.sensor = self.number_of(sensor)
-        self._numbers = _numbers(self._number_of)
-        self.looks = looks = [_Look(m) for m in objects]
+        self.grids = not all(look.homogeneous for look in looks)
         self.scatters = any(look.scatters for look in looks)
         self.gray = all(look.gray for look in looks)
         self.coloured_grids = any(look.coloured_grid for look in looks)
-        self.directional = any(look.directional for look in looks)
-        self._spectral_table = self.gray or not mi.is_spectral
-        # Entry 0 is vacuum.
-        self._extinction = self._table([look.majorant for look in looks])
+        lit = [look.medium.use_emitter_sampling() for look in looks]
+        self.all_lit, self.lit = all(lit), mi.Bool([False, *lit])
+        # Numbers by Mitsuba's registry index; the others by number. No extinction if more matters to it.
+        self._numbers = mi.UInt32([self._number_of.get(place, 0) for place in range(max(found) + 1)])
+        self._extinction = None
+        if not any(look.directional for look in looks) and (self.gray or not mi.is_spectral):
+            table = np.array([np.zeros_like(looks[0].majorant), *(look.majorant for look in looks)])
+            self._extinction = mi.Float(table[:, 0]) if self.gray else mi.UnpolarizedSpectrum(table.T)
         self._mean = mi.Float([0.0, *(look.mean for look in looks)])
-        self._homogeneous = mi.UInt32([0, *map(int, homogeneous)])
-        lit = [m.use_emitter_sampling() for m in objects]
-        self.all_lit = all(lit)
-        self._lit = mi.UInt32([1, *map(int, lit)])
-        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous, self._lit)
-        bsdfs = list(bsdfs)
+        self._homogeneous = mi.Bool([False, *(look.homogeneous for look in looks)])
+        dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous, self.lit)
         null = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+        only = [b for b in null if not b.flags() & OTHER_LOBES]
         self.null_lobes = bool(null)
-        only = [b for b in null if not b.flags() & _OTHER_LOBES]
         self.see_through = bool(only) and all(b.class_name() == "Null" for b in only)
-
-    def _table(self, majorants):
-        """Extinction by number, ``Float`` or ``Spectrum``; None if other variables matter."""
-        if not self._spectral_table:
-            return None
-        entries = np.array([np.zeros(len(majorants[0])), *majorants])
-        return mi.Float(entries[:, 0]) if self.gray else mi.UnpolarizedSpectrum(entries.T)
 
     def number_of(self, medium: mi.Medium | None) -> int:
         """The number of a medium of the scene or of the sensor, 0 for none."""
@@ -90,54 +79,44 @@ class Media:
         """The number of a medium that the scene's shapes point to."""
         return dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, medium))
 
+    def beyond(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, number: mi.UInt32) -> mi.UInt32:
+        """The medium at the surface ``si`` in direction ``d``; ``number`` where it bounds none."""
+        return dr.select(si.is_medium_transition(), self.number(si.target_medium(d)), number)
+
     def is_homogeneous(self, number: mi.UInt32) -> mi.Bool:
-        return dr.gather(mi.UInt32, self._homogeneous, number) == 1
-
-    def is_null(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
-        """Mask: the BSDF of the surface ``si`` has a null lobe only."""
-        return (si.bsdf().flags() & mi.UInt32(_OTHER_LOBES | int(mi.BSDFFlags.Null))) == int(
-            mi.BSDFFlags.Null
-        )
-
-    def allows_next_event(self, number: mi.UInt32) -> mi.Bool:
-        """Mask: next-event estimation is allowed in the medium, or on surfaces (number 0)."""
-        return dr.gather(mi.UInt32, self._lit, number) == 1
+        return dr.gather(mi.Bool, self._homogeneous, number)
 
     def mean(self, number: mi.UInt32) -> mi.Float:
         """Mean extinction (1 / scene unit), of a grid within its box; 0 in vacuum."""
         return dr.gather(mi.Float, self._mean, number)
 
-    def extinction(self, number: mi.UInt32, d: mi.Vector3f, shared, active: mi.Bool):
-        """Extinction along ``d`` (1 / scene unit), a grid's majorant; 0 in vacuum.
+    def extinction(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool):
+        """Extinction along ``ray`` (1 / scene unit), a grid's majorant; 0 in vacuum.
 
-        ``Float`` if `gray`, else ``Spectrum``; ``shared`` carries time and wavelengths.
+        ``Float`` if `gray`, else ``Spectrum``, with equal channels in a grid.
         """
-        if self._extinction is not None and not self.directional:
+        if self._extinction is not None:
             return dr.gather(type(self._extinction), self._extinction, number)
-        answer = self.query(number, self._majorant, interaction(mi.Point3f(0), d, shared), active)
+
+        def majorant(medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
+            majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
+            return majorant[0] if self.gray else majorant
+
+        answer = self.query(number, majorant, interaction(mi.Point3f(0), ray.d, ray), active)
         return dr.select(active & (number != 0), answer, 0)
-
-    def majorant(self, number: mi.UInt32, ray: mi.Ray3f, active: mi.Bool):
-        """Majorant of a grid, one number for all channels (1 / scene unit)."""
-        extinction = self.extinction(number, ray.d, ray, active)
-        return extinction if self.gray else extinction[0]
-
-    def _majorant(self, medium: mi.Medium, mei: mi.MediumInteraction3f, active: mi.Bool):
-        majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
-        return majorant[0] if self.gray else majorant
 
     def query(self, number: mi.UInt32, question, *args) -> Any:
         """Evaluate ``question(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
         *others, active = args
         active = active & (number != 0)
-        if len(self.objects) == 1:
-            return question(self.objects[0], *others, active)
-        questions = [partial(question, medium) for medium in self.objects]
+        questions = [partial(question, look.medium) for look in self.looks]
+        if len(questions) == 1:
+            return questions[0](*others, active)
         return dr.switch(dr.select(active, number - 1, 0), questions, *others, active)
 
 
 # Lobes other than null.
-_OTHER_LOBES = int(
+OTHER_LOBES = int(
     mi.BSDFFlags.Smooth | mi.BSDFFlags.DeltaReflection | mi.BSDFFlags.DeltaTransmission | mi.BSDFFlags.Delta1D
 )
 
@@ -170,15 +149,8 @@ def of_depth(depth: mi.Float | mi.UnpolarizedSpectrum):
     return dr.maximum(transmittance, _LEAST)
 
 
-def _numbers(number_of: dict[int, int]) -> mi.UInt32:
-    """Table from Mitsuba's registry index to the number of a medium."""
-    return mi.UInt32([number_of.get(place, 0) for place in range(max(number_of) + 1)])
-
-
 def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray):
-    """Raise ``UnsupportedError`` if a homogeneous medium's extinction varies in space."""
-    if not medium.is_homogeneous():
-        return
+    """Raise ``UnsupportedError`` if the extinction of a homogeneous ``medium`` varies in space."""
     extinction = children(medium).get("sigma_t")
     if extinction is not None and extinction.class_name() != "ConstVolume":
         raise UnsupportedError(
@@ -188,7 +160,7 @@ def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray)
         )
     at_origin = mi.MediumInteraction3f(mei)
     at_origin.p = mi.Point3f(0)
-    if not np.allclose(majorant, _majorants(medium, at_origin), rtol=1e-5, equal_nan=True):
+    if not np.allclose(majorant, *rows(medium.get_majorant(at_origin)), rtol=1e-5, equal_nan=True):
         raise UnsupportedError(
             f"medium {named(medium)} of type homogeneous has microflakes that vary in space, of which "
             "Mitsuba takes those at the origin for flights; use a constant S, or a medium of type "
@@ -196,28 +168,15 @@ def _check(medium: mi.Medium, mei: mi.MediumInteraction3f, majorant: np.ndarray)
         )
 
 
-def _answers(medium: mi.Medium) -> np.ndarray:
-    """Majorant, sigma_s, sigma_t, phase function at `probes`, one row per channel."""
-    mei = probes(medium)
-    wo = random_directions(np.random.default_rng(1), _PROBES)
-    value, _ = medium.phase_function().eval_pdf(mi.PhaseFunctionContext(None), mei, wo)
-    sigma_s, _, sigma_t = medium.get_scattering_coefficients(mei)
-    zeros = dr.zeros(mi.UnpolarizedSpectrum, _PROBES)
-    phase = mi.unpolarized_spectrum(mi.Spectrum(value))
-    parts = [mi.UnpolarizedSpectrum(part) + zeros for part in (sigma_s, sigma_t, phase)]
-    dr.eval(parts)
-    return np.concatenate([_majorants(medium, mei), *(np.array(part) for part in parts)])
-
-
-def _majorants(medium: mi.Medium, mei: mi.MediumInteraction3f) -> np.ndarray:
-    """Majorants at `probes`: (channels, probes)."""
-    return np.array(
-        mi.UnpolarizedSpectrum(medium.get_majorant(mei)) + dr.zeros(mi.UnpolarizedSpectrum, _PROBES)
-    )
+def rows(*spectra) -> list[np.ndarray]:
+    """``spectra`` at `probes`, (channels, probes); one kernel."""
+    wide = [mi.UnpolarizedSpectrum(part) + dr.zeros(mi.UnpolarizedSpectrum, _PROBES) for part in spectra]
+    dr.eval(wide)
+    return [np.array(part) for part in wide]
 
 
 def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
-    """Random points in the varying volumes of a medium, directions and wavelengths."""
+    """Random points in the varying volumes of a medium (the origin without any), directions, wavelengths."""
     rng = np.random.default_rng(0)
     mei = dr.zeros(mi.MediumInteraction3f, _PROBES)
     wi = random_directions(rng, _PROBES)
@@ -230,7 +189,8 @@ def probes(medium: mi.Medium) -> mi.MediumInteraction3f:
     extinction, volumes = children(medium).get("sigma_t"), _volumes(medium)
     if not medium.is_homogeneous() and isinstance(extinction, mi.Volume):
         volumes = [extinction]
-    mei.p = _points_within([volume.bbox() for volume in volumes], rng)
+    if boxes := [volume.bbox() for volume in volumes]:
+        mei.p = points_in(boxes, np.arange(_PROBES) % len(boxes), rng.random((_PROBES, 3)))
     return mei
 
 
@@ -243,13 +203,6 @@ def _volumes(owner) -> list[mi.Volume]:
         elif isinstance(held, mi.Volume) and held.class_name() != "ConstVolume":
             found.append(held)
     return found
-
-
-def _points_within(boxes: list[mi.BoundingBox3f], rng) -> mi.Point3f:
-    """Points spread equally over boxes; the origin if there are none."""
-    if not boxes:
-        return dr.zeros(mi.Point3f, _PROBES)
-    return points_in(boxes, np.arange(_PROBES) % len(boxes), rng.random((_PROBES, 3)))
 
 
 def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str:
@@ -278,21 +231,22 @@ def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str
     return ""
 
 
-class _Look:
-    """Properties of a medium, from its values at random points and directions.
+class Look:
+    """Properties of a medium, from its values at `probes`.
 
-    ``majorant`` (channels,): maximum over directions; ``gray``, ``directional``, ``scatters``,
-    ``coloured_grid``: see `Media`; ``mean`` extinction, ``least`` majorant of all channels; ``strange``:
-    `_strange`. Raises ``UnsupportedError`` and ``UsageError``, see `_check` and `_strange`.
+    ``majorant`` (channels,): maximum over directions; ``gray``, ``coloured_grid``, ``scatters``: see `Media`;
+    ``directional``: extinction depends on direction (microflakes); ``mean`` extinction, ``least`` majorant of
+    all channels; ``strange``: `_strange`. Raises ``UnsupportedError`` where Mitsuba's own calls disagree,
+    ``UsageError`` for invalid coefficients.
     """
 
     def __init__(self, medium: mi.Medium):
-        mei, homogeneous = probes(medium), medium.is_homogeneous()
-        majorant = _majorants(medium, mei)
-        _check(medium, mei, majorant)
-        sigma_s, _, sigma_t = (
-            np.array(mi.UnpolarizedSpectrum(s)) for s in medium.get_scattering_coefficients(mei)
-        )
+        self.medium, self._probes = medium, probes(medium)
+        self.homogeneous = homogeneous = medium.is_homogeneous()
+        sigma_s, _, sigma_t = medium.get_scattering_coefficients(self._probes)
+        self._rows = majorant, sigma_s, sigma_t = rows(medium.get_majorant(self._probes), sigma_s, sigma_t)
+        if homogeneous:
+            _check(medium, self._probes, majorant)
         self.strange = _strange(medium, sigma_s, sigma_t)
         self.majorant, self.least = majorant.max(1), float(majorant.min())
         # A grid's flights are sampled with one majorant for all channels.
@@ -302,3 +256,10 @@ class _Look:
         self.directional = homogeneous and not same.all() and (self.gray or not mi.is_spectral)
         self.scatters = bool((sigma_s > 0).any()) or not homogeneous
         self.mean = float((majorant if homogeneous else sigma_t).mean())
+
+    @cached_property
+    def answers(self) -> np.ndarray:
+        """Majorant, sigma_s, sigma_t, phase function, one row per channel."""
+        wo, context = random_directions(np.random.default_rng(1), _PROBES), mi.PhaseFunctionContext(None)
+        value, _ = self.medium.phase_function().eval_pdf(context, self._probes, wo)
+        return np.concatenate([*self._rows, *rows(mi.unpolarized_spectrum(mi.Spectrum(value)))])

@@ -10,7 +10,7 @@ light subpaths.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -19,10 +19,7 @@ import numpy as np
 from ..geometry.directions import random_directions, symmetric_frame
 from ..host.introspection import children
 from ..transport.bsdf import Evaluation, Step, Target
-from .media import interaction, probes
-
-if TYPE_CHECKING:
-    from .space import Space
+from .media import Media, interaction, probes, rows
 
 # Plugins with equal forward and reverse densities.
 _SYMMETRIC = frozenset(
@@ -47,15 +44,14 @@ def asymmetry(medium: mi.Medium) -> float:
     if is_symmetric(phase):
         return 0.0
     there = probes(medium)
-    back, count = mi.MediumInteraction3f(there), dr.width(there.wi)
-    back.wi = random_directions(np.random.default_rng(1), count)
+    back = mi.MediumInteraction3f(there)
+    back.wi = random_directions(np.random.default_rng(1), dr.width(there.wi))
     back.sh_frame = symmetric_frame(back.wi)
     found = []
     for mei, wo in ((there, back.wi), (back, there.wi)):
         value, _ = phase.eval_pdf(mi.PhaseFunctionContext(None), mei, wo, mi.Bool(True))
         _, _, sigma_t = medium.get_scattering_coefficients(mei, mi.Bool(True))
-        scattered = mi.UnpolarizedSpectrum(sigma_t) * mi.unpolarized_spectrum(mi.Spectrum(value))
-        found.append(np.array(scattered + dr.zeros(mi.UnpolarizedSpectrum, count)))
+        found += rows(mi.UnpolarizedSpectrum(sigma_t) * mi.unpolarized_spectrum(mi.Spectrum(value)))
     return float(np.abs(found[0] - found[1]).mean() / max(found[0].mean(), np.finfo(float).tiny))
 
 
@@ -71,43 +67,50 @@ def _evaluated(medium: mi.Medium, mei, wo, active):
     return mi.Spectrum(value), pdf, pdf_rev
 
 
-def evaluate(space: Space, medium: mi.UInt32, si, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
-    """Evaluate the phase function of ``medium`` (index) towards the local ``wo``."""
-    mei = interaction(si.p, -si.to_world(si.wi), si)
-    return Evaluation(*space.media.query(medium, _evaluated, mei, si.to_world(wo), active), mi.Bool(True))
+@dataclass(frozen=True)
+class PhaseFunctions:
+    """Phase functions at the vertices in ``media``."""
+
+    media: Media
+
+    def evaluate(self, vertex, wo: mi.Vector3f, active: mi.Bool) -> Evaluation:
+        """Evaluate towards the local ``wo``."""
+        mei, wo = _at(vertex), vertex.si.to_world(wo)
+        return Evaluation(*self.media.query(vertex.medium, _evaluated, mei, wo, active), mi.Bool(True))
+
+    def sample(
+        self, vertex, u1, u2, active: mi.Bool, target: Target | None
+    ) -> tuple[Step, Evaluation | None]:
+        """Continue a subpath; results as in `bsdf.sample`."""
+
+        def questions(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
+            phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
+            d, weight, pdf = phase.sample(ctx, mei, u1, u2, sampled)
+            _, _, pdf_rev = _evaluated(medium, mei, d, sampled)
+            joined = _evaluated(medium, mei, wo, evaluated) if target else None
+            return d, mi.Spectrum(weight), pdf, pdf_rev, joined
+
+        wo = vertex.si.to_world(target.wo) if target else mi.Vector3f(0, 0, 1)
+        evaluated = target.active if target else mi.Bool(False)
+        # Subpaths that end here are still connected.
+        queried = active | evaluated
+        d, weight, pdf, pdf_rev, joined = self.media.query(
+            vertex.medium, questions, _at(vertex), u1, u2, active, wo, evaluated, queried
+        )
+        step = Step(
+            # Otherwise its length would drift along subpaths: frames are built from directions.
+            wo=dr.normalize(vertex.si.to_local(d)),
+            weight=dr.select(pdf > 0, weight, 0),
+            pdf_fwd_w=pdf,
+            pdf_rev_w=pdf_rev,
+            cos_out=mi.Float(1),
+            delta=mi.Bool(False),
+            null=mi.Bool(False),
+            eta=mi.Float(1),
+            volume=mi.Bool(True),
+        )
+        return step, Evaluation(*joined, mi.Bool(True)) if target else None
 
 
-def sample(
-    space: Space, medium: mi.UInt32, si, u1, u2, active: mi.Bool, target: Target | None
-) -> tuple[Step, Evaluation | None]:
-    """Continue a subpath from a volume vertex; results as in `bsdf.sample`."""
-
-    def questions(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
-        phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
-        d, weight, pdf = phase.sample(ctx, mei, u1, u2, sampled)
-        _, _, pdf_rev = _evaluated(medium, mei, d, sampled)
-        joined = _evaluated(medium, mei, wo, evaluated) if target else None
-        return d, mi.Spectrum(weight), pdf, pdf_rev, joined
-
-    mei = interaction(si.p, -si.to_world(si.wi), si)
-    wo = si.to_world(target.wo) if target else mi.Vector3f(0, 0, 1)
-    evaluated = target.active if target else mi.Bool(False)
-    # Subpaths that end here are still connected.
-    queried = active | evaluated
-
-    d, weight, pdf, pdf_rev, joined = space.media.query(
-        medium, questions, mei, u1, u2, active, wo, evaluated, queried
-    )
-    step = Step(
-        # Otherwise its length would drift along subpaths: frames are built from directions.
-        wo=dr.normalize(si.to_local(d)),
-        weight=dr.select(pdf > 0, weight, 0),
-        pdf_fwd_w=pdf,
-        pdf_rev_w=pdf_rev,
-        cos_out=mi.Float(1),
-        delta=mi.Bool(False),
-        null=mi.Bool(False),
-        eta=mi.Float(1),
-        volume=mi.Bool(True),
-    )
-    return step, Evaluation(*joined, mi.Bool(True)) if target else None
+def _at(vertex) -> mi.MediumInteraction3f:
+    return interaction(vertex.si.p, -vertex.si.to_world(vertex.si.wi), vertex.si)

@@ -10,10 +10,11 @@ import mitsuba as mi
 
 from ..geometry import polarization
 from ..sampling.points import Purpose
-from ..transport.contribution import MEDIA, Counters
+from ..transport.contribution import MEDIA
 from ..transport.vacuum import Vacuum
-from . import flight, phase, transmittance
+from . import flight, transmittance
 from .media import Media, of_depth
+from .phase import PhaseFunctions
 
 # Largest optical depth of a connection's approximate transmittance, in the medium that it starts in:
 # connections of less actual depth are drawn at most e^2 times too rarely.
@@ -32,18 +33,14 @@ class Space(Vacuum):
     null_transmission: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.UnpolarizedSpectrum]
     clipped: bool = False
 
-    # Hooks of a walk: its first edge, the end of an edge, the event at its end, the next edge.
     begin = flight.begin
     arrive = flight.arrive
-    sample = phase.sample
     depart = flight.depart
-    # Hooks of connections: the phase function, the optical depth.
-    evaluate = phase.evaluate
     depth_along = transmittance.depth_along
 
     @property
-    def scatters(self) -> bool:
-        return self.media.scatters
+    def phase(self) -> PhaseFunctions | None:
+        return PhaseFunctions(self.media) if self.media.scatters else None
 
     @property
     def counters(self) -> tuple[str, ...]:
@@ -51,19 +48,19 @@ class Space(Vacuum):
 
     def medium_towards(self, vertex, d: mi.Vector3f) -> mi.UInt32:
         """Index of the medium at ``vertex`` in direction ``d``."""
-        beyond = self.media.number(vertex.si.target_medium(d))
-        return dr.select(vertex.si.is_medium_transition(), beyond, vertex.medium)
+        return self.media.beyond(vertex.si, d, vertex.medium)
 
     def allows_next_event(self, vertex):
         if self.media.all_lit:
-            return None
-        return ~vertex.volume | self.media.allows_next_event(vertex.medium)
+            return mi.Bool(True)
+        return ~vertex.volume | dr.gather(mi.Bool, self.media.lit, vertex.medium)
 
     def guessed(self, vertex, between):
         sigma = self.media.mean(self.medium_towards(vertex, between))
         return dr.exp(-dr.minimum(sigma * dr.norm(between), _GUESSED_DEPTH))
 
-    def seen(self, kernel, c, shadow_ray):
+    def seen(self, kernel, c):
+        shadow_ray = c.shadow_ray
         z, medium, event, word = shadow_ray.vertex, kernel.sensor_medium, mi.UInt32(0), mi.UInt32(0)
         if z is not None:
             medium, event = self.medium_towards(z, shadow_ray.d), z.event
@@ -80,8 +77,8 @@ class Space(Vacuum):
             shares=shares,
             # NaN is kept, to be counted.
             active=c.active & ~dr.all(crossing.transmittance == 0),
-            counted=c.counted + Counters(segments=crossing.segments, collisions=crossing.collisions),
+            counted=c.counted + crossing.counted,
         )
 
     def clear(self, ray, medium, active):
-        return transmittance.between(self, ray, medium, active, None, mi.UInt32(0)).clear
+        return transmittance.between(self, ray, medium, active).clear

@@ -7,8 +7,6 @@ majorant. T~ of a grid is that of its mean extinction within its box.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 
@@ -17,54 +15,43 @@ from ..sampling.points import sequential
 from .media import Media, coefficients, interaction
 
 
-@dataclass
-class Tracked:
-    """Result of delta tracking: distance ``t`` of a real collision (infinite if none).
-
-    ``depth``: optical depth of T~ up to it; ``rest``: optical depth until the next tentative collision;
-    ``throughput`` times the ratios of null collisions; next random ``word``; number of tentative
-    ``collisions``.
-    """
-
-    t: mi.Float
-    depth: mi.Float
-    rest: mi.Float
-    throughput: mi.Spectrum
-    word: mi.UInt32
-    collisions: mi.UInt32
-
-
 def exponential(u: mi.Float) -> mi.Float:
     """Optical depth with density exp(-depth); never 0, where vertices would coincide."""
     return dr.select(u > 0, -dr.log(1 - u), 2.0**-25)
 
 
-def _tracks(majorant, throughput, inside):
-    """Mask of finite majorants above 0; ``throughput``, NaN at non-finite ones."""
-    finite = dr.isfinite(majorant)
-    return inside & finite & (majorant > 0), dr.select(inside & ~finite, dr.nan, throughput)
+def _begin(media: Media, number, ray, end, throughput, active):
+    """Begin to track along ``ray`` in the grid's box, up to ``end``.
 
-
-def _within(media: Media, number, ray, end, active):
-    """Interval of ``ray`` in the grid's box, up to ``end``; mask: it is not empty."""
+    Returns the interval, the mask of nonempty ones, the majorant, one number for all channels (1 / scene
+    unit), the mask of lanes with tentative collisions, and ``throughput``, NaN where the majorant is
+    non-finite.
+    """
 
     def box(medium: mi.Medium, ray, active):
         return medium.intersect_aabb(ray)
 
     meets, low, high = media.query(number, box, ray, active)
     low, high = dr.maximum(low, 0), dr.minimum(high, end)
-    return low, high, active & meets & (low < high)
+    inside = active & meets & (low < high)
+    majorant = media.extinction(number, ray, active)
+    majorant = majorant if media.gray else majorant[0]
+    finite = dr.isfinite(majorant)
+    throughput = dr.select(inside & ~finite, dr.nan, throughput)
+    return low, high, inside, majorant, inside & finite & (majorant > 0), throughput
 
 
 @dr.syntax
-def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tracked:
-    """Delta tracking along ``ray`` up to ``end``; ``rest``: first tentative collision."""
-    low, high, inside = _within(media, number, ray, end, active)
-    majorant = media.majorant(number, ray, active)
+def delta(media: Media, number, ray, end, rest, throughput, word, active):
+    """Delta tracking along ``ray`` up to ``end``; ``rest``: optical depth until the next tentative collision.
+
+    Returns the distance of the real collision (infinite if there is none), depth of T~ up to it, ``rest``,
+    ``throughput`` times the ratios of null collisions, the next random word, the number of tentative
+    collisions.
+    """
+    low, high, inside, majorant, going, throughput = _begin(media, number, ray, end, throughput, active)
     t, met = mi.Float(low), mi.Float(dr.inf)
-    rest, throughput, word = mi.Float(rest), type(throughput)(throughput), mi.UInt32(word)
-    collisions = mi.UInt32(0)
-    going, throughput = _tracks(majorant, throughput, inside)
+    rest, word, collisions = mi.Float(rest), mi.UInt32(word), mi.UInt32(0)
     while dr.hint(
         going, label="delta tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
     ):
@@ -87,7 +74,7 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active) -> Tra
         going = mi.Bool(passed)
     travelled = dr.maximum(dr.minimum(met, high) - low, 0)
     depth = dr.select(inside, media.mean(number) * travelled, 0)
-    return Tracked(met, depth, rest, throughput, word, collisions)
+    return met, depth, rest, throughput, word, collisions
 
 
 @dr.syntax
@@ -96,11 +83,9 @@ def ratio(media: Media, number, ray, end, word, active):
 
     Returns transmittance (``Spectrum``), depth of T~, the next random word and the number of collisions.
     """
-    low, high, inside = _within(media, number, ray, end, active)
-    majorant = media.majorant(number, ray, active)
-    t, transmittance, word = mi.Float(low), mi.UnpolarizedSpectrum(1), mi.UInt32(word)
-    collisions = mi.UInt32(0)
-    going, transmittance = _tracks(majorant, transmittance, inside)
+    one = mi.UnpolarizedSpectrum(1)
+    low, high, inside, majorant, going, transmittance = _begin(media, number, ray, end, one, active)
+    t, word, collisions = mi.Float(low), mi.UInt32(word), mi.UInt32(0)
     while dr.hint(
         going, label="ratio tracking", exclude=[media, number, ray, low, high, majorant, inside, end, active]
     ):

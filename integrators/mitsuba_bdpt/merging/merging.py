@@ -95,8 +95,8 @@ class Merging(PhotonStrategy):
 
     begin_camera = begin_light
 
-    def merge(self, kernel, vertex, isolated) -> mis.Merge:
-        return mis.Merge(kernel.heuristic.start(self.weighed(vertex.si.p)), None)
+    def ratio(self, kernel, p):
+        return kernel.heuristic.start(self.weighed(p))
 
     def survival(self, state, partial, p):
         # Whichever is larger, since it may go on to where pixels are larger.
@@ -124,7 +124,7 @@ class Merging(PhotonStrategy):
         camera = z.partial, newest_connection(kernel, kernel.kappa.splat_count, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, kernel.kappa.splat, z))
-        weight = mis.weigh_merge(h, h.start(self.weighed(z.si.p)), light, camera, connections)
+        weight = mis.weigh_merge(h, self.ratio(kernel, z.si.p), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
         c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")

@@ -19,7 +19,7 @@ def direct_coefficient(kernel: Kernel, vertex) -> mis.Coefficient:
 def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
     """kappa of next-event estimation where ``lit`` (None: everywhere), else 0."""
     direct = kernel.kappa.direct
-    return direct if lit is None else mis.choose(lit, direct, kernel.heuristic.zero())
+    return direct if lit is None else mis.choose(lit, direct, 0)
 
 
 def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
@@ -63,12 +63,11 @@ def merges_up_to(
 
     ``first``: as in `newest_coefficient`, of the rival of merges. The number 0 without merging.
     """
-    sds = kernel.sds
-    if sds is None or not sds.merges:
+    if kernel.sds is None or not kernel.sds.merges:
         return 0
-    ratio = kernel.heuristic.start(sds.weighed(vertex.si.p))
+    h, ratio = kernel.heuristic, kernel.sds.ratio(kernel, vertex.si.p)
     coefficient = newest_coefficient(kernel, first, vertex.edges)
-    return mis.merges(kernel.heuristic, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
+    return mis.merges(h, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
 
 
 def merges_before_end(

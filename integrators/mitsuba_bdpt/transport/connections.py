@@ -15,6 +15,7 @@ from .alternatives import direct_coefficient, merges_up_to, newest_coefficient
 from .contribution import (
     Contribution,
     Counters,
+    counters_with_media,
     drop_non_finite,
     layers,
     one,
@@ -73,19 +74,18 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """Connect ``z`` with every stored light vertex, with a shadow ray each.
 
     ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility
-    (`Vacuum.seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
+    (`_seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero = mi.UInt32(0), mi.UInt32(0)
-    counters = Counters.zeros("non_finite", *kernel.space.counters)
+    counters = counters_with_media(kernel, "non_finite")
     while dr.hint(
         slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
     ):
         y = read_light_vertex(kernel, path, slot)
         c = drop_non_finite(inner(kernel, z, y))
         nonzero += one(c.active)
-        ray, own = _shadow_ray(kernel, z, y)
-        visible = kernel.space.seen(kernel, c, ShadowRay(ray, stream, z, ray.d, slot + 1, own))
+        visible = _seen(kernel, z, c, *_shadow_ray(kernel, z, y), stream, slot + 1)
         total = add(_as_drawn(kernel, z, y, c), visible, total)
         counters = counters + visible.counted
         slot += 1
@@ -120,12 +120,14 @@ def connect_one(
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     kernel.observer.drawn(end)
-    estimate = value / survival
-    if drawn.sides is not None:
-        estimate = drawn.unweighted * (drawn.total / drawn.size / survival)
-    c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=drawn.sides)
-    c = kernel.space.seen(kernel, c, ShadowRay(ray, stream, z, ray.d, 1, own))
-    if drawn.sides is not None:  # only now with its weight
+    estimate, sides = value / survival, None
+    if drawn.unweighted is not None:
+        unweighted, light_side, camera_side, size = drawn.unweighted
+        estimate = unweighted * (drawn.total / size / survival)
+        sides = kernel.kappa.inner, light_side, camera_side
+    c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=sides)
+    c = _seen(kernel, z, c, ray, own, stream, 1)
+    if sides is not None:  # only now with its weight
         c = drop_non_finite(c)
     return c.weighted(), counted + c.counted, drawn.layers
 
@@ -142,9 +144,9 @@ class _Drawn:
     """A drawn inner connection.
 
     Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
-    `ShapeErrors.small`), rescaled random number ``u``, `Counters`. In scenes with media, where the weight is
-    known after the shadow ray, also ``unweighted`` value, ``sides`` (see `Contribution`) and ``size`` in the
-    draw. ``layers``: see `Contribution`.
+    `ShapeErrors.small`), rescaled random number ``u``, `Counters`; ``layers``: see `Contribution`. In scenes
+    with media, where the weight is known after the shadow ray, ``unweighted``: value, light and camera side,
+    size in the draw.
     """
 
     value: mi.Spectrum
@@ -152,10 +154,8 @@ class _Drawn:
     end: mi.Point3f | mi.UInt32
     u: mi.Float
     counted: Counters
-    unweighted: mi.Spectrum | None = None
-    sides: tuple | None = None
-    size: mi.Float | None = None
-    layers: tuple[mi.UInt32, ...] = ()
+    layers: tuple[mi.UInt32, ...]
+    unweighted: tuple | None = None
 
 
 @dr.syntax
@@ -194,12 +194,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
     # One light subpath: all vertices are of one emitter.
     own = layers(path.light_group, path_layer)
     counted = Counters(evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
-    drawn = _Drawn(value, total, end, u, counted, layers=own)
-    if kept is not None:
-        unweighted, light_side, camera_side, size = kept
-        sides = kernel.kappa.inner, light_side, camera_side
-        drawn = replace(drawn, unweighted=unweighted, sides=sides, size=size)
-    return drawn
+    return _Drawn(value, total, end, u, counted, own, kept)
 
 
 @dr.syntax
@@ -240,12 +235,17 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
     counted = c.counted + Counters(evaluated=one(some), zero=one(some & ~c.active))
-    return _Drawn(value, size_of(value), end, left, counted, layers=c.layers)
+    return _Drawn(value, size_of(value), end, left, counted, c.layers)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
     """The connection ``c`` as drawn: in media with an approximate transmittance."""
     return replace(c, value=c.value * kernel.space.guessed(z, y.si.p - z.si.p))
+
+
+def _seen(kernel: Kernel, z: Vertex, c: Contribution, ray: mi.Ray3f, own, stream: Stream, number):
+    """The connection ``c`` of ``z`` after its shadow ray; ``number``: from 1, of its random numbers."""
+    return kernel.space.seen(kernel, replace(c, shadow_ray=ShadowRay(ray, stream, z, ray.d, number, own)))
 
 
 def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> tuple[mi.Ray3f, rays.Own | None]:

@@ -11,6 +11,7 @@ import mitsuba as mi
 from ..emitters.records import Cell
 from . import spectra
 from .inputs import Kernel
+from .vacuum import ShadowRay
 
 # Least survival probability of roulette: random numbers are multiples of 2^-24.
 LEAST_SURVIVAL = 2.0**-20
@@ -85,12 +86,17 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
+def counters_with_media(kernel: Kernel, *names: str) -> Counters:
+    """Counters of these ``names`` and of the segments of shadow rays at 0."""
+    return Counters.zeros(*names, *kernel.space.counters)
+
+
 def counted_by_light(kernel: Kernel) -> Counters:
     """Counters of the vertices of light subpaths."""
     plan = kernel.plan
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     names += ["non_finite"] * (plan.splat or plan.arrival)
-    return Counters.zeros(*names, *kernel.space.counters * plan.splat)
+    return counters_with_media(kernel, *names)
 
 
 def counted_by_camera(kernel: Kernel) -> Counters:
@@ -99,7 +105,7 @@ def counted_by_camera(kernel: Kernel) -> Counters:
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     names += ["shadow_inner", "evaluated", "zero"] * inner
-    counters = Counters.zeros(*names, *kernel.space.counters * (plan.direct or inner))
+    counters = counters_with_media(kernel, *names)
     return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
 
 
@@ -110,7 +116,8 @@ class Contribution:
     ``value``: unweighted spectrum; ``weight`` in [0, 1]; ``s``, ``t``: numbers of light and camera vertices;
     ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`; ``position`` on the film in pixels, None
     for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
-    the connected edge until `Vacuum.seen`, which uses ``sides``, the arguments of `mis.Heuristic.weigh`.
+    the connected edge until its ``shadow_ray`` is traced (`seen`), for which ``sides`` are the arguments of
+    `mis.Heuristic.weigh`.
     ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
     sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, ``path_layer`` of the path (see
     `path_layers`), None without such layers.
@@ -130,6 +137,7 @@ class Contribution:
     towards: mi.Vector3f | None = None
     light_group: mi.UInt32 | None = None
     path_layer: mi.UInt32 | None = None
+    shadow_ray: ShadowRay | None = None
 
     @property
     def layers(self) -> tuple[mi.UInt32, ...]:
@@ -146,10 +154,15 @@ def layers(*layer: mi.UInt32 | None) -> tuple[mi.UInt32, ...]:
     return tuple(index for index in layer if index is not None)
 
 
+def seen(kernel: Kernel, c: Contribution) -> Contribution:
+    """``c`` after its shadow ray, if any; all contributions pass here before the sink."""
+    return drop_non_finite(c if c.shadow_ray is None else kernel.space.seen(kernel, c))
+
+
 def drop_non_finite(c: Contribution) -> Contribution:
     """Deactivate and count non-finite contributions, which count as zero.
 
-    All contributions pass here before the sink. Densities from which no weight follows make the value NaN.
+    Densities from which no weight follows make the value NaN.
     """
     lost = c.active & ~spectra.is_finite(c.value * c.weight)
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))

@@ -109,7 +109,7 @@ class Kernel:
         if self.light_media is not None and plan.light:
             self.light_media.settle()
         self.sensor_medium = u32(self.space.media.sensor) if self.has_media else None
-        self.scatters = self.surfaces or self.space.scatters
+        self.scatters = self.surfaces or self.space.phase is not None
         depth = settings.max_depth
         reach = min(depth, prepared.stored_vertices(settings))
         kept = plan.joined * (min(reach - 2, KEPT) if self.has_media else reach - 2)

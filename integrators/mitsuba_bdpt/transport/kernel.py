@@ -212,7 +212,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
     def splat(c):
         """Pass a contribution with t <= 1 to the sink."""
-        c = contribution.drop_non_finite(replace(c, emission=emitted, light_group=light_group))
+        c = contribution.seen(kernel, replace(c, emission=emitted, light_group=light_group))
         return c.counted + sink.splat(kernel, c, shared, stream)
 
     if plan.endpoints:
@@ -249,7 +249,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 @dr.syntax
 def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Counters:
     """Call ``trace_sample`` for each camera sample of the lane; returns the counters."""
-    counters = Counters.zeros("camera", *kernel.space.counters) + counted_by_camera(kernel)
+    counters = Counters.zeros("camera") + counted_by_camera(kernel)
     number = mi.UInt32(0)
     while dr.hint(
         number < kernel.camera_paths,
@@ -279,7 +279,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
     plan, start, shared = kernel.plan, sample.start, lane.shared
 
     def add(c, total, lost):
-        c = contribution.drop_non_finite(c)
+        c = contribution.seen(kernel, c)
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
     def visit(z, state, walk):
@@ -297,7 +297,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             )
             counters = replace(counters, non_finite=lost)
         if plan.direct:
-            c = contribution.drop_non_finite(techniques.next_event(kernel, z, sample.stream, kernel.sds))
+            c = contribution.seen(kernel, techniques.next_event(kernel, z, sample.stream, kernel.sds))
             total, counters = sink.add(kernel, c, total, start, shared), counters + c.counted
         if plan.connections != "none":
             total, counted = sink.connect(kernel, z, lane, sample.stream, total, start)

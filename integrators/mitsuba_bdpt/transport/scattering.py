@@ -15,10 +15,9 @@ def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None)
     step, f, on_surface = None, None, _of(target, ~vertex.volume)
     if kernel.surfaces:
         step, f = take(vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface)
-    if not kernel.space.scatters:
+    if (phase := kernel.space.phase) is None:
         return step, f
-    of_medium, active = _of(target, vertex.volume), active & vertex.volume
-    in_volume = kernel.space.sample(vertex.medium, vertex.si, u1, u2, active, of_medium)
+    in_volume = phase.sample(vertex, u1, u2, active & vertex.volume, _of(target, vertex.volume))
     return in_volume if step is None else dr.select(vertex.volume, in_volume, (step, f))
 
 
@@ -40,7 +39,7 @@ def evaluate(
         given = vertex.bsdf, vertex.si, wo, active & ~vertex.volume, traits
         return bsdf.evaluate(*given) if cos_ratio is None else bsdf.evaluate_adjoint(*given, cos_ratio)
 
-    if not kernel.space.scatters:
+    if (phase := kernel.space.phase) is None:
         return on_surface()
-    in_volume = kernel.space.evaluate(vertex.medium, vertex.si, wo, active & vertex.volume)
+    in_volume = phase.evaluate(vertex, wo, active & vertex.volume)
     return dr.select(vertex.volume, in_volume, on_surface()) if kernel.surfaces else in_volume

@@ -139,7 +139,7 @@ class PhotonStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``merges``: it merges vertices, and `weighed`, `may_merge`, `kept` and `survival`
+    subpaths use, or None; ``merges``: it merges vertices, and `ratio`, `may_merge`, `kept` and `survival`
     are defined; ``near_specular``: near-specular events count as specular, and `counts` is defined.
     """
 
@@ -148,7 +148,7 @@ class PhotonStrategy:
     merges = False
     near_specular = False
 
-    def weighed(self, p: mi.Point3f) -> mi.Float:
+    def ratio(self, kernel, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.Merge`."""
         raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
@@ -182,8 +182,8 @@ class PhotonStrategy:
         """The guide at ``vertex``; ``walk`` as before its arrival, ``step`` from there."""
         return None
 
-    def merge(self, kernel, vertex, isolated: mi.Bool | None) -> mis.Merge:
-        """What samples a path at ``vertex``; ``isolated``: `State.isolated` after its event, or None."""
+    def merge(self, kernel, vertex, isolated: mi.Bool) -> mis.Merge:
+        """What samples SDS paths at ``vertex``; ``isolated``: `State.isolated` after its event."""
         raise NotImplementedError(f"{type(self).__name__} has no merge")
 
     def visit(self, kernel, z, walk, stream, shared, add, state):

@@ -83,9 +83,7 @@ def light_walk(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) ->
     # s = 0, which samples y_0 by a hit, is an older alternative.
     hit = h.scale(h.start(dr.select(e.delta, 0, e.cos * inverse_pdf)), kernel.kappa.hit)
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
-    edge = None
-    if kernel.has_media:
-        edge = kernel.space.begin(kernel, "light", stream, kernel.light_media.at(e), ray)
+    edge = kernel.space.begin(kernel, "light", stream, ray, e)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     walk = replace(walk, broken=broken)
     return walk if sds is None else sds.begin_light(kernel, walk)
@@ -124,10 +122,8 @@ def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> Camera
 
 def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
     """A camera subpath on its first edge."""
-    start, edge = sample.start, None
-    ray = start.ray
-    if kernel.has_media:
-        edge = kernel.space.begin(kernel, "camera", sample.stream, kernel.sensor_medium, ray)
+    start, ray = sample.start, sample.start.ray
+    edge = kernel.space.begin(kernel, "camera", sample.stream, ray)
     if kernel.plan.hide_emitters and edge is None:
         pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
     else:

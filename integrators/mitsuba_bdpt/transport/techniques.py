@@ -1,8 +1,9 @@
 """One function per class of strategies: its path, contribution and weight.
 
-All return a `Contribution`: the *unweighted* estimate f / p divided by the class's count, and the weight;
-only `Contribution.weighted` multiplies the two. Densities and cosines are geometric; throughputs contain
-everything up to and including the edge to the vertex. Equation numbers: Georgiev 2012, see `mis`.
+All return a `Contribution` before its shadow ray: the *unweighted* estimate f / p divided by the class's
+count, and the weight; only `Contribution.weighted` multiplies the two. Densities and cosines are geometric;
+throughputs contain everything up to and including the edge to the vertex. Equation numbers: Georgiev 2012,
+see `mis`.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
     endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need exactly this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
-    direct = where_lit(kernel, z.edge.lit if kernel.has_media else None)
+    direct = where_lit(kernel, z.edge and z.edge.lit)
     newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
     older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # no light subpath comes straight from infinity past all shapes
@@ -109,8 +110,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     Returns an `emitters.Direct` and its `bsdf.Target`.
     """
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
-    if (lit := kernel.space.allows_next_event(z)) is not None:
-        active &= lit
+    active &= kernel.space.allows_next_event(z)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
     e = kernel.emitters.sample_direct(z.si, u, active)
     return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
@@ -149,18 +149,18 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
     counted = Counters(shadow_s1=one(active))
-    shadow_ray = ShadowRay(ray, stream, z, e.d, own=own)
     emission = None
     if kernel.cells is not None:
         cos = dr.abs(dr.dot(e.anchor.n, e.d))
         emission = kernel.cells.at(e.index, z.si.p, -e.d, cos, active)
     ends = mi.UInt32(1), k
     c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
+    c.shadow_ray = ShadowRay(ray, stream, z, e.d, own=own)
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(e.index, active)
     if kernel.path_layers:
         c.path_layer = path_layers.evaluated(z.layer, f, adjoint=False)
-    return kernel.space.seen(kernel, c, shadow_ray)
+    return c
 
 
 def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
@@ -202,10 +202,10 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     counted = Counters(shadow_t1=one(active))
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", connection.position, counted, sides)
-    c = replace(c, towards=connection.d)
+    c = replace(c, towards=connection.d, shadow_ray=ShadowRay(ray, stream))
     if kernel.path_layers:
         c.path_layer = mi.UInt32(path_layers.EMISSION)
-    return kernel.space.seen(kernel, c, ShadowRay(ray, stream))
+    return c
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
@@ -251,12 +251,12 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     active, survival, rouletted = roulette(kernel, c.weighted(), u, active)
     counted = rouletted + Counters(shadow_t1=one(active))
     ray = rays.segment(y.anchor, connection.anchor, y.si)
-    shadow_ray = ShadowRay(ray, stream, y, connection.d, hidden=kernel.plan.hide_emitters)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
+    c.shadow_ray = ShadowRay(ray, stream, y, connection.d, hidden=kernel.plan.hide_emitters)
     if kernel.path_layers:
         of_light = path_layers.evaluated(y.layer, f, adjoint=True)
         c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), of_light)
-    return kernel.space.seen(kernel, c, shadow_ray)
+    return c
 
 
 # Relative rounding error of distances.

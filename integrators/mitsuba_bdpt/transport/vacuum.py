@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import mitsuba as mi
 
@@ -47,14 +47,15 @@ class ShadowRay:
 class Vacuum:
     """The space between the vertices of ``scene``, with rounding errors of shapes.
 
-    ``scatters``: some medium does; ``counters``: names of the `Counters` of edges.
+    ``phase``: `media.phase.PhaseFunctions`, None if no medium scatters; ``counters``: names of the `Counters`
+    of edges.
     """
 
     scene: mi.Scene
     shape_errors: ShapeErrors
 
-    scatters = False
-    counters = ()
+    phase: ClassVar[Any] = None
+    counters: ClassVar[tuple[str, ...]] = ()
 
     def arrive(self, kernel, side, walk, /) -> Arrival:
         """Follow the edge of a ``walk`` to its end."""
@@ -62,23 +63,27 @@ class Vacuum:
         si = kernel.hits.at(walk.pi, ray, walk.active)
         return Arrival(si, ray, mi.Bool(False), walk.throughput)
 
+    def begin(self, kernel, side: str, stream: Stream, ray: mi.Ray3f, emission=None, /) -> Any:
+        """The first edge of a subpath along ``ray``, from its ``emission`` or the sensor."""
+        return None
+
     def depart(self, kernel, side, vertex, passes: mi.Bool, ray: mi.Ray3f, /) -> tuple[Any, mi.Ray3f]:
         """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
         return None, ray
 
-    def allows_next_event(self, vertex) -> mi.Bool | None:
-        """Mask: next-event estimation is allowed at ``vertex``; None if everywhere."""
-        return None
+    def allows_next_event(self, vertex) -> mi.Bool:
+        """Mask: next-event estimation is allowed at ``vertex``."""
+        return mi.Bool(True)
 
     def guessed(self, vertex, between: mi.Vector3f) -> mi.Float:
         """Approximate transmittance from ``vertex`` along ``between``, for draws."""
         return mi.Float(1)
 
-    def seen(self, kernel, c, shadow_ray: ShadowRay):
+    def seen(self, kernel, c):
         """The `Contribution` ``c`` after its shadow ray, with T in the value and T~ in the weight."""
-        ray, active = shadow_ray.ray, c.active
-        if not shadow_ray.hidden:
-            return replace(c, active=active & ~rays.occluded(self.scene, ray, active, shadow_ray.own))
+        ray, active = c.shadow_ray.ray, c.active
+        if not c.shadow_ray.hidden:
+            return replace(c, active=active & ~rays.occluded(self.scene, ray, active, c.shadow_ray.own))
         pi, _ = rays.intersect_past_emitters(self.scene, self.shape_errors, ray, active, coherent=False)
         return replace(c, active=active & ~pi.is_valid())
 

@@ -383,7 +383,7 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
         rival = coefficient
         if not side.adjoint:
             rival = newest_coefficient(kernel, kernel.kappa.splat_count, walk.edges)
-        return state, replace(strategy.merge(kernel, vertex, None), rival=rival)
+        return state, mis.Merge(strategy.ratio(kernel, vertex.si.p), None, rival)
     if state is None:
         return None, None
     state = state.after(kernel.heuristic, vertex, coefficient, step)
