@@ -436,8 +436,8 @@ MUTANTS = (
     Mutant(
         "weights: delta events keep a density",
         "transport/mis.py",
-        "d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w)))",
-        "d_vcm=heuristic.start(dr.rcp(step.pdf_fwd_w))",
+        "dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w)))",
+        "heuristic.start(dr.rcp(step.pdf_fwd_w))",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[odd-balance]",),
     ),
     Mutant(
@@ -1436,8 +1436,8 @@ MUTANTS = (
     Mutant(
         "merging: merges without their coefficient in the sums of subpaths",
         "transport/walk.py",
-        "mis.Merge(strategy.ratio(kernel, vertex.si.p), None, rival)",
-        "mis.Merge(strategy.ratio(kernel, vertex.si.p) / strategy.kappa, None, rival)",
+        "ratio = strategy.ratio(kernel, vertex.si.p)",
+        "ratio = strategy.ratio(kernel, vertex.si.p) / strategy.kappa",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-odd-True-1.0]",),
     ),
     Mutant(

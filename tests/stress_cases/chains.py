@@ -165,7 +165,6 @@ class Recursion:
 
     def _fold(self, partial, coefficient, rival, pdf_fwd_w, pdf_rev_w, cos_out, i):
         is_delta = self.path.delta[i]
-        merge = None if self.eta is None else mis.Merge(self.h.start(self.eta[i]), None, rival)
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
             pdf_fwd_w=dr.select(is_delta, 0, pdf_fwd_w),
@@ -173,7 +172,11 @@ class Recursion:
             cos_out=cos_out,
             delta=is_delta,
         )
-        return mis.scatter(self.h, partial, coefficient, step, merge)
+        after = mis.scatter(self.h, partial, coefficient, step)
+        if self.eta is None:
+            return after
+        merges = mis.scattered_merges(self.h, partial, step, self.h.start(self.eta[i]), rival)
+        return mis.Partial(after.d_vcm, after.d_vc, *merges)
 
     def _along_light(self):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.

@@ -137,8 +137,9 @@ def test_sums_of_guiding_pass_delta_events():
         pdf_fwd_w=mi.Float(0), pdf_rev_w=mi.Float(0), cos_out=mi.Float(0.5), delta=mi.Bool(True)
     )
     before = mis.Partial(mi.Float(1), mi.Float(3), mi.Float(3))
-    after = mis.scatter(mis.Heuristic("balance"), before, 1, step, mis.Merge(mi.Float(7), mi.Bool(True)))
-    assert after.d_vm[0] == after.d_vc[0] == 1.5
+    h, merge = mis.Heuristic("balance"), mis.Merge(mi.Float(7), mi.Bool(True))
+    d_vm, after = mis.scattered_on_sds_path(h, before, step, merge), mis.scatter(h, before, 1, step)
+    assert d_vm[0] == after.d_vc[0] == 1.5
 
 
 @pytest.mark.parametrize("name", settings.HEURISTICS)

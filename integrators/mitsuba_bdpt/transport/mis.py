@@ -70,16 +70,14 @@ class Partial:
 
 @dataclass
 class Merge:
-    """A merge at a vertex, or another strategy that samples SDS paths there.
+    """Another strategy that samples SDS paths at a vertex.
 
-    ``ratio``: its partial sum, kappa times the number of photon subpaths times the area of the disc;
-    ``isolated``: no edge of the path up to the event there is connected by a strategy in use; None of a
-    merge, which has instead the coefficient of the ``rival`` that connects the edge to the vertex.
+    ``ratio``: its partial sum; ``isolated``: no edge of the path up to the event there is connected by a
+    strategy in use.
     """
 
     ratio: mi.Float | mi.Vector4f
-    isolated: mi.Bool | None
-    rival: mi.Float | mi.Vector4f | int = 0
+    isolated: mi.Bool
 
 
 def is_connectible(partial: Partial, coefficient: Coefficient):
@@ -226,13 +224,11 @@ def to_area(
     )
 
 
-def scatter(
-    heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step, merge: Merge | None = None
-) -> Partial:
+def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step) -> Partial:
     """Fold the newest alternative and sample a direction (eqs. 34, 35; delta: 53, 54).
 
     ``coefficient`` of the newest alternative's class; ``step`` with ``pdf_fwd_w`` and ``pdf_rev_w`` (solid
-    angle), ``cos_out`` (geometric) and the mask ``delta``; ``merge`` at this vertex, or None.
+    angle), ``cos_out`` (geometric) and the mask ``delta``.
     """
     older = heuristic.combine(
         heuristic.scale(partial.d_vcm, coefficient),
@@ -249,20 +245,10 @@ def scatter(
             heuristic.scale(partial.d_vc, step.cos_out),
             heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
         )
-    d_vm = d_vm_newest = 0
-    if merge is not None and merge.isolated is not None:
-        d_vm = _scattered_on_sds_path(heuristic, partial, step, merge)
-    elif merge is not None:
-        d_vm, d_vm_newest = _scattered_merges(heuristic, partial, step, merge)
-    return Partial(
-        d_vcm=dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))),
-        d_vc=kept,
-        d_vm=d_vm,
-        d_vm_newest=d_vm_newest,
-    )
+    return Partial(dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))), kept)
 
 
-def _scattered_on_sds_path(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
+def scattered_on_sds_path(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
     """``d_vm`` after an event on SDS paths: earlier merges, and this vertex's unless delta."""
     merges = heuristic.combine(
         heuristic.scale(partial.d_vm, step.pdf_rev_w),
@@ -296,14 +282,16 @@ def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev
     return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
 
 
-def _scattered_merges(h: Heuristic, partial: Partial, step: Step, merge: Merge):
-    """``d_vm`` and ``d_vm_newest`` after an event, with merging.
+def scattered_merges(h: Heuristic, partial: Partial, step: Step, ratio: mi.Float, rival: Coefficient):
+    """``d_vm`` and ``d_vm_newest`` after an event where a merge has this ``ratio``.
 
-    Next to a delta event no edge is connected: the newest merge counts.
+    ``ratio``: kappa times the number of photon subpaths times the area of the disc; ``rival``: coefficient of
+    the class that connects the edge to the vertex. Next to a delta event no edge is connected: the newest
+    merge counts.
     """
-    connection, ratio = h.scale(partial.d_vcm, merge.rival), step.cos_out / step.pdf_fwd_w
-    older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), ratio)
-    newest = h.scale(dr.select(exceeds(merge.ratio, connection), merge.ratio, 0), ratio)
+    connection, factor = h.scale(partial.d_vcm, rival), step.cos_out / step.pdf_fwd_w
+    older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), factor)
+    newest = h.scale(dr.select(exceeds(ratio, connection), ratio, 0), factor)
     through = h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)
     return dr.select(step.delta, through, older), dr.select(step.delta, 0, newest)
 
@@ -319,8 +307,8 @@ def merges(
 ) -> PartialSum:
     """Merges at the vertices of a subpath whose last vertex is connected, as `alternatives`.
 
-    ``coefficient`` and ``own``: of the rivals that connect the edges to it and from it, see `Merge`;
-    ``ratio`` of a merge there.
+    ``coefficient`` and ``own``: of the rivals that connect the edges to it and from it; ``ratio`` of a merge
+    there: see `scattered_merges`.
     """
     connection = h.scale(partial.d_vcm, coefficient)
     there = h.scale(ratio, pdf_a)
@@ -347,10 +335,10 @@ def alternatives(
 def weigh_merge(
     h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple, connections: PartialSum
 ) -> mi.Float:
-    """Weight of a merge of this ``ratio`` (see `Merge`); 0 where merges do not dominate.
+    """Weight of a merge of this ``ratio`` (see `scattered_merges`); 0 where merges do not dominate.
 
     ``light`` and ``camera`` subpath: `Partial`, its ``d_vcm`` times the coefficient of the rival that
-    connects the last edge (see `Merge`), ``pdf_rev_w`` of that edge; ``connections``: sum of both.
+    connects the last edge, ``pdf_rev_w`` of that edge; ``connections``: sum of both.
     """
     older, v = 0, ratio
     for partial, connection, pdf_rev_w in (light, camera):

@@ -149,7 +149,7 @@ class PhotonStrategy:
     near_specular = False
 
     def ratio(self, kernel, p: mi.Point3f) -> mi.Float:
-        """Partial sum of a merge at ``p``, see `mis.Merge`."""
+        """Partial sum of a merge at ``p``, see `mis.scattered_merges`."""
         raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def may_merge(self, kernel, vertex, connection: mis.PartialSum) -> mi.Bool:

@@ -311,12 +311,10 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Wa
     active = vertex.hit & (walk.edges < side.last_edge) | passes
     first = direct_coefficient(kernel, vertex) if side.adjoint else side.coefficient
     coefficient = newest_coefficient(kernel, first, walk.edges)
-    sds, merge = _sds(kernel, side, walk, vertex, coefficient, step)
-    partial = mis.scatter(h, vertex.partial, coefficient, step, merge)
-    d_vcm, d_vc = walk.partial.d_vcm, walk.partial.d_vc
-    partial = replace(
-        partial, d_vcm=choose(passes, d_vcm, partial.d_vcm), d_vc=choose(passes, d_vc, partial.d_vc)
-    )
+    sds, merges = _sds(kernel, side, walk, vertex, coefficient, step)
+    before, after = walk.partial, mis.scatter(h, vertex.partial, coefficient, step)
+    d_vcm, d_vc = choose(passes, before.d_vcm, after.d_vcm), choose(passes, before.d_vc, after.d_vc)
+    partial = mis.Partial(d_vcm, d_vc, *merges)
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
@@ -374,19 +372,21 @@ def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Fl
 
 
 def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
-    """`Walk.sds` after the event, and the `mis.Merge` at ``vertex``, or None.
+    """`Walk.sds`, and the partial sums ``d_vm`` and ``d_vm_newest``, after the event at ``vertex``.
 
     ``coefficient``: that of the class that connects the edge to it.
     """
-    state, strategy = walk.sds, side.sds
+    state, strategy, h = walk.sds, side.sds, kernel.heuristic
     if strategy is not None and strategy.merges:
         rival = coefficient
         if not side.adjoint:
             rival = newest_coefficient(kernel, kernel.kappa.splat_count, walk.edges)
-        return state, mis.Merge(strategy.ratio(kernel, vertex.si.p), None, rival)
+        ratio = strategy.ratio(kernel, vertex.si.p)
+        return state, mis.scattered_merges(h, vertex.partial, step, ratio, rival)
     if state is None:
-        return None, None
-    state = state.after(kernel.heuristic, vertex, coefficient, step)
+        return None, (0, 0)
+    state = state.after(h, vertex, coefficient, step)
     if strategy is None or mis.is_absent(vertex.partial.d_vm):
-        return state, None
-    return state, strategy.merge(kernel, vertex, state.isolated)
+        return state, (0, 0)
+    merge = strategy.merge(kernel, vertex, state.isolated)
+    return state, (mis.scattered_on_sds_path(h, vertex.partial, step, merge), 0)
