@@ -209,14 +209,11 @@ class BDPTIntegrator(metaclass=ABCMeta):
         render = Render(scene, sensor, self.settings, 0, spp or 1)
         if spp:
             render = render.decided()
-        planner, table = render.planner, render.table
-        confidence, invalid = planner.confidence(), planner.decided.non_finite
-        missing = render.missing() if spp else None
-        warning = f"{missing.cause}; {missing.remedy}" if missing else ""
-        plan = replace(render.plan, skipped=(*planner.full.skipped, *planner.decided.left_out))
-        if plan.merging:
-            warning = f"merging: {render.why_merged}"
-        text = explain(render.prepared, plan, self.settings, table, confidence, invalid, warning)
+        planner, missing = render.planner, render.missing() if spp else None
+        about = f"{missing.cause}; {missing.remedy}" if missing else ""
+        if render.plan.merging:
+            about = f"merging: {render.why_merged}"
+        text = explain(render.prepared, self.settings, planner, render.table, about)
         if render.light_groups is not None:
             text = "\n".join([text, *render.light_groups.explained()])
         if spp is None:
@@ -224,7 +221,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
                 f"{text}\nno spp given: this is the plan before the pilot; with spp=..., it may become "
                 "another, with guided emission or merging, and unsampled light is estimated"
             )
-        return text if table else f"{text}\n{planner.why_no_pilot()}"
+        return text if render.table else f"{text}\n{planner.why_no_pilot()}"
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:

@@ -7,32 +7,31 @@ from fractions import Fraction
 from ..scene.diagnostics import spoilt
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.plan import Plan
 from .choice import NEAR, Prediction, why_not
 from .configuration import Configuration
+from .planner import Planner
 from .possible import unsampled_paths
 
 
 def explain(
     prepared: PreparedScene,
-    p: Plan,
     settings: Settings,
+    planner: Planner,
     table: list[Prediction],
-    confidence: float = 0.0,
-    invalid: int = 0,
     not_sampled: str = "",
 ) -> str:
     """Describe the strategies in use and those skipped.
 
-    ``table``: a pilot's predictions (`choice.choose`), with `choice.confidence`; empty without a pilot.
-    ``invalid``: number of non-finite values of the pilot; ``not_sampled``: sentence about unsampled light.
+    ``table``: predictions of the planner's pilot, if one ran; ``not_sampled``: about unsampled light.
     """
+    p, decided = planner.plan, planner.decided
     light = "no light subpaths"
     if p.light:
         count = p.camera_paths_per_light_path
         light = f"one light subpath per {f'{count} camera subpaths' if count > 1 else 'camera subpath'}"
         light += f", each of which is connected with {p.joined} of them" * (p.joined > 1)
     merged = "SDS paths" + " and of paths that connections rarely sample" * bool(prepared.near_specular)
+    left = f"{p.emission.left:.0%}" if p.emission else ""
     used = {
         "s=0 (camera subpath hits an emitter)": p.hit,
         "s=1 (next-event estimation)": p.direct,
@@ -41,14 +40,13 @@ def explain(
         "t=0 (light subpath hits the sensor)": p.arrival,
         f"guided s=0 ({p.guided} per vertex of SDS paths)": p.guided,
         f"inner connections s,t>=2 ({p.connections})": p.connections != "none",
-        _guided_emission(p): p.emission,
+        f"guided emission (predicted to lower squared errors of light subpaths to {left})": p.emission,
         f"vertex merging (photon mapping) of {merged} (the render is consistent, not unbiased)": p.merging,
     }
-    lines = [
-        f"heuristic {settings.heuristic}, {light}",
-        *(f"used: {name}" for name, on in used.items() if on),
-    ]
-    lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in p.skipped]
+    lines = [f"heuristic {settings.heuristic}, {light}"]
+    lines += [f"used: {name}" for name, on in used.items() if on]
+    skipped = (*planner.full.skipped, *decided.left_out)
+    lines += [f"skipped ({s['level']}): {s['class']}: {s['why']}" for s in skipped]
     longest = prepared.stored_vertices(settings)
     if (p.splat or p.arrival or p.connections != "none") and longest < settings.max_depth:
         lines.append(f"limited: paths of more than {longest} edges use s=0 and s=1 only")
@@ -61,20 +59,9 @@ def explain(
             "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
             "one kernel"
         )
-    if invalid:
-        lines.append(
-            f"invalid samples (NaN or infinite): {invalid} of the pilot, which decided from the rest"
-        )
-    return "\n".join(lines + _pilot(settings, table, confidence))
-
-
-def _guided_emission(p: Plan) -> str:
-    if p.emission is None:
-        return ""
-    return (
-        "guided emission (the pilot predicts that it lowers the squared error of strategies with light "
-        f"subpaths to {p.emission.left:.0%})"
-    )
+    if decided.non_finite:
+        lines.append(f"invalid samples (NaN or infinite): {decided.non_finite} of the pilot")
+    return "\n".join(lines + (_pilot(settings, table, planner.confidence()) if table else []))
 
 
 def _named(candidate: Configuration) -> str:
@@ -89,14 +76,8 @@ def _named(candidate: Configuration) -> str:
 
 def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
     """Describe the predictions; the last line is the choice and its confidence."""
-    if not table:
-        return []
-    head = (
-        "pilot: predictions, the chosen configuration first (time to the same error; cost and error relative "
-    )
     lines = [
-        head
-        + "to path tracing alone; error: geometric mean of the relMSE of the mean render and a typical one)",
+        "pilot: the chosen configuration first; cost and relMSE relative to path tracing alone",
         "  relative time  cost per sample     error  configuration",
     ]
     for row in table:

@@ -22,6 +22,7 @@ from ..host.introspection import all_shapes, named
 from ..host.jit import evaluated_mode, gc_paused
 from ..host.notices import warn_once
 from ..sampling.points import Points
+from ..scene.diagnostics import NAMED
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
@@ -45,9 +46,6 @@ NARROW = 100.0
 
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
-
-# Most emitters and shapes named in a message.
-NAMED = 3
 
 SEED = 0x6C6F7374
 
@@ -238,5 +236,5 @@ def _kernel(prepared: PreparedScene, plan: Plan, settings: Settings, undersample
 def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:
     """At most `NAMED` of the ``shapes``, by index, through which most of ``found`` is seen."""
     amounts = np.bincount(shapes, np.where(np.isfinite(found), found, 0))
-    order = [i for i in np.argsort(-amounts) if i and amounts[i] > WARN_SHARE * amounts.sum()]
-    return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(int(i)))[0] for i in order[:NAMED]]
+    order = [int(i) for i in np.argsort(-amounts) if i and amounts[i] > WARN_SHARE * amounts.sum()]
+    return [dr.reinterpret_array(mi.ShapePtr, mi.UInt32(i))[0] for i in order[:NAMED]]
