@@ -924,8 +924,8 @@ MUTANTS = (
     Mutant(
         "media: the near side's medium where a connection starts",
         "media/space.py",
-        "self.media.beyond(vertex.si, d, vertex.medium)",
-        "self.media.beyond(vertex.si, -d, vertex.medium)",
+        "self.media.beyond(z.si, shadow_ray.d, z.medium)",
+        "self.media.beyond(z.si, -shadow_ray.d, z.medium)",
         ("tests/images/test_media_identities.py::test_joins_start_on_the_right_side_of_a_boundary",),
     ),
     Mutant(
@@ -1053,16 +1053,16 @@ MUTANTS = (
     ),
     Mutant(
         "media: t = 0 has the colour of its start",
-        "transport/techniques.py",
-        "throughput = walk.edge.without_collision(throughput, depth)",
-        "throughput = walk.throughput",
+        "media/transmittance.py",
+        "edge.without_collision(walk.throughput, depth)",
+        "walk.throughput",
         ("tests/images/test_media_known_answers.py::test_meter_in_fog[chromatic, absorbing-all]",),
     ),
     Mutant(
         "media: light from infinity arrives before its flight ends",
-        "transport/techniques.py",
-        "return (length > 0) & before_end, depth",
-        "return length > 0, depth",
+        "media/transmittance.py",
+        "return (length > 0) & before_end,",
+        "return length > 0,",
         (
             "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[null-sky]",
             "tests/images/test_media_edges.py::test_light_from_infinity_hits_a_lens[mask-sun]",
@@ -1139,16 +1139,16 @@ MUTANTS = (
     ),
     Mutant(
         "media: t = 0 counts what lies before a mask twice",
-        "transport/techniques.py",
+        "media/transmittance.py",
         "length = distance - dr.norm(walk.o - walk.previous)",
         "length = distance",
         ("tests/images/test_media_plausible_bugs.py::test_a_lens_behind_a_mask_in_fog",),
     ),
     Mutant(
         "media: t = 0 has T~ of what lies behind a mask",
-        "transport/techniques.py",
-        "tr = walk.edge.weight_transmittance(depth)",
-        "tr = replace(walk.edge, depth=depth).weight_transmittance()",
+        "media/transmittance.py",
+        "edge.weight_transmittance(depth)",
+        "edge.weight_transmittance(depth - edge.depth)",
         ("tests/images/test_media_plausible_bugs.py::test_a_meter_behind_a_mask_in_fog",),
     ),
     Mutant(

@@ -136,7 +136,7 @@ def depart(
     u = kernel.points.draw_1d(side.name, side.stream, Purpose.FLIGHT, vertex.event + 1)
     edge = replace(
         before,
-        medium=space.medium_towards(vertex, ray.d),
+        medium=space.media.beyond(vertex.si, ray.d, vertex.medium),
         maxt=dr.select(passes, before.maxt, dr.inf),
         depth=dr.select(passes, before.depth, 0),
         rest=dr.select(passes, before.rest, tracking.exponential(u)),

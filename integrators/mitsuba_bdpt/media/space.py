@@ -36,7 +36,7 @@ class Space(Vacuum):
     begin = flight.begin
     arrive = flight.arrive
     depart = flight.depart
-    depth_along = transmittance.depth_along
+    up_to_sensor = transmittance.up_to_sensor
 
     @property
     def phase(self) -> PhaseFunctions | None:
@@ -46,27 +46,22 @@ class Space(Vacuum):
     def counters(self) -> tuple[str, ...]:
         return MEDIA if self.media.grids else MEDIA[:1]
 
-    def medium_towards(self, vertex, d: mi.Vector3f) -> mi.UInt32:
-        """Index of the medium at ``vertex`` in direction ``d``."""
-        return self.media.beyond(vertex.si, d, vertex.medium)
-
     def allows_next_event(self, vertex):
         if self.media.all_lit:
             return mi.Bool(True)
         return ~vertex.volume | dr.gather(mi.Bool, self.media.lit, vertex.medium)
 
     def guessed(self, vertex, between):
-        sigma = self.media.mean(self.medium_towards(vertex, between))
+        sigma = self.media.mean(self.media.beyond(vertex.si, between, vertex.medium))
         return dr.exp(-dr.minimum(sigma * dr.norm(between), _GUESSED_DEPTH))
 
     def seen(self, kernel, c):
         shadow_ray = c.shadow_ray
         z, medium, event, word = shadow_ray.vertex, kernel.sensor_medium, mi.UInt32(0), mi.UInt32(0)
         if z is not None:
-            medium, event = self.medium_towards(z, shadow_ray.d), z.event
+            medium, event = self.media.beyond(z.si, shadow_ray.d, z.medium), z.event
         if self.media.grids:
-            series = shadow_ray.stream, Purpose.TRACKING, event, 1 + shadow_ray.number
-            word = kernel.points.series(*series)
+            word = kernel.points.series(shadow_ray.stream, Purpose.TRACKING, event, 1 + shadow_ray.number)
         ends = shadow_ray.ray, medium, c.active, shadow_ray.own
         crossing = transmittance.between(self, *ends, word, shadow_ray.hidden)
         weight, shares = kernel.heuristic.weigh(*c.sides, of_depth(crossing.depth))

@@ -16,7 +16,12 @@ from . import tracking
 from .media import Media, depth_of
 
 if TYPE_CHECKING:
+    from ..sensors.records import SensorHit
+    from ..transport.walk import Vertex, Walk
     from .space import Space
+
+# Relative rounding error of distances.
+_ROUNDING = 1e-4
 
 
 @dataclass
@@ -48,14 +53,19 @@ def between(space: Space, ray, medium, active, own=None, word: mi.UInt32 | int =
     return through_surfaces(space, ray, medium, active, own, word, hidden)
 
 
-def depth_along(space: Space, ray: mi.Ray3f, medium: mi.UInt32, active: mi.Bool):
-    """Optical depth of T~ along ``ray``, from ``medium`` to its end or what blocks it.
-
-    The end may lie on a surface, which rounding puts before or behind it.
-    """
-    if not space.media.null_lobes:
-        return _along(space.media, medium, ray, ray.maxt, mi.UInt32(0), active)[1]
-    return through_surfaces(space, ray, medium, active).depth
+def up_to_sensor(space: Space, walk: Walk, y: Vertex, z: SensorHit, active):
+    distance = dr.sqrt(z.dist2) - z.near
+    length = distance - dr.norm(walk.o - walk.previous)
+    ray = mi.Ray3f(walk.o, walk.d, dr.maximum(length, 0), y.si.time, y.si.wavelengths)
+    edge = walk.edge
+    if space.media.null_lobes:
+        depth = through_surfaces(space, ray, edge.medium, active).depth
+    else:
+        depth = _along(space.media, edge.medium, ray, ray.maxt, mi.UInt32(0), active)[1]
+    # Up to rounding: y may be on the sensor's own surface.
+    before_end = ~y.hit | (distance <= dr.norm(y.si.p - walk.previous) * (1 + _ROUNDING))
+    throughput, tr = edge.without_collision(walk.throughput, depth), edge.weight_transmittance(depth)
+    return (length > 0) & before_end, throughput, tr
 
 
 def _along(media: Media, medium, ray, length, word, active):

@@ -16,7 +16,7 @@ import mitsuba as mi
 from ..emitters.records import Direct, Emission
 from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
-from ..sensors.records import CameraConnection, SensorHit
+from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, spectra
 from .alternatives import (
     direct_coefficient,
@@ -259,10 +259,6 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     return c
 
 
-# Relative rounding error of distances.
-_ROUNDING = 1e-4
-
-
 def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
@@ -273,12 +269,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     directly = walk.edges == 1
     z = kernel.camera.hit(_reaching(walk, y), y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
-    throughput, tr = walk.throughput, None
-    if kernel.has_media:
-        reached, depth = _edge_to_sensor(kernel, walk, y, z, active)
-        active &= reached
-        throughput = walk.edge.without_collision(throughput, depth)
-        tr = walk.edge.weight_transmittance(depth)
+    reached, throughput, tr = kernel.space.up_to_sensor(walk, y, z, active)
+    active &= reached
     if kernel.plan.hide_emitters:
         active &= walk.seen
     value = throughput * (z.importance * dr.rcp(kernel.count_light))
@@ -317,19 +309,6 @@ def _reaching(walk: Walk, y: Vertex):
     pi = mi.PreliminaryIntersection3f(walk.pi)
     pi.t = dr.select(y.hit, dr.norm(y.si.p - walk.previous), dr.inf)
     return replace(walk, pi=pi)
-
-
-def _edge_to_sensor(kernel: Kernel, walk: Walk, y: Vertex, z: SensorHit, active):
-    """Whether the sensor lies between ``walk.o`` and ``y``, and its optical depth.
-
-    Up to rounding: ``y`` may be on the sensor's own surface.
-    """
-    distance = dr.sqrt(z.dist2) - z.near
-    length = distance - dr.norm(walk.o - walk.previous)
-    ray = mi.Ray3f(walk.o, walk.d, dr.maximum(length, 0), y.si.time, y.si.wavelengths)
-    depth = kernel.space.depth_along(ray, walk.edge.medium, active)
-    before_end = ~y.hit | (distance <= dr.norm(y.si.p - walk.previous) * (1 + _ROUNDING))
-    return (length > 0) & before_end, depth
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):

@@ -87,6 +87,13 @@ class Vacuum:
         pi, _ = rays.intersect_past_emitters(self.scene, self.shape_errors, ray, active, coherent=False)
         return replace(c, active=active & ~pi.is_valid())
 
+    def up_to_sensor(self, walk, y, z, active: mi.Bool, /) -> tuple[mi.Bool, mi.Spectrum, Any]:
+        """The edge of a light subpath that ends at ``y``, up to the point ``z`` on the sensor.
+
+        Returns whether it reaches ``z``, its throughput and T~ there.
+        """
+        return mi.Bool(True), walk.throughput, None
+
     def clear(self, ray: mi.Ray3f, medium: mi.UInt32 | None, active: mi.Bool) -> Any:
         """Mask: no surface blocks ``ray``, which starts in ``medium``."""
         return ~rays.occluded(self.scene, ray, active)
