@@ -15,7 +15,7 @@ import scene_parts
 import variants
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.media.equal import representatives
-from mitsuba_bdpt.media.media import Look
+from mitsuba_bdpt.media.media import MediumProperties
 from mitsuba_bdpt.media.transmittance import through_surfaces
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport.inputs import Shared
@@ -105,7 +105,7 @@ def test_fog_between_opaque_walls(medium, tagged, optimize):
     for lamp in (None, {}, up):
         scene = box(medium, (lambda: {"exterior": medium()}) if tagged else None, lamp, optimize=optimize)
         media, light = prepared(scene)
-        assert (len(media.looks), light.contradiction, light.outside) == (1, "", 0)
+        assert (len(media.properties), light.contradiction, light.outside) == (1, "", 0)
         assert (starts(scene) != 1).mean() < 5e-3  # rays that stay between the lamp and the ceiling
 
 
@@ -190,7 +190,7 @@ def test_a_lamp_in_a_room_seen_from_outside():
     lamp, eye = parts.lamp(center=[2, 1, 2], radius=0.5), parts.sensor(origin=(0, 5.1, 0.01), near=1e-3)
     _, light = prepared(windowed(0.75, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0])))
     light.settle()
-    assert (light.contradiction, sorted(light._starts[:, 0]), light._any_asked) == ("", [0, 1], False)
+    assert (light.contradiction, sorted(light._starts[:, 0]), light._any_traced) == ("", [0, 1], False)
 
 
 def test_light_from_infinity_over_an_open_sea():
@@ -282,14 +282,14 @@ def test_media_are_told_apart_by_what_they_are(variant):
     mi.set_variant(variant)
     for name, (one, other, equal) in PAIRS.items():
         media = [mi.load_dict(fog(0.1)), mi.load_dict(one()), mi.load_dict(other())]
-        assert representatives([Look(m) for m in media]) == [0, 1, 1 if equal else 2], name
+        assert representatives([MediumProperties(m) for m in media]) == [0, 1, 1 if equal else 2], name
 
 
 def test_media_that_hold_one_grid():
     """As above. Expected: two media that hold the same volume are equal, if all else is."""
     volume = mi.load_dict(grid()["sigma_t"])
     media = [mi.load_dict(grid(scale=scale) | {"sigma_t": volume}) for scale in (3.0, 3.0, 2.9)]
-    assert representatives([Look(m) for m in media]) == [0, 0, 2]
+    assert representatives([MediumProperties(m) for m in media]) == [0, 0, 2]
 
 
 def test_media_of_python_are_equal_to_themselves_only():
@@ -302,7 +302,7 @@ def test_media_of_python_are_equal_to_themselves_only():
         fog() | {"phase": {"type": "own_phase", "a": 0.3}},
     )
     for medium in own:
-        assert representatives([Look(mi.load_dict(medium)) for _ in range(2)]) == [0, 1]
+        assert representatives([MediumProperties(mi.load_dict(medium)) for _ in range(2)]) == [0, 1]
 
 
 # -- connections: the medium that a shadow ray arrives in at a lamp -------------------------------------
@@ -351,9 +351,9 @@ def test_kernels_ask_for_the_medium_only_where_emissions_differ():
     room = mi.cornell_box() | {"vase": parts.ball("dielectric", 0.1, (0.3, -0.8, 0.4), interior=milk())}
     for scene, asks in ((room, False), (CONNECTED["a lamp partly in milk"](), True)):
         _, light = prepared(mi.load_dict(scene))
-        assert light._any_asked
+        assert light._any_traced
         light.settle()
-        assert light._any_asked == asks
+        assert light._any_traced == asks
 
 
 @pytest.mark.parametrize("name", CONNECTED)

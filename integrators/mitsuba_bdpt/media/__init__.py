@@ -53,5 +53,5 @@ def prepare(
         )
     space = Space(emitters.scene, emitters.shape_errors, media, traits.null_transmission)
     far = medium_at_far_plane(space, sensor)
-    space = replace(space, clipped=far > 0 and media.looks[far - 1].medium.is_homogeneous())
+    space = replace(space, clipped=far > 0 and media.properties[far - 1].medium.is_homogeneous())
     return space, LightMedia(space, emitters, sensor, far, about)

@@ -15,27 +15,27 @@ import numpy as np
 from ..host.introspection import children, own_parameters
 
 if TYPE_CHECKING:
-    from .media import Look
+    from .media import MediumProperties
 
 # Relative difference due to rounding (sigma_t 0.4 with scale 2, and 0.8).
 _ROUNDING = 1e-5
 
 
-def representatives(looks: list[Look]) -> list[int]:
-    """Return for the medium of each of ``looks`` the index of the first one that is equal to it.
+def representatives(media: list[MediumProperties]) -> list[int]:
+    """Return for each of ``media`` the index of the first one that is equal to it.
 
-    Equal media have the same classes and parameters, and the same answers up to rounding. Constants count by
-    the answers alone, since only their product matters. Varying volumes and plugins in Python equal only
+    Equal media have the same classes and parameters, and the same values up to rounding. Constants count by
+    the values alone, since only their product matters. Varying volumes and plugins in Python equal only
     themselves: Mitsuba exposes neither a grid's filter nor its wrap mode.
     """
-    keys = [(look.medium.use_emitter_sampling(), *_key(look.medium)) for look in looks]
+    keys = [(m.medium.use_emitter_sampling(), *_key(m.medium)) for m in media]
 
     def are_equal(i: int, j: int) -> bool:
         return keys[i] == keys[j] and np.allclose(
-            looks[i].answers, looks[j].answers, rtol=_ROUNDING, atol=0, equal_nan=True
+            media[i].values, media[j].values, rtol=_ROUNDING, atol=0, equal_nan=True
         )
 
-    return [next((j for j in range(i) if are_equal(j, i)), i) for i in range(len(looks))]
+    return [next((j for j in range(i) if are_equal(j, i)), i) for i in range(len(media))]
 
 
 def _key(owner: mi.Object) -> Iterator[Hashable]:

@@ -58,7 +58,7 @@ class LightMedia:
         self.outside = outside = _outside(space, around, lines)
         self._outside = dr.opaque(mi.UInt32, outside)
         # An endless homogeneous medium absorbs all light from infinity.
-        endless = space.media.looks[outside - 1] if outside else None
+        endless = space.media.properties[outside - 1] if outside else None
         self.hides_infinity = endless is not None and endless.homogeneous and endless.least > 0
         self.contradiction = (
             _contradiction_of_sensor(space, sensor, around)
@@ -82,13 +82,13 @@ class LightMedia:
 
     def _tabulate(self, starts: np.ndarray):
         """Store the results of `start`, one row per emitter."""
-        self._starts, self._any_asked = starts, bool(starts[:, 2].any())
-        self._sides, self._asked = mi.UInt32(starts[:, :2].ravel()), mi.Bool(starts[:, 2] != 0)
-        dr.make_opaque(self._sides, self._asked)
+        self._starts, self._any_traced = starts, bool(starts[:, 2].any())
+        self._sides, self._by_ray = mi.UInt32(starts[:, :2].ravel()), mi.Bool(starts[:, 2] != 0)
+        dr.make_opaque(self._sides, self._by_ray)
 
     def settle(self):
         """Find the emitters whose emissions all start in one medium; to be called before `at` is recorded."""
-        if self._settled or not self._any_asked:
+        if self._settled or not self._any_traced:
             return
         self._settled, count = True, self._emitters.count
         u = np.random.default_rng(0).random((4, min(_EMISSIONS * count, _ALL_EMISSIONS)))
@@ -96,12 +96,12 @@ class LightMedia:
         shared = Shared(mi.Float(0), wavelengths, mi.UnpolarizedSpectrum(1), mi.Float(0.5))
         e = self._emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), shared, mi.Bool(True))
         number, known, index = _arrays(u.shape[1], *self._traced(e), e.index)
-        media = len(self._space.media.looks) + 1
+        media = len(self._space.media.properties) + 1
         found = np.bincount((index * media + number)[known], minlength=count * media).reshape(count, media)
         starts, total, most = self._starts.copy(), found.sum(axis=1), found.max(axis=1)
-        told = (starts[:, 2] != 0) & (total > 0)
-        starts[told, :2] = found.argmax(axis=1)[told, None]
-        starts[told & (total >= _FEWEST) & (most == total), 2] = False
+        settled = (starts[:, 2] != 0) & (total > 0)
+        starts[settled, :2] = found.argmax(axis=1)[settled, None]
+        starts[settled & (total >= _FEWEST) & (most == total), 2] = False
         self._tabulate(starts)
 
     def at(self, e) -> mi.UInt32:
@@ -118,13 +118,13 @@ class LightMedia:
         known = mi.Bool(True)
         outwards = dr.dot(e.anchor.n, e.d) >= 0
         number = dr.gather(mi.UInt32, self._sides, 2 * e.index + dr.select(outwards, mi.UInt32(0), 1))
-        if self._any_asked:
-            asked = dr.gather(mi.Bool, self._asked, e.index)
+        if self._any_traced:
+            traced = dr.gather(mi.Bool, self._by_ray, e.index)
             ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
-            near, found, escaped = near_side(self._space, ray, asked)
-            known = ~asked | found | escaped
+            near, found, escaped = near_side(self._space, ray, traced)
+            known = ~traced | found | escaped
             unless_found = dr.select(escaped, self._outside, number)
-            number = dr.select(asked, dr.select(found, near, unless_found), number)
+            number = dr.select(traced, dr.select(found, near, unless_found), number)
         return dr.select(e.infinite, self._outside, number), known
 
 
@@ -241,12 +241,12 @@ def _contradiction_of_sensor(space: Space, sensor: mi.Sensor, around: list[np.nd
 
 
 def _called(space: Space, number: int) -> str:
-    return f"the medium {named(space.media.looks[number - 1].medium)}" if number else "no medium"
+    return f"the medium {named(space.media.properties[number - 1].medium)}" if number else "no medium"
 
 
 def _contradiction_of_phases(space: Space) -> str:
     """Why scattering is not reciprocal; empty if it is."""
-    for medium in (look.medium for look in space.media.looks):
+    for medium in (p.medium for p in space.media.properties):
         if asymmetry(medium) > _SYMMETRIC:
             return (
                 f"the phase function of medium {named(medium)} ({medium.phase_function().class_name()}) "
@@ -271,14 +271,14 @@ def _contradiction_at_infinity(space: Space, outside: int, lines: mi.Ray3f | Non
             )
     if not outside:
         return ""
-    look = space.media.looks[outside - 1]
-    name = named(look.medium)
-    if not look.homogeneous:
+    endless = space.media.properties[outside - 1]
+    name = named(endless.medium)
+    if not endless.homogeneous:
         return (
             f"the grid of medium {name} has no boundary, so that light from infinity starts within "
             "it: put a shape with a null BSDF around it"
         )
-    if look.least == 0 and look.majorant.max() > 0:
+    if endless.least == 0 and endless.majorant.max() > 0:
         return (
             f"medium {name} has no end and lets some wavelengths of light from infinity through, "
             "but not others: put a shape with a null BSDF around it"

@@ -32,7 +32,7 @@ class Media:
 
     Equal media (`equal.representatives`) share a number (``UInt32``).
 
-    * ``looks``: the `Look` of each number; ``sensor``: number of the sensor's medium.
+    * ``properties``: the `MediumProperties` of each number; ``sensor``: number of the sensor's medium.
     * ``grids``: some medium is heterogeneous; ``coloured_grids``: the extinction of one depends on
       wavelength.
     * ``scatters``: some albedo is not 0.
@@ -45,26 +45,26 @@ class Media:
     """
 
     def __init__(self, found: dict[int, mi.Medium], sensor: mi.Medium | None, bsdfs: Iterable[mi.BSDF]):
-        looks = [Look(medium) for medium in found.values()]
-        firsts = representatives(looks)
+        properties = [MediumProperties(medium) for medium in found.values()]
+        firsts = representatives(properties)
         distinct = sorted(set(firsts))
         self._number_of = {place: distinct.index(i) + 1 for place, i in zip(found, firsts, strict=True)}
-        self.looks = looks = [looks[i] for i in distinct]
+        self.properties = properties = [properties[i] for i in distinct]
         self.sensor = self.number_of(sensor)
-        self.grids = not all(look.homogeneous for look in looks)
-        self.scatters = any(look.scatters for look in looks)
-        self.gray = all(look.gray for look in looks)
-        self.coloured_grids = any(look.coloured_grid for look in looks)
-        lit = [look.medium.use_emitter_sampling() for look in looks]
+        self.grids = not all(p.homogeneous for p in properties)
+        self.scatters = any(p.scatters for p in properties)
+        self.gray = all(p.gray for p in properties)
+        self.coloured_grids = any(p.coloured_grid for p in properties)
+        lit = [p.medium.use_emitter_sampling() for p in properties]
         self.all_lit, self.lit = all(lit), mi.Bool([False, *lit])
         # Numbers by Mitsuba's registry index; the others by number. No extinction if more matters to it.
         self._numbers = mi.UInt32([self._number_of.get(place, 0) for place in range(max(found) + 1)])
         self._extinction = None
-        if not any(look.directional for look in looks) and (self.gray or not mi.is_spectral):
-            table = np.array([np.zeros_like(looks[0].majorant), *(look.majorant for look in looks)])
+        if not any(p.directional for p in properties) and (self.gray or not mi.is_spectral):
+            table = np.array([np.zeros_like(properties[0].majorant), *(p.majorant for p in properties)])
             self._extinction = mi.Float(table[:, 0]) if self.gray else mi.UnpolarizedSpectrum(table.T)
-        self._mean = mi.Float([0.0, *(look.mean for look in looks)])
-        self._homogeneous = mi.Bool([False, *(look.homogeneous for look in looks)])
+        self._mean = mi.Float([0.0, *(p.mean for p in properties)])
+        self._homogeneous = mi.Bool([False, *(p.homogeneous for p in properties)])
         dr.make_opaque(self._numbers, self._extinction, self._mean, self._homogeneous, self.lit)
         null = [b for b in bsdfs if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
         only = [b for b in null if not b.flags() & OTHER_LOBES]
@@ -102,17 +102,17 @@ class Media:
             majorant = mi.UnpolarizedSpectrum(medium.get_majorant(mei, active))
             return majorant[0] if self.gray else majorant
 
-        answer = self.query(number, majorant, interaction(mi.Point3f(0), ray.d, ray), active)
-        return dr.select(active & (number != 0), answer, 0)
+        found = self.query(number, majorant, interaction(mi.Point3f(0), ray.d, ray), active)
+        return dr.select(active & (number != 0), found, 0)
 
-    def query(self, number: mi.UInt32, question, *args) -> Any:
-        """Evaluate ``question(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
+    def query(self, number: mi.UInt32, call, *args) -> Any:
+        """Evaluate ``call(medium, *args)``, undefined in vacuum; ``args[-1]``: mask."""
         *others, active = args
         active = active & (number != 0)
-        questions = [partial(question, look.medium) for look in self.looks]
-        if len(questions) == 1:
-            return questions[0](*others, active)
-        return dr.switch(dr.select(active, number - 1, 0), questions, *others, active)
+        calls = [partial(call, p.medium) for p in self.properties]
+        if len(calls) == 1:
+            return calls[0](*others, active)
+        return dr.switch(dr.select(active, number - 1, 0), calls, *others, active)
 
 
 # Lobes other than null.
@@ -231,7 +231,7 @@ def _strange(medium: mi.Medium, sigma_s: np.ndarray, sigma_t: np.ndarray) -> str
     return ""
 
 
-class Look:
+class MediumProperties:
     """Properties of a medium, from its values at `probes`.
 
     ``majorant`` (channels,): maximum over directions; ``gray``, ``coloured_grid``, ``scatters``: see `Media`;
@@ -258,7 +258,7 @@ class Look:
         self.mean = float((majorant if homogeneous else sigma_t).mean())
 
     @cached_property
-    def answers(self) -> np.ndarray:
+    def values(self) -> np.ndarray:
         """Majorant, sigma_s, sigma_t, phase function, one row per channel."""
         wo, context = random_directions(np.random.default_rng(1), _PROBES), mi.PhaseFunctionContext(None)
         value, _ = self.medium.phase_function().eval_pdf(context, self._probes, wo)

@@ -83,7 +83,7 @@ class PhaseFunctions:
     ) -> tuple[Step, Evaluation | None]:
         """Continue a subpath; results as in `bsdf.sample`."""
 
-        def questions(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
+        def call(medium: mi.Medium, mei, u1, u2, sampled, wo, evaluated, _):
             phase, ctx = medium.phase_function(), mi.PhaseFunctionContext(None)
             d, weight, pdf = phase.sample(ctx, mei, u1, u2, sampled)
             _, _, pdf_rev = _evaluated(medium, mei, d, sampled)
@@ -95,7 +95,7 @@ class PhaseFunctions:
         # Subpaths that end here are still connected.
         queried = active | evaluated
         d, weight, pdf, pdf_rev, joined = self.media.query(
-            vertex.medium, questions, _at(vertex), u1, u2, active, wo, evaluated, queried
+            vertex.medium, call, _at(vertex), u1, u2, active, wo, evaluated, queried
         )
         step = Step(
             # Otherwise its length would drift along subpaths: frames are built from directions.

@@ -53,7 +53,7 @@ def warn_of_media(prepared, sensor):
     media = prepared.light_media
     if media is None:
         return
-    texts = [look.strange for look in prepared.space.media.looks]
+    texts = [p.strange for p in prepared.space.media.properties]
     if media.contradiction:
         texts.append(
             f"{media.contradiction}; light subpaths would see another scene than the camera, so there are "

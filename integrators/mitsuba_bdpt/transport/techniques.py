@@ -293,8 +293,8 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))
     weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=merged)
     if z.surroundings is not None and kernel.emitters.at_infinity:
-        asked = active & emission.infinite & directly
-        active &= ~asked | kernel.space.clear(z.surroundings, kernel.sensor_medium, asked)
+        straight = active & emission.infinite & directly
+        active &= ~straight | kernel.space.clear(z.surroundings, kernel.sensor_medium, straight)
     ends = walk.edges + 1, mi.UInt32(0)
     c = Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
     if walk.layer is not None:
