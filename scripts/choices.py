@@ -95,7 +95,7 @@ def named(way: Configuration) -> str:
     if not way.light_paths:
         return f"0, {way.kappa_direct:g}"
     lane = f", {way.joined} per lane" if way.joined > 1 else ""
-    return f"1/{way.camera_paths_per_light_path} {way.connections} {way.kappa_light:g}{lane}"
+    return f"1/{round(1 / way.light_paths)} {way.connections} {way.kappa_light:g}{lane}"
 
 
 def piloted(scene, settings, seed: int | None = None) -> list[Prediction]:

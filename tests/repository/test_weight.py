@@ -11,7 +11,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7690,
     "transport merging guided_emission": 6749,
-    "planning": 2320,
+    "planning": 2294,
     "emitters": 2680,
     "cli": 1812,
     "media": 1350,
@@ -25,7 +25,7 @@ MOST = {
     "": 1557,  # top files
 }
 OUTSIDE = {"scripts": 6095, "tests": 44935}
-MOST_WORDS = 68540
+MOST_WORDS = 68538
 
 
 def _lines(files):

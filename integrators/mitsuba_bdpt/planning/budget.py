@@ -92,11 +92,6 @@ def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: 
     return replace(full, camera_paths_per_light_path=UNFOCUSED, joined=joined)
 
 
-def is_open(full: Plan, settings: Settings) -> bool:
-    """Whether light subpaths are possible and no parameter fixes the strategies."""
-    return full.light and not fixed_by(settings)
-
-
 def fixed_by(settings: Settings) -> list[str]:
     """The parameters that fix the strategies, with their values (strategy images need all strategies)."""
     values = {name: getattr(settings, name) for name in ("skip", "light_paths", "connections")}

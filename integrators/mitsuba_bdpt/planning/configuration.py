@@ -60,11 +60,6 @@ class Configuration:
         """Index of the candidate that this is, whatever was decided beside it."""
         return CANDIDATES.index(replace(self, guided=0, emission=None))
 
-    @property
-    def camera_paths_per_light_path(self) -> int:
-        """Camera subpaths per light subpath (S); 1 without light subpaths."""
-        return round(1 / self.light_paths) if self.light_paths else 1
-
     def plan(self, full: Plan) -> Plan:
         """``full`` restricted to this configuration."""
         light = self.light_paths > 0
@@ -79,10 +74,10 @@ class Configuration:
             guided=max(self.guided, full.guided) if full.guidable and not full.merging else 0,
             merging=full.merging and (self.guided > 0 or not full.guidable),
         )
-        served = self.camera_paths_per_light_path if adopted.light else 1
-        joined = self.joined if adopted.connections == "one" else 1
-        emission = self.emission if adopted.light else None
-        return replace(adopted, camera_paths_per_light_path=served, joined=joined, emission=emission)
+        if not adopted.light:
+            return replace(adopted, camera_paths_per_light_path=1, joined=1, emission=None)
+        shared, joined = round(1 / self.light_paths), self.joined if adopted.connections == "one" else 1
+        return replace(adopted, camera_paths_per_light_path=shared, joined=joined, emission=self.emission)
 
 
 PATH_TRACING = Configuration(0.0, "none", 1.0, 1.0)
@@ -148,17 +143,9 @@ class Decision(Configuration):
 
     def record(self) -> dict[str, Any]:
         """Entry of ``statistics["decisions"]``."""
-        return {
-            "light_paths": self.light_paths,
-            "connections": self.connections,
-            "guided": self.guided,
-            "emission": None if self.emission is None else self.emission.record(),
-            "joined": self.joined,
-            "coefficients": {"t<=1": self.kappa_light, "s=1": self.kappa_direct},
-            "cost": self.cost,
-            "variance": self.variance,
-            "mean": self.mean,
-        }
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values["coefficients"] = {"t<=1": values.pop("kappa_light"), "s=1": values.pop("kappa_direct")}
+        return values | {"emission": None if self.emission is None else self.emission.record()}
 
     @staticmethod
     def read(record: dict[str, Any]) -> Decision:
@@ -171,12 +158,9 @@ class Decision(Configuration):
 
 
 # kappa of s = 1 under an environment whose largest radiance is at most `UNIFORM` times the mean, where s = 0
-# has little noise. From `UNIFORM_SAMPLES` on a pilot chooses. See experiments, "Choice of strategies".
-UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES = 0.7, 2, 1 << 20
-
-# Multiple of the samples that a pilot's kernel takes (`budget.samples_of_kernel`) from which on the pilot's
-# gain there pays for it.
-UNIFORM_TIMES = 10
+# has little noise. From `UNIFORM_SAMPLES`, and from `UNIFORM_TIMES` the samples that a pilot's kernel takes
+# (`budget.samples_of_kernel`) on a pilot chooses. See experiments, "Choice of strategies".
+UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_TIMES = 0.7, 2, 1 << 20, 10
 
 LEFT_OUT = [
     not_worth(name, "all light comes from a uniform environment, and the render is too short for a pilot")
@@ -185,24 +169,21 @@ LEFT_OUT = [
 
 
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:
-    """Those of `CANDIDATES` that sample the light that ``full`` samples."""
+    """Those of `CANDIDATES` that sample the light that ``full`` samples without t = 0 and merging.
 
-    def without_arrival(plan: Plan) -> tuple[str, ...]:
-        """Paths that are not sampled, when neither t = 0 nor merging counts.
-
-        A small lens rarely samples such paths, and merging is not unbiased: neither replaces connections.
-        """
-        return unsampled_paths(prepared, replace(plan, arrival=False, merging=False), settings)
-
-    def is_possible(candidate: Configuration) -> bool:
-        if candidate.connections != "none" and full.connections == "none":
-            return False
-        return (candidate.light_paths > 0 or not tied) and without_arrival(candidate.plan(full)) == unsampled
-
-    unsampled = without_arrival(full)
+    A small lens rarely samples light by t = 0, and merging is not unbiased: neither replaces connections.
+    """
     # A sensor with area sees delta emitters only by light subpaths.
     tied = prepared.emitters.unhittable and not prepared.camera.delta and (full.endpoints or full.arrival)
-    return [candidate for candidate in CANDIDATES if is_possible(candidate)]
+    plan = replace(full, arrival=False, merging=False)
+    unsampled = unsampled_paths(prepared, plan, settings)
+    return [
+        candidate
+        for candidate in CANDIDATES
+        if (candidate.connections == "none" or full.connections != "none")
+        and (candidate.light_paths or not tied)
+        and unsampled_paths(prepared, candidate.plan(plan), settings) == unsampled
+    ]
 
 
 def without_pilot(

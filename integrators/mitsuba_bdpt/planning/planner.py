@@ -19,14 +19,15 @@ from . import budget, choice, pilot
 from .configuration import LEFT_OUT, Decision, candidates, not_worth, without_pilot
 from .findings import SceneCache
 from .moments import Moments
-from .possible import may_join, plan
+from .possible import plan
 
 if TYPE_CHECKING:
     from ..guided_emission import Learnt
 
 # Least samples and pixels of a render whose camera subpaths may connect with several light subpaths, drawn by
-# an approximation (`connections`). Not with transmissive BSDFs, which the approximation does not cover, and
-# only with LLVM: lanes need four times the local memory. See experiments, "Several light subpaths per lane".
+# an approximation (`connections`). Not with transmissive BSDFs, which the approximation does not cover, nor
+# where rays test small shapes; with LLVM only, as lanes need four times the local memory. See experiments,
+# "Several light subpaths per lane".
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
@@ -141,7 +142,8 @@ class Planner:
             and self._pixels >= JOINED_PIXELS
             and not self._prepared.traits.transmits
             and dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-            and may_join(self._prepared, self.full.merging)
+            and self._prepared.space is None
+            and not (self.full.merging or self._prepared.emitters.shape_errors.small)
         )
 
     def _learnt(self, moments: Moments) -> Learnt | None:
@@ -193,9 +195,10 @@ class Planner:
 
         An empty reason means that one runs.
         """
-        if not budget.is_open(self.full, self._settings):
-            fixed = " and ".join(budget.fixed_by(self._settings))
-            return f"nothing to choose with {fixed}" if fixed else "no light subpaths are possible", None
+        if fixed := budget.fixed_by(self._settings):
+            return f"nothing to choose with {' and '.join(fixed)}", None
+        if not self.full.light:
+            return "no light subpaths are possible", None
         if self._pixels < budget.FEW_PIXELS:
             return f"the film has fewer than {budget.FEW_PIXELS} pixels", None
         samples = self._samples

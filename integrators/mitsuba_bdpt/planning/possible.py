@@ -80,11 +80,6 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     )
 
 
-def may_join(prepared: PreparedScene, merging: bool) -> bool:
-    """Whether camera subpaths may connect with several light subpaths: not where rays test small shapes."""
-    return prepared.space is None and not merging and not prepared.emitters.shape_errors.small
-
-
 def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str]:
     """Why emission cannot be guided, empty if it can, and the level of the reason."""
     if settings.guiding in ("photons", "never"):
