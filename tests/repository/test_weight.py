@@ -24,7 +24,7 @@ MOST = {
     "sensors": 934,
     "": 1557,  # top files
 }
-OUTSIDE = {"scripts": 6095, "tests": 44935}
+OUTSIDE = {"scripts": 6095, "tests": 44930}
 MOST_WORDS = 68538
 
 
