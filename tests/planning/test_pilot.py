@@ -412,13 +412,6 @@ def test_small_caustics_get_their_light(name, monkeypatch):
         assert render.decide()[0].candidate.light_paths >= 1 / 2
 
 
-def test_decisions_in_explain():
-    """Expected: what is replayed is explained, without a pilot."""
-    target = cornell(128)
-    text = forced(decision(ALONE)).explain(target, spp=64)
-    assert "no light subpaths" in text and "relative time" not in text
-
-
 def surroundings(bright=1.0, **emitters):
     """`sky` under a map of radiance 1 with one pixel so bright, and other emitters."""
     data = np.ones((16, 32, 3), dtype=np.float32)
@@ -475,17 +468,25 @@ def test_an_uniform_decides_without_a_pilot(monkeypatch):
 
 
 def test_why_there_is_no_pilot():
-    """Expected: `explain` with a number of samples says why it shows no table."""
-    assert "no pilot: the render has 4096 samples, a pilot needs 16384" in bdpt().explain(cornell(), spp=4)
-    assert "no pilot: the scene alone decides" in bdpt().explain(sky(), spp=4)
-    fixed = bdpt(light_paths=1, connections="one").explain(cornell(), spp=4)
-    assert "no pilot: nothing to choose with light_paths=1 and connections=one" in fixed
-    assert "no pilot: nothing to choose with skip=none" in bdpt(skip="none").explain(cornell(), spp=4)
-    assert "no pilot: nothing to choose with decisions" in forced(decision(ALONE)).explain(cornell(), spp=4)
-    assert "no pilot: nothing to choose with layers=strategies" in bdpt(
-        layers="strategies", max_depth=3
-    ).explain(cornell(), spp=4)
-    assert "no pilot: no light subpaths are possible" in bdpt(max_depth=0).explain(cornell(), spp=4)
+    """Expected: no pilot in short renders, where parameters fix the strategies, and where light subpaths are
+    impossible; statistics and `explain` have the reason, and `explain` no table."""
+    fixed = "nothing to choose with"
+    for parameters, target, why in (
+        ({}, cornell(), "the render has 4096 samples, a pilot needs 16384"),
+        ({}, sky(), "the scene alone decides"),
+        ({"light_paths": 1, "connections": "one"}, cornell(), f"{fixed} light_paths=1 and connections=one"),
+        ({"skip": "impossible"}, cornell(), f"{fixed} skip=impossible"),
+        ({"decisions": [decision(ALONE).record()]}, cornell(), f"{fixed} decisions"),
+        ({"layers": "strategies", "max_depth": 3}, cornell(), f"{fixed} layers=strategies"),
+        ({"max_depth": 0}, cornell(), "no light subpaths are possible"),
+    ):
+        integrator = bdpt(**parameters)
+        integrator.render(target, spp=4)
+        given = integrator.statistics["no_pilot"] or fixed  # of given decisions there is no reason
+        assert why.startswith(given) or given.startswith(why)
+        assert integrator.statistics["seconds"]["pilot"] == 0
+        text = integrator.explain(target, spp=4)
+        assert f"no pilot: {why}" in text and "relative time" not in text
     assert "no pilot" not in bdpt().explain(cornell(), spp=1024)
 
 
@@ -600,24 +601,6 @@ def test_what_renders_do_not_meet_does_not_decide(monkeypatch):
         table = render.decide()
         alone = min(row.time for row in table if not row.candidate.light_paths)
         assert alone < 4 * min(row.time for row in table)
-
-
-def test_not_asked():
-    """Expected: no pilot in short renders, nor where light_paths or connections are given, nor for another
-    ``skip``, nor where light subpaths are impossible."""
-    long, short = cornell(128), cornell(64)
-    for parameters, target, spp in (
-        ({}, short, 3),
-        ({"light_paths": 1}, long, 32),
-        ({"connections": "one"}, long, 32),
-        ({"skip": "impossible"}, long, 32),
-        ({"max_depth": 0}, long, 32),
-        ({"layers": "strategies", "max_depth": 3}, long, 32),
-    ):
-        integrator = bdpt(**parameters)
-        integrator.render(target, spp=spp)
-        assert integrator.statistics["decisions"] == [] and integrator.statistics["seconds"]["pilot"] == 0
-        assert integrator.statistics["no_pilot"]
 
 
 def test_light_that_only_connections_find():

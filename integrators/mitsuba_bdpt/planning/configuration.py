@@ -189,11 +189,10 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
 def without_pilot(
     prepared: PreparedScene, full: Plan, settings: Settings, samples: int, of_kernel: int
 ) -> Decision | None:
-    """Decision for a render of ``samples`` samples that needs no pilot, or None.
+    """Path tracing alone under a uniform environment, if ``samples`` are too few for a pilot; else None.
 
-    Path tracing alone under a uniform environment in a render too short for a pilot, whose kernel takes as
-    long as ``of_kernel`` samples: camera subpaths hit the environment wherever its light enters, caustics
-    included, and light subpaths rarely find the way in.
+    A pilot's kernel takes as long as ``of_kernel`` samples. Camera subpaths hit the environment wherever its
+    light enters, caustics included, and light subpaths rarely find the way in.
     """
     contrast = prepared.emitters.contrast
     most = max(UNIFORM_TIMES * of_kernel, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)

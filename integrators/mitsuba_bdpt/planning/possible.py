@@ -26,16 +26,12 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
             skipped.append({"class": name, "level": level, "why": why})
         return not why
 
-    def connected(needed: int, *reasons: str) -> str:
-        """Why no path of ``needed`` edges can be connected: the first reason."""
-        return _why_no_path(prepared, depth, needed) or next(filter(None, reasons), "")
-
-    untraced = "" if emitters.traced else _UNTRACED
+    unconnected, untraced = _why_no_path(prepared, depth, 2), "" if emitters.traced else _UNTRACED
     hit = possible("s=0", "" if emitters.hittable else "no emitter that a ray can hit")
     no_choice = "" if emitters.direct else "next-event estimation can choose no emitter"
-    direct = possible("s=1", connected(2, no_choice))
-    splat = possible("t=1", connected(2, camera.reason, untraced))
-    inner = possible("inner", connected(3, untraced))
+    direct = possible("s=1", unconnected or no_choice)
+    splat = possible("t=1", unconnected or camera.reason or untraced)
+    inner = possible("inner", _why_no_path(prepared, depth, 3) or untraced)
     endpoints = possible("(1,1)", _why_not_endpoints(prepared, settings))
     arrival = possible("t=0", _why_not_arrival(prepared, settings))
     specular = prepared.delta or bool(prepared.near_specular)

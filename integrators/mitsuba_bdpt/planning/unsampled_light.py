@@ -142,11 +142,10 @@ def _called(emitters: Iterable[mi.Emitter]) -> str:
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
-    if not prepared.emitters.traced:  # the estimate traces light subpaths
+    media = prepared.light_media
+    if media is not None and media.contradiction:  # light subpaths would see another scene
         return False
-    if prepared.light_media is not None and prepared.light_media.contradiction:  # it would see another scene
-        return False
-    if plan.merging or components.why_absent("merging"):  # which samples or estimates it
+    if plan.merging or components.why_absent("merging") or not prepared.emitters.traced:
         return False
     beams = prepared.emitters.beams and not plan.splat
     never = not plan.arrival and (_has_sds_paths(prepared) or beams)
