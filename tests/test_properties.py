@@ -709,7 +709,6 @@ METER = {"type": "rectangle"}
         (GLASS_LAMP, False, {"light_paths": 0}, ["needs t=1", "needs inner", "SDS"]),
         (GLASS_LAMP, False, {"connections": "none"}, ["needs inner", "SDS"]),
         (GLASS_LAMP, True, {}, []),
-        (GLASS_LAMP, True, {"stored_vertices": 4}, ["more than 4 edges"]),
         (
             GLASS_LAMP,
             True,

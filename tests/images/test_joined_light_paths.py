@@ -229,7 +229,7 @@ def test_a_cornell_box_is_joined_and_less_noisy():
     _, method = rendered(scene)
     (decision,) = method.statistics["decisions"]
     assert decision["light_paths"] == 1 / 16 and decision["joined"] == 4
-    assert "each of which is connected with 4 of them" in method.explain(scene, spp=64)
+    assert "light subpaths per lane: 4" in method.explain(scene, spp=64)
     scene, errors = cornell(32), []
     reference = np.mean([rendered(scene, 1024, 50 + i)[0] for i in range(4)], axis=0)
     for joined in (4, 1):

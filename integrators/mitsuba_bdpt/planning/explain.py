@@ -27,9 +27,8 @@ def explain(
     p, decided = planner.plan, planner.decided
     light = "no light subpaths"
     if p.light:
-        count = p.camera_paths_per_light_path
-        light = f"one light subpath per {f'{count} camera subpaths' if count > 1 else 'camera subpath'}"
-        light += f", each of which is connected with {p.joined} of them" * (p.joined > 1)
+        light = f"camera subpaths per light subpath: {p.camera_paths_per_light_path}, "
+        light += f"light subpaths per lane: {p.joined}"
     merged = "SDS paths" + " and of paths that connections rarely sample" * bool(prepared.near_specular)
     left = f"{p.emission.left:.0%}" if p.emission else ""
     used = {

@@ -166,10 +166,9 @@ class Planner:
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on."""
-        adopted = replace(decision.plan(self.full), skipped=(*self.full.skipped, *left_out))
         decisions = (*self.decided.decisions, decision)
         self.decided = replace(self.decided, decisions=decisions, left_out=tuple(left_out))
-        self.threshold, self.plan = decision.threshold, adopted
+        self.threshold, self.plan = decision.threshold, decision.plan(self.full)
 
     def restore(self, decided: PlannerState):
         """Resume from the decisions of an earlier part of the render."""

@@ -34,9 +34,8 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     inner = possible("inner", _why_no_path(prepared, depth, 3) or untraced)
     endpoints = possible("(1,1)", _why_not_endpoints(prepared, settings))
     arrival = possible("t=0", _why_not_arrival(prepared, settings))
-    specular = prepared.delta or bool(prepared.near_specular)
-    merging = settings.merging is True and possible("merging", _why_not_merging(emitters, specular, direct))
-    why = _why_not_guided(prepared, settings, hit, direct, specular)
+    merging = settings.merging is True and possible("merging", _why_not_merging(prepared, direct))
+    why = _why_not_guided(prepared, settings, hit, direct)
     if settings.guiding == "always":
         possible("guided s=0", why)
     guidable = not why
@@ -148,13 +147,14 @@ def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     return _why_no_path(prepared, settings.max_depth)
 
 
-def _why_not_merging(emitters: Emitters, specular: bool, direct: bool) -> str:
-    """Why no vertex can be merged, or empty. ``specular``: there are BSDFs with such lobes."""
+def _why_not_merging(prepared: PreparedScene, direct: bool) -> str:
+    """Why no vertex can be merged, or empty; ``direct``: next-event estimation is possible."""
+    emitters = prepared.emitters
     if not emitters.traced:
         return _UNTRACED
     if emitters.contrast <= EVEN:
         return "s=0 finds a uniform environment by itself"
-    if direct and not (specular or emitters.beams):
+    if direct and not (prepared.delta or prepared.near_specular or emitters.beams):
         return "without specular surfaces next-event estimation connects all that light meets first"
     return ""
 
@@ -163,9 +163,7 @@ def _why_not_merging(emitters: Emitters, specular: bool, direct: bool) -> str:
 SHORTEST = 3
 
 
-def _why_not_guided(
-    prepared: PreparedScene, settings: Settings, hit: bool, direct: bool, specular: bool
-) -> str:
+def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
     """Why s = 0 cannot be guided, or does not gain by it; empty if neither."""
     if prepared.space is not None:
         return "photons in scenes with participating media are not traced"
@@ -175,7 +173,7 @@ def _why_not_guided(
         return "no emitter that a ray can hit"
     if settings.max_depth < SHORTEST:
         return f"max_depth={settings.max_depth} allows no such path"
-    return _why_not_merging(prepared.emitters, specular, direct)
+    return _why_not_merging(prepared, direct)
 
 
 def _reaches_behind(prepared: PreparedScene, sensor: mi.Sensor) -> bool:
@@ -201,11 +199,7 @@ def unsampled_paths(prepared: PreparedScene, p: Plan, settings: Settings) -> tup
         if prepared.delta and prepared.emitters.unhittable:
             rest = "one non-specular vertex - specular - sensor"
             found.append(f"delta emitter - specular - {rest} (SDS: no connectible edge)")
-    found += unsampled_at_sensor(prepared, p, settings)
-    longest = prepared.stored_vertices(settings)
-    if starts and p.light and longest < settings.max_depth:
-        found.append(f"{' or '.join(starts)} - any path of more than {longest} edges")
-    return tuple(found)
+    return (*found, *unsampled_at_sensor(prepared, p, settings))
 
 
 def unsampled_at_sensor(prepared: PreparedScene, p: Plan, settings: Settings) -> list[str]:

@@ -1,10 +1,9 @@
 """Estimates the share of an image's light on SDS paths that no strategy samples, or hardly ever.
 
-Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface, delta surfaces, and
-reaches the sensor; no two neighbouring vertices can be connected. Through near-specular lobes in
-place of delta lobes a few samples find such light: it is *undersampled* if a render expects too few of them,
-see `merging.undersampled`. The estimate merges camera subpaths with as many photons, see `merging.unsampled`
-for what it leaves out, and lamps seen in a mirror.
+Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface and delta surfaces,
+and reaches the sensor; no two neighbouring vertices can be connected. Through near-specular lobes a few
+samples find such light: it is *undersampled* if a render expects too few, see `merging.undersampled`. The
+estimate merges camera subpaths with as many photons, see `merging.unsampled`.
 """
 
 from __future__ import annotations
