@@ -676,7 +676,7 @@ def test_explain():
         assert any(line.startswith(f"used: {name}") for line in text.splitlines()), name
     assert "limited: paths of more than 64 edges use s=0 and s=1 only" in text
     text = integrator().explain(glowing_sphere(), sensor=0)
-    assert "16 camera subpaths" in text and "(one)" in text
+    assert "camera subpaths per light subpath: 16" in text and "(one)" in text
     text = integrator(light_paths=0).explain(glowing_sphere())
     assert "light_paths=0" in text and "no light subpaths" in text
     text = integrator(connections="none").explain(glowing_sphere())
