@@ -405,7 +405,7 @@ def test_it_gains_and_says_so():
     assert never[0][1].statistics["decisions"][0]["emission"] is None
     assert errors[0] < 0.85 * errors[1], errors
     text = auto[0][1].explain(scene, spp=64)
-    assert "used: guided emission (the pilot predicts that it lowers the squared error of" in text
+    assert "used: guided emission (predicted to lower squared errors of light subpaths to" in text
     assert "skipped (by hand): guided emission: guiding=photons" in never[0][1].explain(scene, spp=64)
 
 

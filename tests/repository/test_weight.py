@@ -11,7 +11,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7690,
     "transport merging guided_emission": 6749,
-    "planning": 2279,
+    "planning": 2273,
     "emitters": 2680,
     "cli": 1812,
     "media": 1350,

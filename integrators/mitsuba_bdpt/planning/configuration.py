@@ -162,10 +162,8 @@ class Decision(Configuration):
 # (`budget.samples_of_kernel`) on a pilot chooses. See experiments, "Choice of strategies".
 UNIFORM_DIRECT, UNIFORM, UNIFORM_SAMPLES, UNIFORM_TIMES = 0.7, 2, 1 << 20, 10
 
-LEFT_OUT = [
-    not_worth(name, "all light comes from a uniform environment, and the render is too short for a pilot")
-    for name in ("t<=1", "inner")
-]
+_SHORT = "all light comes from a uniform environment, and the render is too short for a pilot"
+LEFT_OUT = [not_worth(name, _SHORT) for name in ("t<=1", "inner")]
 
 
 def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[Configuration]:

@@ -54,10 +54,7 @@ def explain(
         lines.append(not_sampled)
     lines += [f"warning: {text}" for text in spoilt(prepared, settings)]
     if prepared.emitters.evaluated:
-        lines.append(
-            "slow: a timed_sunsky lives, here or in another scene; calls that visit it cannot be recorded in "
-            "one kernel"
-        )
+        lines.append("slow: a timed_sunsky lives, here or in another scene: no kernel records its calls")
     if decided.non_finite:
         lines.append(f"invalid samples (NaN or infinite): {decided.non_finite} of the pilot")
     return "\n".join(lines + (_pilot(settings, table, planner.confidence()) if table else []))

@@ -217,6 +217,5 @@ def unsampled_at_sensor(prepared: PreparedScene, p: Plan, settings: Settings) ->
 
 def _unsampled_starts(prepared: PreparedScene) -> list[str]:
     """Starts of paths that camera subpaths sample neither by a hit nor by next event."""
-    emitters = prepared.emitters
-    is_delta = prepared.delta and emitters.unhittable
-    return ["delta emitter - specular"] * is_delta + ["directionalarea"] * emitters.beams
+    deltas, beams = prepared.delta and prepared.emitters.unhittable, prepared.emitters.beams
+    return ["delta emitter - specular"] * deltas + ["directionalarea"] * beams

@@ -408,7 +408,7 @@ class Render:
             return None
         samples = self._samples()
         look = partial(unsampled_light.estimate, prepared, plan, settings, samples)
-        key = replace(plan, skipped=(), emission=None), plan.emission is None, settings, samples
+        key = replace(plan, skipped=()), settings, samples
         unsampled, _ = self.findings.find("unsampled light", key, look)
         return unsampled if unsampled.colours else None
 
