@@ -344,7 +344,7 @@ def test_tables_count_in_the_choice():
     these are not connected, and they are traced by the tables; without tables nothing changes."""
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
     ones = np.ones((GROUPS, len(CANDIDATES)))
-    found = Moments(ones, ones, sds=np.zeros((GROUPS, 2)), mean=1.0, rays=rays, lanes=4096)
+    found = Moments(ones, ones, guidable=(0.0, 0.0), mean=1.0, rays=rays, lanes=4096)
     tables = EmissionTables.of(np.ones((1, 4, 4)), 0.5)
     for learnt in (learning.Learnt(tables, 0.4, 0.5), learning.Learnt(None, 0.4, 0.5)):
         rows = choice.choose(found, choice.Alternatives(list(CANDIDATES), learnt=learnt))

@@ -189,13 +189,13 @@ def test_what_a_lamp_with_area_adds_is_what_is_lost(glass, monkeypatch):
         ("point", {"ball": BALL}, {}, []),
         ("point", {"ball": BALL | {"center": [30, 0.6, 0]}}, {}, []),
         ("point", {}, {}, []),
-        (lamp_with_area([0.5, 3, 0], 0.1), {"block": BLOCK}, {}, []),
+        (lamp_with_area([0.5, 3, 0], 0.4), {"block": BLOCK}, {}, []),
     ],
 )
 def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
     """Rationale: a point light and a glass object are in many scenes that lack nothing. Expected: one warning
     for two renders of the floor beneath a block of glass, which is dark; none for a glass ball (a thousandth
-    of the light), one out of view, no glass, and a lamp with area. The lamp is named and a remedy."""
+    of the light), one out of view, no glass, and a lamp that is not small. The lamp is named and a remedy."""
     scene = scene_of(LAMPS.get(lamp) if isinstance(lamp, str) else lamp, **shapes)
     with Warned() as warnings:
         for seed in range(2):
@@ -380,8 +380,8 @@ def test_it_is_looked_for_once(monkeypatch):
     looked = []
     original = unsampled_light.estimate
     monkeypatch.setattr(unsampled_light, "estimate", lambda *a: looked.append(a) or original(*a))
-    for lamp, count in ((LAMPS["point"], 1), (lamp_with_area([0.5, 3, 0], 0.1), 0)):
-        scene = scene_of(lamp, block=BLOCK)
+    for lamp, count in ((LAMPS["point"], 1), (LAMPS["point"], 0)):
+        scene = scene_of(lamp, **({"block": BLOCK} if count else {}))
         for seed in range(3):
             bdpt().render(scene, spp=1, seed=seed)
         assert len(looked) == count
@@ -415,18 +415,18 @@ def test_what_the_committed_scenes_lack(name, share, said, monkeypatch):
     assert sum(integrator.statistics["unsampled_light"].values()) == pytest.approx(share, rel=0.4)
 
 
-def test_other_committed_scenes_are_not_looked_at():
-    """Expected: in every other scene no such path is possible, nor are there narrow lobes."""
-    lacking = set()
+def test_committed_scenes_without_specular_surfaces_are_not_looked_at():
+    """Expected: in no other scene are such paths possible, or small emitters behind specular surfaces."""
+    others = set()
     for path in sorted(SCENES.glob("*.xml")):
         scene = mi.load_file(str(path), resolution=8, integrator="bdpt")
         render = Render(scene, scene.sensors()[0], scene.integrator().settings, 0, 16)
-        if unsampled_light.is_possible(render.prepared, render.plan, render.settings):
-            lacking.add(path.stem)
-    assert lacking == {
-        *("lamp_behind_glass", "projector_through_glass", "smallvcm_cornell_point", "smallvcm_cornell_sun"),
-        *("pool_floor", "lamp_in_glass_seen", "veach_mis"),
-        *("frosted_bulb", "frosted_glass_caustics", "pane", "polished_metal", "rough_glass_caustics"),
+        if not unsampled_light.is_possible(render.prepared, render.plan, render.settings):
+            others.add(path.stem)
+    assert others == {
+        *("cloud_sky", "cloudy_ball", "cornell_box", "fog_beam", "fog_beam_thick", "fog_lamp", "skin_ball"),
+        *("furnace_emission", "furnace_point", "furnace_white", "many_lights", "open_sky"),
+        *("smallvcm_cornell_lamp", "smallvcm_cornell_sky"),
     }
 
 
@@ -451,7 +451,7 @@ def test_only_lamps_that_no_ray_hits_lack_light():
         render = Render(scene, scene.sensors()[0], bdpt().settings, 0, 16)
         found.append(unsampled_light.estimate(render.prepared, render.plan, render.settings).radiance)
     alone, beside = found
-    assert len(alone) == len(beside) == 1
+    assert len(alone) == 1 and beside.pop(1, 0) < 1e-3 * alone[0]  # nearly edge-on
     assert sum(beside.values()) == pytest.approx(sum(alone.values()), rel=0.15)
 
 

@@ -181,7 +181,7 @@ def _segment(media: Media, ray, landing: Landing, word, active):
         *found, throughput, word, collisions = tracking.delta(
             media, edge.medium, segment, end, edge.rest, throughput, word, grid
         )
-        t, depth, rest = dr.select(grid, tuple(found), (t, depth, rest))
+        t, depth, rest = (dr.select(grid, a, b) for a, b in zip(found, (t, depth, rest), strict=True))
         edge = replace(edge, collisions=collisions + edge.collisions)
     collided = active & (t < end)
     edge = replace(edge, depth=edge.depth + depth, rest=rest)

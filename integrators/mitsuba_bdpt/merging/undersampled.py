@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..transport.alternatives import newest_connection
+from ..transport import mis
+from ..transport.alternatives import newest_coefficient, newest_connection
 from ..transport.inputs import Kernel
 from ..transport.near_specular import is_narrow
 from ..transport.walk import Vertex
@@ -26,40 +27,65 @@ FEWEST = 0.1
 # outliers).
 KINDS = (0.0, FEWEST, 1.0)
 
+# What photons can guide s = 0 to find: SDS light, second and fourth moments of its samples without guiding
+# (mean over the colours), and vertices at which s = 0 is guided. Dr.Jit adds four numbers as a packet.
+GUIDABLE = ("light", "second", "fourth", "vertices")
+
 
 @dataclass
 class Undersampled:
     """Which merges count as missing in a render of ``samples`` per pixel.
 
-    ``kinds``: sums of sizes by kind, see `KINDS`.
+    ``kinds``: sums of sizes by kind, see `KINDS`. ``guidable``: by tile of the film, ``tiles`` per direction,
+    sums of `GUIDABLE` over camera samples; where fewer than ``rarest`` samples are expected in a pixel, s = 0
+    counts as not finding the light.
     """
 
     samples: mi.Float
+    rarest: mi.Float
+    tiles: int
     kinds: mi.Float64
+    guidable: mi.Float64
 
     @staticmethod
-    def of(samples: float) -> Undersampled:
+    def of(samples: float, tiles: int, rarest: float = 0.0) -> Undersampled:
         """Empty sums for a render of ``samples`` per pixel."""
-        return Undersampled(dr.opaque(mi.Float, samples), dr.zeros(mi.Float64, len(KINDS)))
+        sums = (dr.zeros(mi.Float64, count) for count in (len(KINDS), tiles**2 * len(GUIDABLE)))
+        numbers = (dr.opaque(mi.Float, number) for number in (samples, rarest))
+        return Undersampled(*numbers, tiles, *sums)
 
     def missing(
-        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, only_delta: mi.Bool
+        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position: mi.Point2f
     ) -> mi.Bool:
         """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
 
-        Only where the vertex is not near-specular itself: the path is merged there alone. Light of emitters
-        that rays can hit counts only behind a near-specular event; ``only_delta``: none came before ``z``. It
-        does not count where photons guide s = 0.
+        ``position`` of the camera sample on the film.
+
+        Only where the vertex is not near-specular itself: the path is merged there alone.
         """
         expected = self.expected(kernel, merging, z, found)
         active = found.active & ~is_narrow(found.f)
-        active &= ~(found.photon.delta if kernel.plan.guided else only_delta & found.photon.delta)
         kind = mi.UInt32(0)
         for bound in KINDS[:-1]:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
         size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
         dr.scatter_add(self.kinds, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
+        self._add_guidable(kernel, z, found, active & (expected > 0), expected, position)
         return active & ~(expected >= FEWEST)  # NaN counts
+
+    def _add_guidable(self, kernel: Kernel, z: Vertex, found: Sample, active, expected, position):
+        """Add the merge ``found`` at ``z`` where it is ``active`` and on a path that photons guide."""
+        photon, kappa = found.photon, kernel.kappa
+        isolated = ~mis.is_used(newest_coefficient(kernel, kappa.splat, z.edges)) | (z.edges > 1)
+        active &= isolated & photon.hittable & ((photon.edges > 1) | ~mis.is_used(kappa.direct))
+        colours = mi.unpolarized_spectrum(found.value)
+        light = mi.Float64(dr.sum(colours) / len(colours))
+        size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
+        powers = [light, light * size, light * size * dr.square(size)]
+        active &= dr.isfinite(powers[-1])
+        sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
+        tile = kernel.camera.region.tile(position, self.tiles)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile, isolated)
 
     def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
         """Expected number of samples per pixel of the merged path and its neighbours.

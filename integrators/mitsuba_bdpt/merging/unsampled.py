@@ -24,7 +24,6 @@ from ..transport.near_specular import NARROW
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import PhotonPolicy
-from ..transport.sds import State
 from ..transport.walk import random_walk
 from .merging import Merging
 from .merging import sample as draw
@@ -47,7 +46,7 @@ class Unsampled:
 
     ``by_emitter``: a spectrum for each emitter. Of each sample ``seen``: mask, it has a vertex for merging;
     ``size``: the sum of its spectrum; ``through``: index of its first shape. ``broken``: mask by emitter,
-    a photon subpath ended by a non-finite value. ``kinds``: sums of sizes, see `undersampled.KINDS`, or None.
+    a photon subpath ended by a non-finite value.
     """
 
     by_emitter: mi.Float64
@@ -55,7 +54,6 @@ class Unsampled:
     size: mi.Float
     through: mi.UInt32
     broken: mi.Bool
-    kinds: mi.Float64 | None = None
 
 
 @dataclass
@@ -77,12 +75,12 @@ def estimate(
     photon_points: Points,
     points: Points,
     aim: Aim,
-    samples: float | None = None,
+    undersampled: Undersampled | None = None,
 ) -> Unsampled:
     """Merge the camera subpaths of a pilot's ``batch`` with ``count`` photon subpaths, which ``aim`` begins.
 
-    ``kernel``: samples delta lobes only. With ``samples`` per pixel of the render it samples all lobes, and
-    undersampled light is included.
+    ``kernel``: samples delta lobes only. With ``undersampled`` it samples all lobes, and such
+    light is included.
     """
     sets, wavelengths = 1, None
     if mi.is_spectral:
@@ -92,12 +90,11 @@ def estimate(
     discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     met = dr.opaque(mi.Float, count / sets)
     merging = _Discs(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
-    undersampled = None if samples is None else Undersampled.of(samples)
-    kept = PhotonPolicy.UNSAMPLED if samples is None else PhotonPolicy.UNDERSAMPLED
+    kept = PhotonPolicy.UNSAMPLED if undersampled is None else PhotonPolicy.UNDERSAMPLED
     traced = photon_pass.trace(kernel, merging, aim, photon_points, count, kept)
     merging.photons = sort(merging, traced.photons, traced.count)
     found = _merged(kernel, merging, batch, points, undersampled)
-    return Unsampled(*found, traced.broken, None if undersampled is None else undersampled.kinds)
+    return Unsampled(*found, traced.broken)
 
 
 def _merged(
@@ -114,18 +111,17 @@ def _merged(
     walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
     side = subpaths.camera_side(kernel, sample, shared, walk)
     delta = undersampled is None
-    if not delta:
-        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
     side = replace(side, connect=None, only_delta=delta, only_specular=0 if delta else NARROW, sds=None)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, kernel.emitters.count * channels)
 
-    def merge(z, only_delta, size):
+    def merge(z, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)
         if undersampled is None:
             active, flaw = found.active, found.photon.older  # 0, or NaN
         else:
-            active, flaw = undersampled.missing(kernel, merging, z, found, only_delta), 0 * found.photon.older
+            active = undersampled.missing(kernel, merging, z, found, sample.start.position)
+            flaw = 0 * found.photon.older
         value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i
@@ -140,14 +136,12 @@ def _merged(
             there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
         else:
             there = has_lobe(kernel, z)
-        only_delta = mi.Bool(False) if delta else walk.sds.only_delta
-        arguments = z, only_delta, size
-        size = dr.if_stmt(arguments, there, merge, lambda *arguments: arguments[2], label="unsampled light")
+        size = dr.if_stmt((z, size), there, merge, lambda z, size: size, label="unsampled light")
         first = z.hit & (z.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, z.si.shape), through)
         return seen | there, size, through
 
     state = mi.Bool(False), mi.Float(0), mi.UInt32(0)
     state, _ = random_walk(kernel, side, walk, visit, state)
-    dr.eval(sums, state, () if undersampled is None else undersampled.kinds)
+    dr.eval(sums, state, undersampled or ())
     return sums, *state

@@ -68,13 +68,6 @@ TABLES_ALONE = 0.7
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
-# Photon-guided BSDF sampling has to gain this factor in three quarters of the pilot's groups. It removes
-# outliers only, at a cost; see experiments, "Photon-guided BSDF sampling".
-GUIDE_GAIN = 3.0
-
-# The same in scenes with near-specular lobes, where the trimmed error falls too (`pilot.LEAST_REDUCTION`).
-NEAR_SPECULAR_GAIN = 1.0
-
 # Bootstrap resamplings of a pilot's groups, see `confidence`.
 RESAMPLINGS = 100
 
@@ -86,35 +79,26 @@ LEAST_VARIANCE = 1e-4
 class Alternatives:
     """The ``candidates`` for a render with ``samples`` samples still to come.
 
-    ``guidable``: whether photon-guided BSDF sampling is possible; ``near_specular``: the scene has
-    near-specular lobes; ``learnt``: tables of emission, with which light subpaths are traced.
+    ``learnt``: tables of emission, with which light subpaths are traced.
     """
 
     candidates: list[Configuration]
     samples: float = math.inf
-    guidable: bool = False
-    near_specular: bool = False
     learnt: Any = None  # a `guided_emission.Learnt`
-
-    @property
-    def guide_gain(self) -> float:
-        """The gain from which on photon-guided BSDF sampling pays."""
-        return NEAR_SPECULAR_GAIN if self.near_specular else GUIDE_GAIN
 
 
 @dataclass(frozen=True)
 class Prediction:
     """The predicted efficiency of a candidate, guided emission included.
 
-    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample, without SDS
-    paths where s = 0 can be guided; ``gain``: see `guided_gain`.
+    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample, without
+    SDS paths where s = 0 can be guided.
     """
 
     candidate: Configuration
     cost: float
     error: float
     variance: float
-    gain: float = 1.0
 
     @property
     def time(self) -> float:
@@ -134,57 +118,30 @@ class Prediction:
 def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first.
 
-    Preceded by the best one with photon-guided BSDF sampling, if that pays.
+    One of them with photon-guided BSDF sampling, of those with light subpaths: path tracing alone would guide
+    more vertices than were counted. Its samples hardly add an error.
     """
-    table = _unguided(moments, alternatives)
-    guided = _guided(moments, alternatives, table)
-    return [guided, *table] if guided and guided.gain >= alternatives.guide_gain else table
-
-
-def guided_gain(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> float:
-    """Factor by which guiding s = 0 shortens the time to equal error, outliers included; 0 if impossible.
-
-    Lower quartile of the groups. ``table`` of `choose`.
-    """
-    guided = _guided(moments, alternatives, [row for row in table if not row.candidate.guided])
-    return guided.gain if guided else 0.0
-
-
-def _guided(moments: Moments, alternatives: Alternatives, table: list[Prediction]) -> Prediction | None:
-    """The best prediction with light subpaths, with photon-guided BSDF sampling; None if impossible.
-
-    Path tracing alone would guide more vertices than the pilot measures, those that light tracing samples.
-    The number of light subpaths and the coefficients do not depend on guiding: its outliers would hide the
-    differences of the candidates.
-    """
-    lit = next((row for row in table if row.candidate.light_paths), None)
-    if not alternatives.guidable or lit is None or not moments.sds.size:
-        return None
-    candidate = replace(lit.candidate, guided=GUIDED)
-    each = cost(candidate, moments.rays, alternatives.samples)
-    others = _by_group(moments.variance, [table[0].candidate, lit.candidate], alternatives.learnt)
-    best, variance = np.maximum(others, LEAST_VARIANCE).T
-    best = np.minimum(best, variance * table[0].error / lit.error)  # not what light subpaths do without it
-    unguided, guided = moments.sds.T
-    # Not the ratio of means: a few vertices may hold all of the variance.
-    gains = table[0].cost * (best + unguided) / (each * (variance + guided))
-    return replace(lit, candidate=candidate, cost=each, gain=float(np.quantile(gains, 1 / 4)))
-
-
-def _unguided(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """Predictions for the candidates of finite variance, the best first."""
     candidates, learnt = alternatives.candidates, alternatives.learnt
     both = (
         np.maximum(_by_group(values, candidates, learnt).mean(axis=0), LEAST_VARIANCE)
         for values in (moments.variance, moments.typical)
     )
-    rows = [
-        Prediction(_with_tables(c, learnt), cost(c, moments.rays, alternatives.samples), (v * t) ** 0.5, v)
-        for c, v, t in zip(candidates, *(values.tolist() for values in both), strict=True)
-        if math.isfinite(v)
-    ]
+    rows: list[Prediction] = []
+    guided: list[Prediction] = []
+    mean, typical = moments.guidable
+    for candidate, v, t in zip(candidates, *(values.tolist() for values in both), strict=True):
+        if not math.isfinite(v):
+            continue
+        candidate = _with_tables(candidate, learnt)
+        each = cost(candidate, moments.rays, alternatives.samples)
+        rows.append(Prediction(candidate, each, ((v + mean) * (t + typical)) ** 0.5, v))
+        if mean and candidate.light_paths:
+            candidate = replace(candidate, guided=GUIDED)
+            each = cost(candidate, moments.rays, alternatives.samples)
+            guided.append(Prediction(candidate, each, (v * t) ** 0.5, v))
     alone = [row.error for row in rows if not row.candidate.light_paths]
     unit = min(alone or [row.error for row in rows], default=1.0)
+    rows += sorted(guided, key=lambda row: row.score)[:1]
     return sorted((replace(row, error=row.error / unit) for row in rows), key=lambda row: row.score)
 
 
@@ -211,11 +168,11 @@ def confidence(moments: Moments, alternatives: Alternatives) -> float:
 
     Share of `RESAMPLINGS` in which the candidate that `choose` puts first is within `NEAR` of the best.
     """
-    best = _unguided(moments, alternatives)[0].candidate
+    best = choose(moments, alternatives)[0].candidate
     random = np.random.default_rng(len(alternatives.candidates))
     agree = 0
     for _ in range(RESAMPLINGS):
-        table = _unguided(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
+        table = choose(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
         times = {row.candidate: row.time for row in table}
         agree += times.get(best, math.inf) <= NEAR * min(times.values())
     return agree / RESAMPLINGS
@@ -229,29 +186,20 @@ def why_not(row: Prediction, chosen: Prediction) -> str:
     gain = chosen.time / row.time
     if gain <= 1:
         return ""
-    if chosen.candidate.guided and not row.candidate.guided:
-        return "without guided s=0 it has the outliers of SDS paths, which are in no figure here"
     what = "light subpaths" if row.candidate.light_paths else "other weights"
     return f"{what} have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
 
 
-def left_out(
-    table: list[Prediction], guided: float = 0.0, least: float = GUIDE_GAIN, name: str = "guided s=0"
-) -> list[dict[str, str]]:
+def left_out(table: list[Prediction], guided: str = "guided s=0") -> list[dict[str, str]]:
     """What the best of `choose` leaves out, and why, as in ``statistics["skipped"]``.
 
-    ``guided``: the `guided_gain` of the class ``name``, which needs ``least``.
+    ``guided``: the class of strategies that the candidates with guided samples have.
     """
     skipped: list[dict[str, str]] = []
-    if guided and not table[0].candidate.guided:
-        why = (
-            f"guiding gains {guided:.2f}x or more in three quarters of the pilot's parts, outliers "
-            f"included, and has to gain {least:g}x"
-        )
-        skipped.append(not_worth(name, why))
     without: dict[str, Callable[[Configuration], bool]] = {
         "t<=1": lambda c: not c.light_paths,
         "inner": lambda c: c.connections == "none",
+        guided: lambda c: not c.guided,
     }
     for name, lacks in without.items():
         others = [row for row in table if not lacks(row.candidate)]

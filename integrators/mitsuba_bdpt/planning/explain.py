@@ -80,11 +80,6 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         why = why_not(row, table[0])
         figures = f"{row.time / table[0].time:15.2f}  {row.cost:15.2f}  {row.error:8.3g}"
         lines.append(f"{figures}  {_named(row.candidate)}" + (f"; not chosen: {why}" if why else ""))
-    if table[0].candidate.guided:
-        lines.append(
-            f"  guided s=0 gains {table[0].gain:.3g}x, by fewer outliers of SDS paths, which none of "
-            "these figures has"
-        )
     if settings.heuristic != "balance":
         lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
     lines.append(

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -18,8 +17,6 @@ from ..transport import mis
 from .configuration import CANDIDATES
 
 if TYPE_CHECKING:
-    from ..sensors.records import Region
-
     Lanes = TypeVar("Lanes", np.ndarray, mi.UInt32)
 
 
@@ -109,7 +106,7 @@ TRIMMED = 1e-3
 RULED_OUT = 1e15
 
 # Fields of `Moments` with a row per group.
-_OF_GROUPS = ("variance", "typical", "sds")
+_OF_GROUPS = ("variance", "typical")
 
 
 @dataclass(frozen=True)
@@ -119,8 +116,7 @@ class Moments:
     * ``variance``, shape (`GROUPS`, candidates): the mean of the squared errors of many renders.
     * ``typical``: the same of a typical render, in which contributions that fewer than `TRIMMED` of the
       pixels receive are missing.
-    * ``sds``, shape (`GROUPS`, 2): variance of SDS paths on which s = 0 can be guided, excluded from all
-      others: unguided and guided (no columns: not measured).
+    * ``guidable``: both of s = 0 by SDS paths on which photons can guide it, which are in no other figure.
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
     * ``rays``: rays and connections per camera sample by kind, with one light subpath each.
     * ``lanes``: number of camera samples.
@@ -129,7 +125,7 @@ class Moments:
 
     variance: np.ndarray
     typical: np.ndarray
-    sds: np.ndarray
+    guidable: tuple[float, float]
     mean: float
     rays: dict[str, float]
     lanes: int
@@ -183,13 +179,6 @@ class Splats:
     lanes: int
 
 
-def tile_of(region: Region, position: mi.Point2f, tiles: int = FINE) -> mi.UInt32:
-    """Index of the tile at a film ``position``, with ``tiles`` per direction."""
-    uv = dr.clip(region.to_uv(position), 0, 1)
-    xy = dr.minimum(mi.Point2u(uv * tiles), tiles - 1)
-    return mi.UInt32(xy.y * tiles + xy.x)
-
-
 def group(lane: Lanes) -> Lanes:
     """Index of the independent part of a sample, or of a lane's light subpath.
 
@@ -198,24 +187,22 @@ def group(lane: Lanes) -> Lanes:
     return lane // PER_PIXEL % GROUPS
 
 
-@dataclass(frozen=True)
-class SDSLight:
-    """Light on SDS paths that s = 0 finds where it can be guided.
+def _dark() -> np.ndarray:
+    return np.zeros(FINE**2)
 
-    ``sums`` over ``lanes`` camera samples, shape (`GROUPS`, fine tiles, 3): of the light and its second
-    moments, see `guiding_benefit.Found`; ``vertices``: guidable vertices per camera sample.
+
+@dataclass(frozen=True)
+class GuidableLight:
+    """SDS light that photons can guide s = 0 to find, per camera sample.
+
+    By fine tile ``light``, and the ``second`` and ``fourth`` moments of samples of s = 0 without guiding;
+    ``vertices`` at which s = 0 is guided.
     """
 
-    sums: np.ndarray
-    vertices: float
-    lanes: int
-
-    @property
-    def reduction(self) -> float:
-        """Factor by which guiding lowers the second moment, lower quartile of the groups; 1 without light."""
-        _, unguided, guided = self.sums.sum(axis=1).T
-        factors = np.divide(unguided, guided, out=np.ones(len(guided)), where=guided > 0)
-        return float(np.quantile(factors, 1 / 4))
+    light: np.ndarray = field(default_factory=_dark)
+    second: np.ndarray = field(default_factory=_dark)
+    fourth: np.ndarray = field(default_factory=_dark)
+    vertices: float = 0.0
 
 
 def moments(
@@ -223,19 +210,18 @@ def moments(
     splats: Splats,
     rays: dict[str, float],
     spp: float,
-    sds: SDSLight | None = None,
+    guidable: GuidableLight,
     emission: np.ndarray | None = None,
 ) -> Moments:
     """The moments of a pilot for a render of ``spp`` samples per pixel.
 
     ``splats`` are normalised to one light subpath per camera sample; ``rays`` are per camera sample;
-    ``sds`` light is in no sample; ``emission``: see `guided_emission.EmissionStatistics`.
+    ``guidable`` light is in no sample; ``emission``: see `guided_emission.EmissionStatistics`.
     """
     count = len(samples.tile)
     width = samples.estimate.shape[1]
     sizes = SPLAT.of(splats.sums, "size").sum(axis=2) / splats.lanes
-    if sds is not None:
-        sizes = sizes + sds.sums[:, :, 0] / sds.lanes
+    sizes = sizes + guidable.light / GROUPS
     groups = group(np.arange(count))
     inverse = 1 / _norms(samples, groups % 2, np.stack([sizes[half::2].sum(axis=0) for half in (0, 1)]))
     of_group = inverse[np.arange(GROUPS) % 2][:, None]
@@ -247,9 +233,6 @@ def moments(
         total = _by_group(values * of_sample) * (GROUPS / count)
         return _padded(total + SPLAT.of(weighted, of_splats) if of_splats else total, width)
 
-    of_sds = np.zeros((GROUPS, 2))
-    if sds is not None:
-        of_sds = np.matmul(of_group, sds.sums[:, :, 1:])[:, 0] * (GROUPS / sds.lanes)
     estimate = samples.estimate
     squares = _second(samples) - estimate * _other(estimate)
     for i, candidate in enumerate(_SEVERAL):
@@ -263,7 +246,7 @@ def moments(
     return Moments(
         variance=variance,
         typical=variance - hidden + missing,
-        sds=of_sds,
+        guidable=_of_guidable(guidable, inverse.mean(axis=0), spp),
         emission=_of_tiles(emission, samples, sizes.sum(axis=0)),
         mean=float(np.median(by_group) * GROUPS),
         rays=rays,
@@ -313,13 +296,31 @@ def _hidden(
     for c in range(width):
         real = np.flatnonzero((second[:, c] > 0) & (fourth[:, c] > 0) & np.isfinite(fourth[:, c]))
         m, p = second[real, c], fourth[real, c]
-        order = np.argsort(-p / m, kind="stable")
-        rare = order[np.cumsum((m**2 / p)[order]) * spp < TRIMMED]
+        rare = _rare(m, p, spp)
         where = real[rare]
         hidden[:, c] = np.bincount(of_group[where], part[where, c], GROUPS) * GROUPS
         missed = np.bincount(tile[where], m[rare] * np.sqrt(m[rare] / p[rare]), FINE**2) * FINE**2
         missing[c] = spp * np.mean(missed**2)
     return hidden, missing
+
+
+def _rare(second: np.ndarray, fourth: np.ndarray, spp: float) -> np.ndarray:
+    """Indices of the contributions of the largest squared error, up to a rate of `TRIMMED` per pixel."""
+    order = np.argsort(-fourth / second, kind="stable")
+    return order[np.cumsum((second**2 / fourth)[order]) * spp < TRIMMED]
+
+
+def _of_guidable(guidable: GuidableLight, inverse: np.ndarray, spp: float) -> tuple[float, float]:
+    """Relative squared error per sample of guidable light: of the mean render, and of a typical one.
+
+    Each fine tile counts as one contribution, see `_hidden`; ``inverse`` of its squared brightness.
+    """
+    lit = np.flatnonzero(guidable.second)
+    second, inverse = guidable.second[lit], inverse[lit]
+    hidden = _rare(second * inverse, guidable.fourth[lit] * inverse**2, spp)
+    missing = spp * FINE**2 * float((guidable.light[lit] ** 2 * inverse)[hidden].sum())
+    variance = second * inverse
+    return float(variance.sum()), float(np.delete(variance, hidden).sum()) + missing
 
 
 def _padded(values: np.ndarray, width: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from ..transport.inputs import Kernel
 from ..transport.kernel import trace
 from ..transport.photons.guided_hits import Unguided
 from ..transport.plan import Plan
-from . import moments, sds_light
+from . import moments
 from .configuration import CANDIDATES
 from .moments import (
     EMISSION_TILES,
@@ -37,10 +37,9 @@ from .moments import (
     SAMPLE,
     SPLAT,
     SUMS,
+    GuidableLight,
     Layout,
     Moments,
-    SDSLight,
-    tile_of,
 )
 
 if TYPE_CHECKING:
@@ -76,10 +75,6 @@ DIRECT = 1 / 64
 
 # Lanes that run a loop together.
 PACKET = 16
-
-# With near-specular lobes, where other strategies sample guidable light too, guiding is possible where it
-# lowers the light's second moment by this factor; see experiments, "Photon-guided BSDF sampling".
-LEAST_REDUCTION = 8.0
 
 _WITH_INNER = tuple(candidate for candidate in CANDIDATES if candidate.connections != "none")
 
@@ -171,7 +166,7 @@ class Pilot:
     def splat(self, kernel: Kernel, c: Contribution, shared: Shared, stream: Stream) -> Counters:
         """Accumulate a contribution with t <= 1."""
         size = self._size(c)
-        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + tile_of(self._region, c.position)
+        row = moments.group(dr.arange(mi.UInt32, self._lanes)) * FINE**2 + self._region.tile(c.position, FINE)
         _, found = self._parts(size, c)
         found = {"size": [size], **found}
         _add(self._splats, SPLAT, found, row, size > 0)
@@ -181,7 +176,7 @@ class Pilot:
     def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
         """Accumulate a camera sample."""
         slot = dr.arange(mi.UInt32, self._lanes)
-        others = {"tile": tile_of(self._region, sample.start.position)}
+        others = {"tile": self._region.tile(sample.start.position, FINE)}
         others["evaluated"] = total["evaluated"] if self._media else 0
         found = total | {name: [mi.Float64(value)] for name, value in others.items()}
         _add(self._samples, SAMPLE, found, slot, sample.covered)
@@ -191,7 +186,7 @@ class Pilot:
         if self._emission is not None:
             lane = dr.arange(mi.UInt32, self._lanes)
             half = moments.group(lane) % 2  # samples of a pixel are in one
-            tile = tile_of(self._region, position, EMISSION_TILES)
+            tile = self._region.tile(position, EMISSION_TILES)
             square, active = dr.square(size), active & (size > 0)
             self._emission.accumulate(c.shares, c.emission, tile, half, square, active)
 
@@ -199,10 +194,10 @@ class Pilot:
         """Evaluate the recorded kernel together with ``counts``."""
         dr.eval(self._samples, self._splats, counts)
 
-    def moments(self, counts: dict[str, int], spp: float, sds: SDSLight | None = None) -> Moments:
+    def moments(self, counts: dict[str, int], spp: float, guidable: GuidableLight) -> Moments:
         """The pilot's moments for a render of ``spp`` samples per pixel.
 
-        ``counts`` of the lanes' counters; ``sds`` light is in no sample.
+        ``counts`` of the lanes' counters; ``guidable`` light is in no sample.
         """
         rows = np.array(self._samples).reshape(-1, SAMPLE.width)
         sums = np.array(self._splats).reshape(GROUPS, FINE**2, SPLAT.width)
@@ -213,9 +208,9 @@ class Pilot:
         evaluated = SAMPLE.of(rows, "evaluated")[: len(rows) // PACKET * PACKET]
         if self._media and len(evaluated):
             rays["packets"] = float(evaluated.reshape(-1, PACKET).max(1).mean())
-        rays["guidable"] = sds.vertices if sds else 0.0
+        rays["guidable"] = guidable.vertices
         emission = self._emission.evaluated() if self._emission is not None else None
-        return moments.moments(moments.Samples.of_rows(rows), splats, rays, spp, sds, emission)
+        return moments.moments(moments.Samples.of_rows(rows), splats, rays, spp, guidable, emission)
 
     def _parts(self, size: mi.Float64, c: Contribution) -> tuple[Row, dict[str, Row]]:
         """What a contribution ``c`` of weighted ``size`` adds.
@@ -275,14 +270,12 @@ def measure(
     seed: mi.UInt32,
     lanes: int,
     stands_for: float = RAREST,
-    guiding: bool = True,
+    guidable: GuidableLight | None = None,
 ) -> Moments:
     """Run a pilot of about ``lanes`` camera samples, spread over the image.
 
-    Each represents ``stands_for`` samples of the render. ``guiding``: predict the gain of photon-guided BSDF
-    sampling where possible, with two more kernels. Guidable light is in no sample either way: its outliers
-    would hide the differences of the candidates. Of light through near-specular lobes only where guiding may
-    pay.
+    Each represents ``stands_for`` samples of the render. ``guidable``: light that the samples leave out: its
+    outliers would hide the differences of the candidates. None if it was not measured.
     """
     everything = replace(
         plan,
@@ -295,16 +288,8 @@ def measure(
         roulette=False,
     )
     kernel = Kernel(prepared, everything, settings, mis.ByClass())
-    found = None
-    guiding = guiding and everything.guidable
-    if guiding:
-        found = sds_light.measure(prepared, everything, settings, seed, max(stands_for, RAREST) * lanes)
-    if found is not None and kernel.near_specular and found.reduction < LEAST_REDUCTION:
-        found = None
-    if found is not None:
-        kernel.sds = Unguided(kernel.near_specular)
-    elif everything.guidable and (prepared.delta if kernel.near_specular else not guiding):
-        kernel.sds = Unguided(near_specular=False)
+    if everything.guidable and (prepared.delta if guidable is None else guidable.second.any()):
+        kernel.sds = Unguided(kernel.near_specular and guidable is not None)
     region, emission = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
         kernel.cells = components.guided_emission.Cells(prepared.emitters)
@@ -321,10 +306,7 @@ def measure(
     counts = trace(kernel, pilot, batch, points, samples)
     pilot.evaluate(counts)
     counted = dict(zip(COUNTERS, counts.numpy().tolist(), strict=True))
-    found = pilot.moments(counted, max(stands_for * batch.size / pixels, 1), found)
-    if everything.guidable and not guiding:
-        found = replace(found, sds=found.sds[:, :0])
-    return found
+    return pilot.moments(counted, max(stands_for * batch.size / pixels, 1), guidable or GuidableLight())
 
 
 def _add(target: mi.Float64, layout: Layout, found: Mapping[str, Row], row: mi.UInt32, active: mi.Bool):

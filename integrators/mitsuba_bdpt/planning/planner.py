@@ -15,10 +15,10 @@ from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import JOINED
-from . import budget, choice, pilot
+from . import budget, choice, pilot, unsampled_light
 from .configuration import LEFT_OUT, Decision, candidates, not_worth, without_pilot
 from .findings import SceneCache
-from .moments import Moments
+from .moments import GuidableLight, Moments
 from .possible import plan
 
 if TYPE_CHECKING:
@@ -34,6 +34,9 @@ JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 UNMEASURED = not_worth(
     "guided s=0", "with so many BSDFs the render is too short for the kernels that would predict its gain"
 )
+
+# Variance of guidable light over that of all other light from which on it may change the choice.
+MATTERS = 0.1
 
 # Why a pilot decides nothing. Directly seen emission is the same for all candidates.
 SAW_NOTHING = "the pilot found no light but that of emitters which the sensor sees directly"
@@ -116,20 +119,32 @@ class Planner:
         return list(result.table)
 
     def _piloted(self) -> _Result:
-        """Result of a pilot."""
-        moments = self._measured()
+        """Result of a pilot.
+
+        Its samples leave out light for guided s = 0. Other strategies sample near-specular paths too: where
+        they are to do so, and this light matters, they are measured again, with it.
+        """
+        guidable = self._guidable()
+        found = self._of_pilot(guidable)
+        if guidable is None or not self._prepared.near_specular or not found.table:
+            return found
+        best = found.table[0]
+        if best.candidate.guided or found.moments.guidable[0] < MATTERS * best.variance:
+            return found
+        return replace(self._of_pilot(None), left_out=found.left_out)
+
+    def _of_pilot(self, guidable: GuidableLight | None) -> _Result:
+        moments = self._measured(guidable)
         learnt = self._learnt(moments)
         alternatives = self._alternatives(learnt)
         table, left_out = choice.choose(moments, alternatives), ()
         if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
         if table:
-            gain = choice.guided_gain(moments, alternatives, table)
-            name = "merging" if self.full.merging else "guided s=0"
             unguided = table[0].candidate.emission is None
             left_out = (
-                *choice.left_out(table, gain, alternatives.guide_gain, name),
-                *[UNMEASURED] * (self.full.guidable and not moments.sds.size),
+                *choice.left_out(table, "merging" if self.full.merging else "guided s=0"),
+                *[UNMEASURED] * (self.full.guidable and not self._predicts_guiding()),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
         return _Result(tuple(table), left_out, moments, alternatives)
@@ -153,16 +168,28 @@ class Planner:
         counts, component = self._prepared.emitters.tables, components.guided_emission
         return component.learn(moments.emission, component.side_of(sum(counts)), counts)
 
-    def _measured(self) -> Moments:
+    def _measured(self, guidable: GuidableLight | None) -> Moments:
         """Moments of a pilot, see `pilot.measure`."""
         samples, count = self._samples, budget.lanes(self._samples)
-        guiding = self.full.merging or budget.predicts_guiding(self._prepared, samples)
         seed = sequence_seed(mi.UInt32(self.pilot_seed), PILOT)
         flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
         with gc_paused(), flag, evaluated_mode(self._prepared.emitters.evaluated):
             return pilot.measure(
-                self._prepared, self.full, self._settings, seed, count, samples / count, guiding
+                self._prepared, self.full, self._settings, seed, count, samples / count, guidable
             )
+
+    def _predicts_guiding(self) -> bool:
+        """Whether a pilot predicts the gain of photon-guided BSDF sampling."""
+        if not self.full.guidable or components.why_absent("merging"):
+            return False
+        return self.full.merging or budget.predicts_guiding(self._prepared, self._samples)
+
+    def _guidable(self) -> GuidableLight | None:
+        """SDS light whose variance the pilot compares with that of other light."""
+        if not self._predicts_guiding():
+            return None
+        spp = self._samples // self._pixels
+        return unsampled_light.guidable(self._prepared, self.full, self._settings, spp)
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on."""
@@ -213,5 +240,4 @@ class Planner:
         joins = self._is_worth_joining(self._samples)
         possible = candidates(self._prepared, self.full, self._settings)
         possible = [candidate for candidate in possible if candidate.joined == 1 or joins]
-        near_specular = bool(self._prepared.near_specular)
-        return choice.Alternatives(possible, self._samples, self.full.guidable, near_specular, learnt)
+        return choice.Alternatives(possible, self._samples, learnt)

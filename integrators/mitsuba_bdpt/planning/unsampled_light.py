@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -29,7 +30,11 @@ from ..transport.batch import Batch
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
+from .moments import FINE, GuidableLight
 from .possible import SHORTEST
+
+if TYPE_CHECKING:
+    from ..merging import Undersampled, Unsampled
 
 # Subpaths from either end: the fewest, the most, and samples of the render per subpath. The noise of the
 # estimate suffices for `WARN_SHARE`, not for a figure to rely on; see experiments, "Vertex merging". Few
@@ -45,6 +50,10 @@ NARROW = 100.0
 
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
+
+# Light of which s = 0 has fewer samples in an image, if all of it were like that, is no noise that guiding
+# would remove. Where vertices may be merged instead, they are to find it.
+FEWEST_HITS = 16
 
 SEED = 0x6C6F7374
 
@@ -153,9 +162,9 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
 
 def is_undersampling_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether near-specular lobes, or a sensor that light subpaths must hit, may leave light undersampled."""
-    narrow = prepared.narrowest >= NARROW and prepared.has_small_emitter
+    sharp = prepared.narrowest >= NARROW or (prepared.delta and plan.hit and not plan.guided)
     by_arrival = plan.arrival and _has_sds_paths(prepared)
-    return settings.max_depth >= SHORTEST and (narrow or by_arrival)
+    return settings.max_depth >= SHORTEST and ((sharp and prepared.has_small_emitter) or by_arrival)
 
 
 def _has_sds_paths(prepared: PreparedScene) -> bool:
@@ -171,18 +180,12 @@ def estimate(
     Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
     value.
     """
-    pixels, count = int(prepared.camera.region.size.prod()), _subpaths(prepared, samples)
-    chosen = min(count, pixels)
-    batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
-    with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
-        undersampled = is_undersampling_possible(prepared, plan, settings)
-        kernel = _kernel(prepared, plan, settings, undersampled)
-        aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if undersampled else ())
-        drawn = (Points(kind, dr.opaque(mi.UInt32, SEED)) for kind in ("sobol", "independent"))
-        of = max(samples, PREVIEW) if undersampled else None
-        found = components.merging.estimate(kernel, batch, count, *drawn, aim, of)
+    undersampled = None
+    if is_undersampling_possible(prepared, plan, settings):
+        undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE)
+    found, lanes = _merged(prepared, plan, settings, samples, undersampled)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
-    total = np.array(found.by_emitter).reshape(prepared.emitters.count, -1) / batch.size
+    total = np.array(found.by_emitter).reshape(prepared.emitters.count, -1) / lanes
     if mi.is_spectral:
         total = np.repeat(total.mean(axis=1, keepdims=True), total.shape[1], axis=1)
     if np.array(found.seen).any():
@@ -199,7 +202,7 @@ def estimate(
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    never, rare, few = np.array([1, 0, 0] if found.kinds is None else found.kinds)
+    never, rare, few = np.array([1, 0, 0] if undersampled is None else undersampled.kinds)
     size = max(never + rare, np.finfo(np.float32).tiny)
     if never < rare:
         meant = {id(bsdf) for bsdf in prepared.near_specular}
@@ -209,6 +212,35 @@ def estimate(
         shapes = seen or (shapes if _has_sds_paths(prepared) else others)
     objects = tuple(dict.fromkeys(f"shape {named(shape)}" for shape in shapes))
     return UnsampledLight(colours, objects, float(never / size), float(few / size))
+
+
+def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> GuidableLight:
+    """SDS light that photons can guide s = 0 to find, in a render of ``samples`` per pixel by ``plan``."""
+    names = components.merging.GUIDABLE
+    rarest = 0.0 if settings.merging is True else FEWEST_HITS / int(prepared.camera.region.size.prod())
+    undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE, rarest)
+    _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, samples, undersampled)
+    *of_light, vertices = np.array(undersampled.guidable).reshape(-1, len(names)).T / lanes
+    return GuidableLight(*of_light, float(vertices.sum()))
+
+
+def _merged(
+    prepared: PreparedScene,
+    plan: Plan,
+    settings: Settings,
+    samples: int,
+    undersampled: Undersampled | None,
+) -> tuple[Unsampled, int]:
+    """Merge subpaths; returns the sums, and over how many camera samples they go."""
+    pixels, count = int(prepared.camera.region.size.prod()), _subpaths(prepared, samples)
+    chosen = min(count, pixels)
+    batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
+    sharp = undersampled is not None
+    with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
+        kernel = _kernel(prepared, plan, settings, sharp)
+        aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if sharp else ())
+        drawn = (Points(kind, dr.opaque(mi.UInt32, SEED)) for kind in ("sobol", "independent"))
+        return components.merging.estimate(kernel, batch, count, *drawn, aim, undersampled), batch.size
 
 
 def _subpaths(prepared: PreparedScene, samples: int) -> int:

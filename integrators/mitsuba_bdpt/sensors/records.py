@@ -109,6 +109,11 @@ class Region:
         """Film position in the unit square of the crop window (beyond it in the border)."""
         return (position - self._offset) / self._size
 
+    def tile(self, position: mi.Point2f, tiles: int) -> mi.UInt32:
+        """Index of the tile at a film ``position``, of ``tiles`` per direction, row by row."""
+        xy = dr.minimum(mi.Point2u(dr.clip(self.to_uv(position), 0, 1) * tiles), tiles - 1)
+        return mi.UInt32(xy.y * tiles + xy.x)
+
     def to_position(self, uv: mi.Point2f) -> mi.Point2f:
         """Inverse of `to_uv`."""
         return mi.Point2f(uv) * self._size + self._offset

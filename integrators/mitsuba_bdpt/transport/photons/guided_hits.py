@@ -129,7 +129,7 @@ class _Guided(PhotonStrategy):
 
 
 class Unguided(Guiding):
-    """Leaves out s = 0 where it could be guided, in a pilot; see `guiding_benefit`."""
+    """Leaves out s = 0 where it could be guided, in a pilot."""
 
     counters = ()
 

@@ -72,24 +72,11 @@ class ConnectedPhoton(Photon):
     """A photon whose path may also be sampled by connections; ``older`` is its ``d_vc``.
 
     ``connection``: its ``d_vcm`` times the coefficient of the connection of the last edge. All partial sums
-    are those of a light subpath, whose first direction is not aimed. ``delta``: from an emitter that rays can
-    hit, by delta events only; where photons guide s = 0, by any events.
+    are those of a light subpath, whose first direction is not aimed. ``hittable``: a ray can hit its emitter.
     """
 
     connection: mi.Float
-    delta: mi.Bool
-
-
-@dataclass
-class GuidingPhoton(Photon):
-    """A photon of a guide through near-specular events; ``older`` and ``connection`` as above.
-
-    ``unconnected``: the part of ``older`` of s = 0 and s = 1; ``only_delta``: only delta events before it.
-    """
-
-    connection: mi.Float
-    unconnected: mi.Float
-    only_delta: mi.Bool
+    hittable: mi.Bool
 
 
 @dataclass

@@ -10,7 +10,6 @@ mean of the lobes. Photons are independent of the samples that use the density, 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -21,10 +20,6 @@ from .photon import Photon
 _NEAR = 4
 _FAR = (6, 12, 25, 60)
 WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
-
-# Number of places that each photon of a window represents.
-_BETWEEN = [b - a for a, b in pairwise(WINDOW)]
-STANDS_FOR = tuple((a + b) / 2 for a, b in pairwise([_BETWEEN[0], *_BETWEEN, _BETWEEN[-1]]))
 
 # Bits of each coordinate of a place on the curve, and of a subpath's index: 64 together.
 _BITS, _LANE_BITS = 15, 19
@@ -39,7 +34,7 @@ class Guide:
     """``photons`` sorted by ``place`` on the curve, ``count`` of them; and the box.
 
     ``slope`` of each: change of direction per distance (1 / scene unit), see `_slopes`; ``low``: corner of
-    the box; ``scale``: places over length; ``offsets``: see `WINDOW`; ``stands_for``: see `STANDS_FOR`.
+    the box; ``scale``: places over length; ``offsets``: see `WINDOW`.
     """
 
     photons: Photon
@@ -49,7 +44,6 @@ class Guide:
     low: mi.Point3f
     scale: mi.Float
     offsets: mi.Int32
-    stands_for: mi.Float
 
     @staticmethod
     def of(photons: Photon, count: int) -> Guide:
@@ -70,7 +64,6 @@ class Guide:
             low,
             scale,
             mi.Int32(WINDOW),
-            mi.Float(STANDS_FOR),
         )
         guide.slope = _slopes(guide)
         dr.make_opaque(guide)
@@ -146,12 +139,6 @@ def number(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> mi.UInt32:
 def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
     """The ``k``-th photon of the window about index ``found``."""
     return guide.photons.at(number(guide, found, k, active), active)
-
-
-def exists(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.Bool:
-    """Mask: the window has a ``k``-th photon; at the array's ends it repeats photons."""
-    number = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k)
-    return (number >= 0) & (number < mi.Int32(guide.count))
 
 
 def _lobe(guide: Guide, p: mi.Point3f, found: mi.UInt32, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:

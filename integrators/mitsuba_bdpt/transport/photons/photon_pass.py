@@ -14,10 +14,11 @@ from ..alternatives import has_lobe, is_sds_vertex, newest_connection
 from ..contribution import Counters, one
 from ..inputs import Kernel, Observer
 from ..near_specular import GUIDED, NARROW
-from ..sds import PhotonStrategy, State, begun_near_specular
+from ..sds import PhotonStrategy, State
 from ..walk import random_walk
 from .aim import Aim
-from .photon import ConnectedPhoton, GuidingPhoton, MergedPhoton, Photon
+from .guided_hits import Unguided
+from .photon import ConnectedPhoton, MergedPhoton, Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
@@ -45,17 +46,6 @@ class PhotonPolicy(Enum):
     def estimates(self) -> bool:
         """Whether photons estimate how much light a render lacks, of which emitter."""
         return self in (PhotonPolicy.UNSAMPLED, PhotonPolicy.UNDERSAMPLED)
-
-
-class _Unconnected(PhotonStrategy):
-    """Keeps the partial sum of s = 0 and s = 1 in ``d_vm``, through near-specular events."""
-
-    def begin_light(self, kernel, walk):
-        return begun_near_specular(walk, light=True, d_vm=walk.partial.d_vc)
-
-    def merge(self, kernel, vertex, isolated):
-        direct = kernel.heuristic.scale(vertex.partial.d_vcm, kernel.kappa.direct)
-        return mis.Merge(mis.choose(vertex.edges == 1, direct, kernel.heuristic.zero()), isolated)
 
 
 @dataclass
@@ -105,7 +95,7 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: PhotonPolicy, out: Photo
     shared = subpaths.shared_by_lane(kernel, stream, mi.UInt64(lanes))
     merges, undersampled = kernel.merges, kept is PhotonPolicy.UNDERSAMPLED
     near_specular = kept is PhotonPolicy.GUIDED and kernel.near_specular
-    sds = kernel.sds if merges else _Unconnected() if near_specular else None
+    sds = kernel.sds if merges else Unguided(near_specular=True) if near_specular else None
     e, aimed, finite, walk = _begun(kernel, aim, kept, sds, stream, shared)
     side = subpaths.light_side(kernel, e, stream, shared, walk, sds)
     specular = GUIDED * near_specular + NARROW * undersampled
@@ -128,17 +118,13 @@ def _traced(kernel: Kernel, aim: Aim, count: int, kept: PhotonPolicy, out: Photo
             keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
-        if near_specular:
-            older = y.partial.d_vc
-            more = _connection(kernel, y), y.partial.d_vm, walk.sds.only_delta
-        elif kept is PhotonPolicy.GUIDED:
+        if kept is PhotonPolicy.GUIDED and not near_specular:
             keep &= older > 0
         if kept is PhotonPolicy.UNSAMPLED:
             older = dr.select(finite, mi.Float(0), dr.nan)
         if undersampled:
             older = dr.select(finite, mi.Float(older), dr.nan)
-            only_delta = mi.Bool(True) if kernel.plan.guided else walk.sds.only_delta
-            more = _connection(kernel, y), only_delta & ~e.delta
+            more = _connection(kernel, y), ~e.delta
         distance = dr.norm(y.si.p - y.previous)
         fields = y.si.p, -walk.d, y.si.n, flux, older, aimed, distance, y.edges, lanes, e.index
         found = type(out)(*fields, *more, layer=y.layer)
@@ -173,14 +159,13 @@ def _begun(kernel: Kernel, aim: Aim, kept: PhotonPolicy, sds: PhotonStrategy | N
         finite = spectra.is_finite(e.weight)
         e = replace(e, weight=dr.select(finite, e.weight, 1))
     # These weights do not know of the aim, see `merging.merging`.
-    unaimed = kernel.merges or kept is PhotonPolicy.UNDERSAMPLED or isinstance(sds, _Unconnected)
+    unaimed = kernel.merges or kept is PhotonPolicy.UNDERSAMPLED
     start = replace(e, pdf_second=e.pdf_second * aimed) if unaimed else e
     walk = subpaths.light_walk(kernel, start, stream, shared, sds)
-    if kept is PhotonPolicy.UNDERSAMPLED:
-        walk = replace(walk, sds=State(only_delta=mi.Bool(True)))
-    elif kernel.merges:
+    if kernel.merges:
         walk = replace(walk, sds=State(survived=mi.Float(1)))
-    elif kept.estimates:  # s = 0 samples the others
+    elif kept is PhotonPolicy.UNSAMPLED or (kept.estimates and kernel.plan.guided):
+        # s = 0 samples the others, guided if need be.
         walk = replace(walk, active=walk.active & e.delta)
     return e, aimed, finite, walk
 
@@ -189,8 +174,6 @@ def _kind(kernel: Kernel, kept: PhotonPolicy) -> type[Photon]:
     """The record of its photons."""
     if kernel.merges:
         return MergedPhoton
-    if kept is PhotonPolicy.GUIDED and kernel.near_specular:
-        return GuidingPhoton
     return ConnectedPhoton if kept is PhotonPolicy.UNDERSAMPLED else Photon
 
 
