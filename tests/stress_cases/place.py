@@ -224,9 +224,9 @@ def _decided(statistics, keys=("light_paths", "connections", "coefficients")):
 EXACT = 1e-5
 
 # Share of the pixels that may differ all the same: those in whose draws something took part that is 0 in
-# single precision in one unit and not in the other, or is rounded another way. In `thin_lens` connections of
-# copper with copper (Beckmann's distribution, 1e-20 each) are 0 until lights are times 2^28; the pilot counts
-# those that are not, and the threshold of roulette follows its cost: 2 % of the pixels, by 3e-3 at most.
+# single precision in one unit and not in the other, or is rounded another way, as tables of emission are. In
+# `thin_lens` connections of copper with copper (Beckmann's distribution, 1e-20 each) are 0 until lights are
+# times 2^28; the threshold of roulette follows their cost: 2 % of the pixels, by 3e-3 at most.
 DRAWN = 0.04
 
 # How far the means of such images may be apart, relative: a pixel that differs is off by a share of its own
@@ -251,12 +251,12 @@ def _equal(subject: Subject, first: Place, places: dict, digits: float, **parame
     for way, of_way in WAYS.items():
         of_way = of_way | parameters
         plain, statistics = _render(subject.load(first), of_way, SPP[way], 3)
-        decided, cost = _decided(statistics), _decided(statistics, ["cost"])
+        decided, draws = _decided(statistics), _decided(statistics, ("cost", "emission"))
         ok &= plain.mean() > 0.01 and (way != "default parameters" or bool(decided))
         for name, place in places.items():
             image, statistics = _render(subject.load(place), of_way, SPP[way], 3)
             apart = np.abs(image / place.light - plain) / plain.mean()
-            limit = digits if _decided(statistics, ["cost"]) == cost else DRAWN
+            limit = digits if _decided(statistics, ("cost", "emission")) == draws else DRAWN
             differing = max(differing, float((apart > limit).mean()))
             worst = max(worst, abs(float(image.mean() / place.light / plain.mean()) - 1))
             if _decided(statistics) != decided or statistics["non_finite"]:
