@@ -13,7 +13,7 @@ import welch as st
 from mitsuba_bdpt.planning import choice, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run.rendering import Render
-from mitsuba_bdpt.transport import light_path, sds
+from mitsuba_bdpt.transport import sds
 from mitsuba_bdpt.transport.photons import guided_hits
 from sds_scenes import (
     NEAR_SPECULAR,
@@ -26,8 +26,6 @@ from sds_scenes import (
     under_glass,
     without_photons,
 )
-
-import drjit as dr  # isort: skip
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
@@ -265,22 +263,12 @@ def test_light_that_is_not_guided_is_in_a_second_pilot(monkeypatch):
     assert not found[0][0].candidate.guided and found[0][0].variance == found[1][0].variance
 
 
-def test_scenes_without_near_specular_lobes_have_no_flags(monkeypatch):
-    """Expected: with ideal glass no event is tested, and no flag of a light vertex is stored."""
+def test_scenes_without_near_specular_lobes_test_no_event(monkeypatch):
+    """Expected: with ideal glass no event is tested."""
 
     def never(*_):
         raise AssertionError
 
     for module in (sds, guided_hits):
         monkeypatch.setattr(module, "is_specular", never)
-    monkeypatch.setattr(light_path, "_flags", never)
     images(mi.load_dict(under_glass(ball())), 4, 1, guiding="always")
-
-
-def test_stored_vertices_keep_their_flags():
-    """Expected: the flags of every combination are read as they were written."""
-    bits = dr.arange(mi.UInt32, 4)
-    written = light_path._of_flags(bits)
-    np.testing.assert_array_equal(light_path._flags(written).numpy(), np.arange(4))
-    flags = (written.isolated, written.specular)
-    assert len({tuple(row) for row in np.stack([flag.numpy() for flag in flags], axis=1)}) == 4

@@ -14,7 +14,7 @@ import variants
 import welch as st
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
-from mitsuba_bdpt.transport import light_path, mis
+from mitsuba_bdpt.transport import light_path, mis, sds
 from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
     NEAR_SPECULAR,
@@ -204,7 +204,7 @@ def test_few_photons_far_from_what_is_sharp(monkeypatch):
 
 
 def test_stored_vertices_keep_their_merges():
-    """Expected: what inner connections read of a light vertex are the partial sums that were stored."""
+    """Expected: what inner connections read of a light vertex are the stored partial sums and flags."""
     sums = [mi.Float(0.1 * i, i) for i in range(1, 5)]
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
     anchor = rays.Anchor(si.p, si.n, mi.Float(0, 0), mi.Float(0, 0))
@@ -218,14 +218,14 @@ def test_stored_vertices_keep_their_merges():
         edges=mi.UInt32(1),
         hit=mi.Bool(True),
         edge=None,
-        sds=None,
+        sds=sds.State(isolated=mi.Bool(True, False), specular=mi.Bool(False, True)),
         layer=None,
         connectible=lambda: mi.Bool(True),
     )
     kernel = SimpleNamespace(
         store_size=2,
         merges=True,
-        guides_near_specular=False,
+        guides_near_specular=True,
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
         path_layers=False,
@@ -236,9 +236,11 @@ def test_stored_vertices_keep_their_merges():
     )
     path = light_path.allocate_light_path(kernel, 2)
     light_path.store_light_vertex(kernel, vertex, path)
-    found = light_path.read_light_vertex(kernel, path, mi.UInt32(0)).partial
+    y = light_path.read_light_vertex(kernel, path, mi.UInt32(0))
+    found = y.partial
     for a, b in zip((found.d_vcm, found.d_vc, found.d_vm, found.d_vm_newest), sums, strict=True):
         np.testing.assert_array_equal(a, b)
+    assert list(y.sds.isolated) == [True, False] and list(y.sds.specular) == [False, True]
 
 
 @pytest.mark.parametrize(

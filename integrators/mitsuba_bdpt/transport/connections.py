@@ -23,7 +23,7 @@ from .contribution import (
     size_of,
 )
 from .inputs import Kernel
-from .light_path import LightPath, StoredVertex, read_light_vertex
+from .light_path import LightPath, StoredVertex, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
 from .sds import meets
 from .vacuum import ShadowRay
@@ -102,10 +102,10 @@ def connect_one(
     """
     candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
-    if path.proxies is None:
-        drawn = _draw(kernel, z, path, candidates, u)
-    else:
+    if path.guesses:
         drawn = _draw_by_guess(kernel, z, path, candidates, u, stream)
+    else:
+        drawn = _draw(kernel, z, path, candidates, u)
     # In this order: total / size is infinite for tiny drawn values.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
     if kernel.plan.joined > 1:  # each light subpath is a separate estimate
@@ -218,8 +218,8 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     while dr.hint(
         slot < candidates, label="guess inner connections", exclude=[kernel, z, path, candidates, at_z, even]
     ):
-        y = path.proxies.read(path.si[slot].p, slot)
-        reached = z.edges + path.s[slot] <= kernel.last_inner
+        y, edges = read_proxy(path, slot)
+        reached = z.edges + edges + 1 <= kernel.last_inner
         size = dr.select(reached, guess(kernel, at_z, y), 0)
         total, take, u = offer(total, size, u)
         chosen, of_chosen = dr.select(take, slot, chosen), dr.select(take, size, of_chosen)
@@ -261,6 +261,6 @@ def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     are no edges), or slots of several light subpaths, several vertices may have the same number.
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
-    if kernel.has_media or path.proxies is not None:
+    if kernel.has_media or path.guesses:
         return dr.select(possible, path.count, 0)
     return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)

@@ -11,10 +11,14 @@ import mitsuba as mi
 from ..geometry import polarization, rays
 from . import mis
 from .alternatives import newest_coefficient
+from .contribution import one
 from .inputs import KEPT, Kernel
-from .proxy_vertices import ProxyVertex, ProxyVertices
+from .proxy_vertices import Diffuse, Lobe, ProxyVertex
 from .sds import State
 from .walk import Vertex, volume_cosine
+
+# Entries of local memory that only draws by approximation read.
+PROXY = "proxy", "lobe"
 
 
 @dataclass
@@ -104,63 +108,48 @@ class Thinning:
 class LightPath:
     """The `StoredVertex` objects of a lane's light subpath in local memory.
 
-    ``throughput_over_cos`` as `polarization.stokes`; ``d_vcm`` and ``d_vc``: ``partial``; ``rounding``:
-    offset and curvature of anchors, whose rest is in ``si``; ``merges``: ``d_vm`` and ``d_vm_newest``, where
-    vertices are merged; ``s``: light vertices up to and including each; ``count``: of stored vertices;
-    ``medium``: None in scenes without media; ``light_group`` (see `Contribution`) of the newest subpath,
-    ``light_groups`` of each vertex if there are several; ``layers``: `StoredVertex.layer`; ``flags``: of its
-    ``sds``, where near-specular events count as specular.
+    ``entries``: fields that do not follow from others, by name: of anchors offset and curvature
+    (``rounding``), of ``sds`` bits; with several light subpaths also proxies. ``count``: of stored vertices;
+    ``light_group`` (see `Contribution`) of the newest subpath; ``thinning``: in scenes with media.
     """
 
-    si: dr.Local[mi.SurfaceInteraction3f]
-    throughput_over_cos: list[dr.Local]
-    d_vcm: dr.Local[mi.Float]
-    d_vc: dr.Local[mi.Float] | dr.Local[mi.Vector4f]
-    merges: list[dr.Local]
-    rounding: dr.Local[mi.Vector2f]
-    s: dr.Local[mi.UInt32]
+    entries: dict[str, dr.Local]
     count: mi.UInt32
-    medium: dr.Local[mi.UInt32] | None = None
     light_group: mi.UInt32 | None = None
-    light_groups: dr.Local[mi.UInt32] | None = None
-    layers: dr.Local[mi.UInt32] | None = None
-    thinning: Any = None  # a `Thinning`, in scenes with media
-    proxies: Any = None  # `ProxyVertices`, for draws by approximation
-    flags: dr.Local[mi.UInt32] | None = None
+    thinning: Any = None  # a `Thinning`
+
+    @property
+    def guesses(self) -> bool:
+        """Whether it has proxies, for draws by approximation."""
+        return "proxy" in self.entries
 
 
 def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
-    size, several = kernel.store_size, kernel.plan.joined > 1
+    several, groups = kernel.plan.joined > 1, kernel.light_groups is not None
+    types = {
+        "si": (mi.SurfaceInteraction3f, True),
+        "d_vcm": (mi.Float, True),
+        "d_vc": (type(kernel.heuristic.zero()), True),
+        "d_vm": (mi.Float, kernel.merges),
+        "d_vm_newest": (mi.Float, kernel.merges),
+        "rounding": (mi.Vector2f, True),
+        "edges": (mi.UInt32, True),
+        "medium": (mi.UInt32, kernel.has_media),
+        "light_group": (mi.UInt32, several and groups),
+        "layer": (mi.UInt32, kernel.path_layers),
+        "flags": (mi.UInt32, kernel.guides_near_specular),
+        "proxy": (Diffuse, several),
+        "lobe": (Lobe, several and kernel.traits.glossy),
+        **{f"stokes_{i}": (kind, True) for i, kind in enumerate(polarization.stokes_types())},
+    }
+    size = kernel.store_size
     return LightPath(
-        si=dr.alloc_local(mi.SurfaceInteraction3f, size),
-        throughput_over_cos=[dr.alloc_local(kind, size) for kind in polarization.stokes_types()],
-        d_vcm=dr.alloc_local(mi.Float, size),
-        d_vc=dr.alloc_local(type(kernel.heuristic.zero()), size),
-        merges=[dr.alloc_local(mi.Float, size) for _ in range(2 if kernel.merges else 0)],
-        rounding=dr.alloc_local(mi.Vector2f, size),
-        s=dr.alloc_local(mi.UInt32, size),
+        {name: dr.alloc_local(kind, size) for name, (kind, used) in types.items() if used},
         # As wide as the lanes: Dr.Jit treats an index of width 1 as equal in all lanes.
         count=dr.zeros(mi.UInt32, lanes),
-        medium=dr.alloc_local(mi.UInt32, size) if kernel.has_media else None,
-        light_group=dr.zeros(mi.UInt32, lanes) if kernel.light_groups is not None else None,
-        light_groups=dr.alloc_local(mi.UInt32, size) if several and kernel.light_groups is not None else None,
-        layers=dr.alloc_local(mi.UInt32, size) if kernel.path_layers else None,
-        proxies=ProxyVertices.allocate(kernel, size) if several else None,
-        flags=dr.alloc_local(mi.UInt32, size) if kernel.guides_near_specular else None,
+        light_group=dr.zeros(mi.UInt32, lanes) if groups else None,
     )
-
-
-def _flags(sds: State) -> mi.UInt32:
-    """The flags of a light vertex, as bits."""
-    bits = enumerate((sds.isolated, sds.specular))
-    return sum((dr.select(flag, mi.UInt32(1 << i), 0) for i, flag in bits), mi.UInt32(0))
-
-
-def _of_flags(bits: mi.UInt32) -> State:
-    """The inverse of `_flags`."""
-    isolated, specular = ((bits & (1 << i)) != 0 for i in range(2))
-    return State(isolated=isolated, specular=specular)
 
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
@@ -169,28 +158,24 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     y, slot = StoredVertex.of(vertex), path.count
     if path.thinning is not None:
         y, slot, keep = _thinned(path, y, keep)
-    path.si.write(y.si, slot, keep)
-    for local, entry in zip(
-        path.throughput_over_cos, polarization.stokes(y.throughput_over_cos), strict=True
-    ):
-        local.write(entry, slot, keep)
-    path.d_vcm.write(y.partial.d_vcm, slot, keep)
-    path.d_vc.write(y.partial.d_vc, slot, keep)
-    for local, entry in zip(path.merges, (y.partial.d_vm, y.partial.d_vm_newest), strict=False):
-        local.write(entry, slot, keep)
-    path.rounding.write(mi.Vector2f(y.anchor.offset, y.anchor.curvature), slot, keep)
-    path.s.write(y.edges + 1, slot, keep)
-    if path.medium is not None:
-        path.medium.write(y.medium, slot, keep)
-    if path.flags is not None:
-        path.flags.write(_flags(y.sds), slot, keep)
-    if path.light_groups is not None:
-        path.light_groups.write(path.light_group, slot, keep)
-    if path.layers is not None:
-        path.layers.write(y.layer, slot, keep)
-    if path.proxies is not None:
+    entries = {
+        "si": y.si,
+        **vars(y.partial),
+        "rounding": mi.Vector2f(y.anchor.offset, y.anchor.curvature),
+        "edges": y.edges,
+        "medium": y.medium,
+        "light_group": path.light_group,
+        "layer": y.layer,
+        **{f"stokes_{i}": value for i, value in enumerate(polarization.stokes(y.throughput_over_cos))},
+    }
+    if kernel.guides_near_specular:
+        entries["flags"] = one(y.sds.isolated) + 2 * one(y.sds.specular)
+    if path.guesses:
         newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
-        path.proxies.write(ProxyVertex.of(kernel, vertex, newest, keep, alone=True), slot, keep)
+        proxy = ProxyVertex.of(kernel, vertex, newest, keep, alone=True)
+        entries |= {"proxy": proxy.diffuse, "lobe": proxy.lobe}
+    for name, local in path.entries.items():
+        local.write(entries[name], slot, keep)
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
@@ -206,26 +191,25 @@ def read_light_vertex(
     kernel: Kernel, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
 ) -> StoredVertex:
     """Stored vertex ``slot``; zeros where not ``active``, since slots may be unset."""
-    si = path.si.read(slot, active)
-    rounding = path.rounding.read(slot, active)
-    s = path.s.read(slot, active)
+    e = {name: path.entries[name].read(slot, active) for name in path.entries if name not in PROXY}
+    si, rounding, flags = e["si"], e["rounding"], e.get("flags")
     curvature = rounding.y if kernel.shape_errors.any else mi.Float(0)
-    groups = path.light_groups
     return StoredVertex(
         si=si,
         bsdf=si.bsdf(),
         anchor=rays.Anchor(si.p, si.n, rounding.x, curvature),
-        throughput_over_cos=polarization.of_stokes(
-            [local.read(slot, active) for local in path.throughput_over_cos]
-        ),
-        partial=mis.Partial(
-            path.d_vcm.read(slot, active),
-            path.d_vc.read(slot, active),
-            *(local.read(slot, active) for local in path.merges),
-        ),
-        edges=s - 1,
-        medium=None if path.medium is None else path.medium.read(slot, active),
-        light_group=path.light_group if groups is None else groups.read(slot, active),
-        layer=None if path.layers is None else path.layers.read(slot, active),
-        sds=None if path.flags is None else _of_flags(path.flags.read(slot, active)),
+        throughput_over_cos=polarization.of_stokes([e[name] for name in e if name.startswith("stokes")]),
+        partial=mis.Partial(**{name: e[name] for name in e if name.startswith("d_")}),
+        edges=e["edges"],
+        medium=e.get("medium"),
+        light_group=e.get("light_group", path.light_group),
+        layer=e.get("layer"),
+        sds=flags if flags is None else State(isolated=(flags & 1) != 0, specular=(flags & 2) != 0),
     )
+
+
+def read_proxy(path: LightPath, slot: mi.UInt32) -> tuple[ProxyVertex, mi.UInt32]:
+    """Proxy of the stored vertex ``slot``, and the number of edges up to it."""
+    at = path.entries
+    lobe = at["lobe"][slot] if "lobe" in at else None
+    return ProxyVertex(at["si"][slot].p, at["proxy"][slot], lobe), at["edges"][slot]

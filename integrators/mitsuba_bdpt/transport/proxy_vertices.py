@@ -13,9 +13,8 @@ drawn contribution by its probability and is unbiased for any approximation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -28,7 +27,7 @@ WRONG_SIDE = 0.0002
 # Least cosine by which densities over area are divided.
 _LEAST_COS = 0.01
 
-# Least magnitude of numbers whose sign is a flag.
+# Least brightness of a light vertex, among which black ones are drawn by their other factors.
 _LEAST_SIZE = 1e-30
 
 # Bounds of the squared width of a lobe, and the least density and cosine that it is fitted to.
@@ -36,42 +35,54 @@ _NARROW, _LEAST_PDF, _LEAST_Z = 1e-5, 1e-3, 1e-3
 
 
 @dataclass
-class Lobes:
-    """A BSDF: brightness and density of a diffuse part, and of a lobe at its peak.
+class Lobe:
+    """The lobe of a glossy BSDF in a proxy, and the density of its diffuse part over cos / pi.
 
-    Diffuse ones over cos / pi; ``width2``: squared roughness of the lobe.
+    ``wi``: incident direction, ``shading``: shading normal, both in world space; ``peak`` brightness, density
+    and ``others`` (see `Diffuse`) at the peak; ``width2``: squared roughness, above 1 without a lobe.
     """
 
-    diffuse: mi.Float
+    wi: mi.Vector3f
+    shading: mi.Vector3f
     diffuse_pdf: mi.Float
     peak: mi.Float
-    peak_pdf: mi.Float
+    pdf: mi.Float
     width2: mi.Float
+    others: mi.Float
 
-    @staticmethod
-    def plain() -> Lobes:
-        """A diffuse BSDF of unit brightness."""
-        return Lobes(mi.Float(1), mi.Float(1), mi.Float(0), mi.Float(0), mi.Float(1))
+    def added(self, d, cos, size, pdf_w, others) -> tuple:
+        """The results of `ProxyVertex.towards` with the lobe, from those of the diffuse part."""
+        half = self.wi + d
+        cos2 = dr.square(dr.dot(self.shading, half)) / dr.maximum(dr.squared_norm(half), 1e-12)
+        shape = _shape(cos2, self.width2)
+        return (
+            size + self.peak * shape,
+            pdf_w * self.diffuse_pdf + self.pdf * shape,
+            others + self.others * shape / dr.maximum(cos, _LEAST_COS),
+        )
+
+
+@dataclass
+class Diffuse:
+    """The diffuse part of a BSDF in a proxy. No field is a Bool: in local memory LLVM fails.
+
+    ``n``: geometric normal on the incident side; ``size``: brightness over cos / pi; ``behind``: its factor
+    on the other side; ``others``: partial sums of the other strategies over the density from the other side.
+    """
+
+    n: mi.Vector3f
+    size: mi.Float
+    behind: mi.Float
+    others: mi.Float
 
 
 @dataclass
 class ProxyVertex:
-    """Proxy of a vertex.
-
-    ``p``: position; ``n``: geometric normal on the incident side; ``both``: scatters to both sides; ``wi``:
-    incident direction, ``shading``: shading normal, both in world space; ``others``: partial sums of the
-    other strategies over the density from the other side, of the diffuse part; ``peak_others``: of the lobe.
-    """
+    """Proxy of a vertex at ``p``; ``lobe``: None in scenes without glossy BSDFs."""
 
     p: mi.Point3f
-    n: mi.Vector3f
-    both: mi.Bool
-    glossy: mi.Bool
-    lobes: Lobes
-    wi: mi.Vector3f
-    shading: mi.Vector3f
-    others: mi.Float
-    peak_others: mi.Float
+    diffuse: Diffuse
+    lobe: Lobe | None = None
 
     @staticmethod
     def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> ProxyVertex:
@@ -79,49 +90,44 @@ class ProxyVertex:
 
         ``alone``: the brightness matters, as it is not common to all compared connections.
         """
-        si, partial = vertex.si, vertex.partial
-        wi, n = si.to_world(si.wi), mi.Vector3f(si.n)
-        glossy = active & mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Glossy)
-        lobes = _lobes(kernel, vertex, glossy, active, alone)
-        density = partial.d_vc * vertex.cos
+        si, partial, flags = vertex.si, vertex.partial, vertex.bsdf.flags()
+        wi, n, size = si.to_world(si.wi), mi.Vector3f(si.n), mi.Float(1)
+        density, diffuse_pdf, lobe = partial.d_vc * vertex.cos, mi.Float(1), None
+        if alone:
+            up = mi.Vector3f(0, 0, dr.sign(si.wi.z))
+            size = _brightness(vertex, scattering.evaluate(kernel, vertex, up, active, reverse=False)) * dr.pi
+        if kernel.traits.glossy:
+            size, diffuse_pdf, peak, pdf, width2 = dr.if_stmt(
+                (size,),
+                active & mi.has_flag(flags, mi.BSDFFlags.Glossy),
+                lambda size: _fitted(kernel, vertex, active),
+                lambda size: (size, mi.Float(1), mi.Float(0), mi.Float(0), mi.Float(2)),
+            )
+            shading = mi.Vector3f(si.sh_frame.n)
+            lobe = Lobe(wi, shading, diffuse_pdf, peak, pdf, width2, density * pdf)
+        size = dr.maximum(size, _LEAST_SIZE if alone else 0)
+        behind = dr.select(mi.has_flag(flags, mi.BSDFFlags.Transmission), 1, mi.Float(WRONG_SIDE))
+        others = partial.d_vcm * coefficient + density * (diffuse_pdf * dr.inv_pi)
         return ProxyVertex(
-            p=mi.Point3f(si.p),
-            n=dr.mulsign(n, dr.dot(n, wi)),
-            both=mi.has_flag(vertex.bsdf.flags(), mi.BSDFFlags.Transmission),
-            glossy=glossy,
-            lobes=lobes,
-            wi=wi,
-            shading=mi.Vector3f(si.sh_frame.n),
-            others=partial.d_vcm * coefficient + density * (lobes.diffuse_pdf * dr.inv_pi),
-            peak_others=density * lobes.peak_pdf,
+            mi.Point3f(si.p), Diffuse(dr.mulsign(n, dr.dot(n, wi)), size, behind, others), lobe
         )
 
-    def towards(self, kernel, d: mi.Vector3f) -> tuple[mi.Float, mi.Float, mi.Float, mi.Float]:
+    def towards(self, d: mi.Vector3f) -> tuple:
         """For direction ``d``: brightness times cosine, density, ``others``, and cosine."""
-        signed = dr.dot(self.n, d)
+        signed = dr.dot(self.diffuse.n, d)
         cos = dr.abs(signed)
         part = cos * dr.inv_pi
-        found = part * self.lobes.diffuse, part * self.lobes.diffuse_pdf, self.others
-        if kernel.traits.glossy:
+        found = part * self.diffuse.size, part, self.diffuse.others
+        if (lobe := self.lobe) is not None:
             found = dr.if_stmt(
                 found,
-                self.glossy,
-                lambda *diffuse: self._with_lobe(d, cos, *diffuse),
+                lobe.width2 <= 1,
+                lambda *diffuse: lobe.added(d, cos, *diffuse),
                 lambda *diffuse: diffuse,
             )
-        size, pdf_w, others = found
-        size *= dr.select(self.both | (signed > 0), mi.Float(1), WRONG_SIDE)
-        return size, pdf_w, others, mi.Float(cos)
-
-    def _with_lobe(self, d, cos, size, pdf_w, others):
-        half = self.wi + d
-        cos2 = dr.square(dr.dot(self.shading, half)) / dr.maximum(dr.squared_norm(half), 1e-12)
-        shape = _shape(cos2, self.lobes.width2)
-        return (
-            size + self.lobes.peak * shape,
-            pdf_w + self.lobes.peak_pdf * shape,
-            others + self.peak_others * shape / dr.maximum(cos, _LEAST_COS),
-        )
+        bright, pdf_w, others = found
+        bright *= dr.select(signed > 0, 1, self.diffuse.behind)
+        return bright, pdf_w, others, mi.Float(cos)
 
 
 def guess(kernel, z: ProxyVertex, y: ProxyVertex) -> mi.Float:
@@ -130,8 +136,8 @@ def guess(kernel, z: ProxyVertex, y: ProxyVertex) -> mi.Float:
     dist2 = dr.squared_norm(between)
     inverse = dr.rcp(dist2)
     d = between * dr.sqrt(inverse)
-    size_z, pdf_z, others_z, cos_z = z.towards(kernel, d)
-    size_y, pdf_y, others_y, cos_y = y.towards(kernel, -d)
+    size_z, pdf_z, others_z, cos_z = z.towards(d)
+    size_y, pdf_y, others_y, cos_y = y.towards(-d)
     others = others_y * (pdf_z * cos_y) + others_z * (pdf_y * cos_z)
     size = size_z * size_y * inverse / (kernel.kappa.inner + others * inverse)
     return dr.select((dist2 > 0) & dr.isfinite(size), size, 0)
@@ -142,33 +148,26 @@ def _shape(cos2: mi.Float, width2: mi.Float) -> mi.Float:
     return dr.square(width2 / (cos2 * (width2 - 1) + 1))
 
 
-def _lobes(kernel, vertex, glossy: mi.Bool, active: mi.Bool, alone: bool) -> Lobes:
-    """Fit to evaluations towards the normal and, if glossy, in the mirror direction."""
+def _fitted(kernel, vertex, active: mi.Bool) -> tuple:
+    """Fit a diffuse part and a lobe to evaluations towards the normal and in the mirror direction.
+
+    Returns ``size`` and ``diffuse_pdf``, and of the lobe ``peak``, ``pdf`` and ``width2``.
+    """
     evaluate = partial(scattering.evaluate, kernel, vertex, reverse=False)
     wi = vertex.si.wi
     up = mi.Vector3f(0, 0, dr.sign(wi.z))
-    throughput = mi.unpolarized_spectrum(vertex.throughput)
-    lobes = Lobes.plain()
-    if alone:
-        lobes.diffuse = spectra.brightest(throughput * _intensity(evaluate(up, active))) * dr.pi
-    if not kernel.traits.glossy:
-        return lobes
-
-    def fit(lobes: Lobes) -> Lobes:
-        f, mirror = evaluate(up, glossy), evaluate(mi.Vector3f(-wi.x, -wi.y, wi.z), glossy)
-        pdf_w = dr.maximum(mirror.pdf_fwd_w, _LEAST_PDF)
-        width2 = dr.clip(1 / (4 * dr.pi * pdf_w * dr.maximum(dr.abs(wi.z), _LEAST_Z)), _NARROW, 1)
-        shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
-        diffuse = dr.maximum(_intensity(f) - _intensity(mirror) * shape, 0)
-        return Lobes(
-            spectra.brightest(throughput * diffuse) * dr.pi,
-            dr.maximum(f.pdf_fwd_w - mirror.pdf_fwd_w * shape, 0) * dr.pi,
-            spectra.brightest(throughput * _intensity(mirror)),
-            mi.Float(mirror.pdf_fwd_w),
-            width2,
-        )
-
-    return dr.if_stmt((lobes,), glossy, fit, lambda lobes: lobes)
+    f, mirror = evaluate(up, active), evaluate(mi.Vector3f(-wi.x, -wi.y, wi.z), active)
+    pdf_w = dr.maximum(mirror.pdf_fwd_w, _LEAST_PDF)
+    width2 = dr.clip(1 / (4 * dr.pi * pdf_w * dr.maximum(dr.abs(wi.z), _LEAST_Z)), _NARROW, 1)
+    shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
+    diffuse = replace(f, value=dr.maximum(_intensity(f) - _intensity(mirror) * shape, 0))
+    return (
+        _brightness(vertex, diffuse) * dr.pi,
+        dr.maximum(f.pdf_fwd_w - mirror.pdf_fwd_w * shape, 0) * dr.pi,
+        _brightness(vertex, mirror),
+        mi.Float(mirror.pdf_fwd_w),
+        width2,
+    )
 
 
 def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
@@ -176,60 +175,6 @@ def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
     return mi.unpolarized_spectrum(f.value)
 
 
-@dataclass
-class ProxyVertices:
-    """Proxies of a lane's light vertices in local memory, without positions.
-
-    No field is a Bool (LLVM code generation aborts). ``normal`` with the diffuse brightness, negative if it
-    scatters to both sides; ``others``, negative if glossy; in scenes with glossy BSDFs ``lobe``: peak, its
-    density, squared width and ``peak_others``; ``wi`` with the diffuse density; ``shading``.
-    """
-
-    normal: dr.Local[mi.Vector4f]
-    others: dr.Local[mi.Float]
-    lobe: Any = None
-    wi: Any = None
-    shading: Any = None
-
-    @staticmethod
-    def allocate(kernel, size: int) -> ProxyVertices:
-        """Local memory for ``size`` proxies."""
-        made = ProxyVertices(dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Float, size))
-        if kernel.traits.glossy:
-            made.lobe, made.wi = dr.alloc_local(mi.Vector4f, size), dr.alloc_local(mi.Vector4f, size)
-            made.shading = dr.alloc_local(mi.Vector3f, size)
-        return made
-
-    def write(self, y: ProxyVertex, slot: mi.UInt32, keep: mi.Bool):
-        """Store a proxy in ``slot`` where ``keep``."""
-        size, n = dr.maximum(y.lobes.diffuse, _LEAST_SIZE), y.n  # its sign is a flag
-        self.normal.write(mi.Vector4f(n.x, n.y, n.z, dr.select(y.both, -size, size)), slot, keep)
-        others = y.others
-        if self.lobe is not None:
-            others = dr.select(y.glossy, -dr.maximum(others, _LEAST_SIZE), others)
-            lobe = mi.Vector4f(y.lobes.peak, y.lobes.peak_pdf, y.lobes.width2, y.peak_others)
-            self.lobe.write(lobe, slot, keep)
-            self.wi.write(mi.Vector4f(y.wi.x, y.wi.y, y.wi.z, y.lobes.diffuse_pdf), slot, keep)
-            self.shading.write(y.shading, slot, keep)
-        self.others.write(others, slot, keep)
-
-    def read(self, p: mi.Point3f, slot: mi.UInt32) -> ProxyVertex:
-        """The proxy in ``slot`` of a vertex at ``p``."""
-        normal, others = self.normal[slot], self.others[slot]
-        lobes, wi, shading, peak_others = Lobes.plain(), mi.Vector3f(0), mi.Vector3f(0), mi.Float(0)
-        lobes.diffuse = dr.abs(normal.w)
-        if self.lobe is not None:
-            lobe, wi, shading = self.lobe[slot], self.wi[slot], self.shading[slot]
-            lobes = Lobes(lobes.diffuse, wi.w, lobe.x, lobe.y, lobe.z)
-            wi, peak_others = mi.Vector3f(wi.x, wi.y, wi.z), lobe.w
-        return ProxyVertex(
-            p=p,
-            n=mi.Vector3f(normal.x, normal.y, normal.z),
-            both=normal.w < 0,
-            glossy=others < 0,
-            lobes=lobes,
-            wi=wi,
-            shading=shading,
-            others=dr.abs(others),
-            peak_others=peak_others,
-        )
+def _brightness(vertex, f: bsdf.Evaluation):
+    """Size of unpolarized light that reaches ``vertex`` and is scattered by ``f``."""
+    return spectra.brightest(mi.unpolarized_spectrum(vertex.throughput) * _intensity(f))
