@@ -244,19 +244,6 @@ def test_it_is_said_before_the_samples_are_traced(parameters, spp, long, passes,
     assert share == pytest.approx(sum(integrator.statistics["unsampled_light"].values()), rel=0.2)
 
 
-def test_explain_knows_the_share():
-    """Expected: with a pilot the text of the warning, without one only that such paths are not sampled."""
-    scene = scene_of(LAMPS["point"], block=BLOCK)
-    said = "\nnot sampled, about [0-9]+ % of the image's light: that of emitter 'lamp', .*; set merging"
-    paths = (
-        "\nnot sampled: delta emitter - specular - one non-specular vertex - specular - sensor (SDS: no "
-        "connectible edge)\n"
-    )
-    text, without = bdpt().explain(scene, spp=64), bdpt().explain(scene)
-    assert re.search(said, text) and text.count("not sampled") == 2 and paths in text
-    assert without.count("not sampled") == 1 and paths in without and "no spp given" in without
-
-
 def test_a_share_of_a_hundredth_is_said_before_the_first_pass():
     """Rationale: shares that a pilot put between a hundredth and two were said after the first pass, which
     may be the whole render. Expected: a share above a hundredth is said by a pilot, one below is not, as

@@ -149,13 +149,6 @@ def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command
     assert f"argument {words[-2]}: got {words[-1]!r}, which must be" in error
 
 
-@pytest.mark.parametrize("words", ["bdpt nothing", "", "skip=none"])
-def test_integrators_of_command_lines_are_checked(here, monkeypatch, capsys, words):
-    """Expected: what is no type with properties is said with the form that is wanted, status 2."""
-    assert by_user(monkeypatch, "equal-time", "room.xml", "-i", words, "path") == 2
-    assert "which must have the form" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("command", "taken"),
     [

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..transport import mis
-from ..transport.alternatives import newest_coefficient, newest_connection
+from ..transport.alternatives import newest_connection
 from ..transport.inputs import Kernel
 from ..transport.near_specular import is_narrow
 from ..transport.walk import Vertex
@@ -38,21 +38,23 @@ class Undersampled:
 
     ``kinds``: sums of sizes by kind, see `KINDS`. ``guidable``: by tile of the film, ``tiles`` per direction,
     sums of `GUIDABLE` over camera samples; where fewer than ``rarest`` samples are expected in a pixel, s = 0
-    counts as not finding the light.
+    counts as not finding the light. ``isolated``: camera subpaths pass diffuse vertices too, as long as no
+    edge is connectible (see `sds`), and merge where s = 0 can be guided.
     """
 
     samples: mi.Float
     rarest: mi.Float
     tiles: int
+    isolated: bool
     kinds: mi.Float64
     guidable: mi.Float64
 
     @staticmethod
-    def of(samples: float, tiles: int, rarest: float = 0.0) -> Undersampled:
+    def of(samples: float, tiles: int, rarest: float = 0.0, isolated: bool = False) -> Undersampled:
         """Empty sums for a render of ``samples`` per pixel."""
         sums = (dr.zeros(mi.Float64, count) for count in (len(KINDS), tiles**2 * len(GUIDABLE)))
         numbers = (dr.opaque(mi.Float, number) for number in (samples, rarest))
-        return Undersampled(*numbers, tiles, *sums)
+        return Undersampled(*numbers, tiles, isolated, *sums)
 
     def missing(
         self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position: mi.Point2f
@@ -70,14 +72,14 @@ class Undersampled:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
         size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
         dr.scatter_add(self.kinds, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
-        self._add_guidable(kernel, z, found, active & (expected > 0), expected, position)
+        if self.isolated:
+            self._add_guidable(kernel, found, active & (expected > 0), expected, position)
         return active & ~(expected >= FEWEST)  # NaN counts
 
-    def _add_guidable(self, kernel: Kernel, z: Vertex, found: Sample, active, expected, position):
-        """Add the merge ``found`` at ``z`` where it is ``active`` and on a path that photons guide."""
-        photon, kappa = found.photon, kernel.kappa
-        isolated = ~mis.is_used(newest_coefficient(kernel, kappa.splat, z.edges)) | (z.edges > 1)
-        active &= isolated & photon.hittable & ((photon.edges > 1) | ~mis.is_used(kappa.direct))
+    def _add_guidable(self, kernel: Kernel, found: Sample, active, expected, position):
+        """Add the merge ``found`` where it is ``active`` and on a path that photons guide."""
+        photon = found.photon
+        active &= photon.hittable & ((photon.edges > 1) | ~mis.is_used(kernel.kappa.direct))
         colours = mi.unpolarized_spectrum(found.value)
         light = mi.Float64(dr.sum(colours) / len(colours))
         size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
@@ -85,7 +87,7 @@ class Undersampled:
         active &= dr.isfinite(powers[-1])
         sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
         tile = kernel.camera.region.tile(position, self.tiles)
-        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile, isolated)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile)
 
     def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
         """Expected number of samples per pixel of the merged path and its neighbours.

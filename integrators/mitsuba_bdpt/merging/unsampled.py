@@ -23,6 +23,7 @@ from ..transport.inputs import Kernel, Observer
 from ..transport.near_specular import NARROW
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
+from ..transport.photons.guided_hits import Unguided
 from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.walk import random_walk
 from .merging import Merging
@@ -112,6 +113,10 @@ def _merged(
     side = subpaths.camera_side(kernel, sample, shared, walk)
     delta = undersampled is None
     side = replace(side, connect=None, only_delta=delta, only_specular=0 if delta else NARROW, sds=None)
+    isolated = undersampled and undersampled.isolated
+    if isolated:
+        walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)
+        side = replace(side, only_specular=0, isolated=True)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, kernel.emitters.count * channels)
 
@@ -132,7 +137,7 @@ def _merged(
 
     def visit(z, state, walk):
         seen, size, through = state
-        if undersampled is None:
+        if delta or isolated:
             there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
         else:
             there = has_lobe(kernel, z)

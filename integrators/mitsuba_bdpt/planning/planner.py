@@ -138,13 +138,15 @@ class Planner:
         learnt = self._learnt(moments)
         alternatives = self._alternatives(learnt)
         table, left_out = choice.choose(moments, alternatives), ()
+        if self.full.guided:  # whatever it costs
+            table = [row for row in table if row.candidate.guided] or table
         if not moments.mean > 0:  # the pilot saw no light, or NaN
             table = []
         if table:
             unguided = table[0].candidate.emission is None
             left_out = (
                 *choice.left_out(table, "merging" if self.full.merging else "guided s=0"),
-                *[UNMEASURED] * (self.full.guidable and not self._predicts_guiding()),
+                *[UNMEASURED] * (self.full.guidable and not (self.full.guided or self._predicts_guiding())),
                 *(components.guided_emission.left_out(learnt) if learnt and unguided else ()),
             )
         return _Result(tuple(table), left_out, moments, alternatives)

@@ -218,7 +218,7 @@ def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, samples: i
     """SDS light that photons can guide s = 0 to find, in a render of ``samples`` per pixel by ``plan``."""
     names = components.merging.GUIDABLE
     rarest = 0.0 if settings.merging is True else FEWEST_HITS / int(prepared.camera.region.size.prod())
-    undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE, rarest)
+    undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE, rarest, isolated=True)
     _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, samples, undersampled)
     *of_light, vertices = np.array(undersampled.guidable).reshape(-1, len(names)).T / lanes
     return GuidableLight(*of_light, float(vertices.sum()))
