@@ -289,7 +289,7 @@ def test_the_variance_without_guiding_is_predicted():
     scene = mi.load_dict(under_glass(ball(0.3) | {"center": ASIDE}))
     found = images(scene, 64, 20, guiding="never", light_paths=0, points="independent")
     render = Render(scene, scene.sensors()[0], internals.bdpt(max_depth=6, light_paths=0).settings, 1, 64)
-    light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 4096)
+    light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 4096, 0)
     assert light.light.sum() == pytest.approx(found.mean(), rel=0.15)
     assert light.second.sum() == pytest.approx(found.var(axis=0, ddof=1).mean() * 64, rel=0.15)
 
@@ -307,7 +307,7 @@ def test_light_of_several_diffuse_vertices_is_predicted():
         more["roof"] = roof | {"bsdf": matte(albedo)}
         scene = mi.load_dict(under_glass(lamp, floor=matte(0.8), **more))
         render = Render(scene, scene.sensors()[0], internals.bdpt(max_depth=16).settings, 1, 256)
-        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256)
+        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256, 0)
         found.append(light.light.sum())
     assert found[1] == pytest.approx(1.78 * found[0], rel=0.2)
 
@@ -455,12 +455,14 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
 
 def test_light_that_is_hit_too_rarely_is_merged():
     """Rationale: a pilot dropped hits that a render rarely has, found no gain, and left out ``merging=true``:
-    the image was black. Expected: a tiny lamp is merged."""
+    the image was black. Expected: a tiny lamp is merged, and guided where the user excludes merging."""
     described = under_glass(ball(0.001))
     described["sensor"]["film"] |= {"width": 64, "height": 64}
     method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
     image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))
     assert image.any() and method.statistics["merging"]["merges"]
+    unbiased = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": False})
+    assert unbiased.decide(mi.load_dict(described), spp=16)[0]["guided"]
 
 
 def test_no_photon_of_the_guide_is_dropped(monkeypatch):

@@ -214,7 +214,7 @@ def test_an_unrelated_ball_changes_no_prediction():
         scene = mi.load_dict(lit_metal(**more))
         settings = mi.load_dict({"type": "bdpt", "max_depth": 8}).settings
         render = Render(scene, scene.sensors()[0], settings, 0, 256)
-        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256)
+        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256, 0)
         found.append([light.light.sum(), light.second.sum()])
     np.testing.assert_allclose(*found, rtol=0.25)
 

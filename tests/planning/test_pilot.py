@@ -858,7 +858,7 @@ def test_pilots_that_do_not_measure_guided_hits():
     target = caustic()
     render = of(target)
     assert render.plan.guidable
-    light = unsampled_light.guidable(render.prepared, render.plan, render.settings, 64)
+    light = unsampled_light.guidable(render.prepared, render.plan, render.settings, 64, 0)
     without, measured = (
         pilot.measure(render.prepared, render.plan, render.settings, mi.UInt32(3), 2048, guidable=guidable)
         for guidable in (None, light)

@@ -11,7 +11,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7690,
     "transport merging guided_emission": 6488,
-    "planning": 2160,
+    "planning": 2162,
     "emitters": 2680,
     "cli": 1812,
     "media": 1350,
@@ -20,11 +20,11 @@ MOST = {
     "files": 1226,
     "run": 1237,
     "scene sampling": 770,
-    "host": 1077,
+    "host": 1075,
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 6092, "tests": 44848}
+OUTSIDE = {"scripts": 6092, "tests": 44849}
 MOST_WORDS = 68538
 
 

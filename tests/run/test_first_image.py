@@ -92,7 +92,7 @@ def test_pilots_of_rooms():
     for times, guided in ((1, False), (budget.GUIDING_TIMES, True)):
         assert len(integrator.decide(many, spp=times * least // 128**2 + 1)) == 1
         text = str(integrator.statistics["skipped"])
-        assert ("too short for the kernels" in text) == (not guided)
+        assert ("too short to predict its gain" in text) == (not guided)
 
 
 @pytest.mark.parametrize("light", LIGHTS)

@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 JOINED_SAMPLES, JOINED_PIXELS = 1 << 16, 1 << 10
 
 # Why s = 0 is not guided where its gain was not predicted, as in ``statistics["skipped"]``.
-UNMEASURED = not_worth(
-    "guided s=0", "with so many BSDFs the render is too short for the kernels that would predict its gain"
-)
+UNMEASURED = not_worth("guided s=0", "with so many BSDFs the render is too short to predict its gain")
 
 # Variance of guidable light over that of all other light from which on it may change the choice.
 MATTERS = 0.1
@@ -76,15 +74,17 @@ class _Result:
 class Planner:
     """The ``plan`` of one render of ``spp`` samples per pixel, and its decisions.
 
-    ``full``: the plan before any decision; ``threshold`` of roulette in units of the image, None before a
-    decision; ``decided``: saved with the render.
+    ``is_open``: light that it lacks may make it merge; ``full``: the plan before any decision; ``threshold``
+    of roulette in units of the image, None before a decision; ``decided``: saved with the render.
     """
 
     # The same for all seeds of a render, so that all decide alike.
     pilot_seed = 30
 
-    def __init__(self, prepared: PreparedScene, settings: Settings, spp: int, findings: SceneCache):
-        self._prepared, self._settings, self._findings = prepared, settings, findings
+    def __init__(
+        self, prepared: PreparedScene, settings: Settings, spp: int, findings: SceneCache, is_open: bool
+    ):
+        self._prepared, self._settings, self._findings, self._is_open = prepared, settings, findings, is_open
         self._pixels = int(prepared.camera.region.size.prod())
         self._samples = budget.expected_samples(settings, spp * self._pixels)
         self.full = plan(prepared, settings)
@@ -109,7 +109,7 @@ class Planner:
 
     def run_pilot(self) -> list[choice.Prediction]:
         """Run a pilot and adopt its decision; returns its predictions, the best first."""
-        key = self._settings, self.pilot_seed, self._samples, self._pixels, JOINED
+        key = self._settings, self._is_open, self.pilot_seed, self._samples, self._pixels, JOINED
         result, is_known = self._findings.find("results", key, self._piloted)
         self._result, ran = result, "cached" if is_known else "rendered"
         self.decided = replace(self.decided, pilot=ran, non_finite=result.moments.non_finite)
@@ -191,7 +191,9 @@ class Planner:
         if not self._predicts_guiding():
             return None
         spp = self._samples // self._pixels
-        return unsampled_light.guidable(self._prepared, self.full, self._settings, spp)
+        merges = self._is_open and not components.merging.why_not(self._prepared.camera.sensor, media=False)
+        fewest = unsampled_light.FEWEST_HITS if merges else 0
+        return unsampled_light.guidable(self._prepared, self.full, self._settings, spp, fewest)
 
     def adopt(self, decision: Decision, left_out: Iterable[dict[str, str]]):
         """Plan as decided from now on."""

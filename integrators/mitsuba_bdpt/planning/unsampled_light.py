@@ -51,8 +51,8 @@ NARROW = 100.0
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
 
-# Light of which s = 0 has fewer samples in an image, if all of it were like that, is no noise that guiding
-# would remove. Where vertices may be merged instead, they are to find it.
+# Light of which s = 0 has fewer samples in an image, if all of it were like that, is left to vertex merging
+# where ``merging=auto`` can choose it.
 FEWEST_HITS = 16
 
 SEED = 0x6C6F7374
@@ -214,12 +214,12 @@ def estimate(
     return UnsampledLight(colours, objects, float(never / size), float(few / size))
 
 
-def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, samples: int) -> GuidableLight:
-    """SDS light that photons can guide s = 0 to find, in a render of ``samples`` per pixel by ``plan``."""
+def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, fewest: int) -> GuidableLight:
+    """SDS light that photons can guide s = 0 to find, in a render by ``plan``; ``fewest``: `FEWEST_HITS`."""
     names = components.merging.GUIDABLE
-    rarest = 0.0 if settings.merging is True else FEWEST_HITS / int(prepared.camera.region.size.prod())
-    undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE, rarest, isolated=True)
-    _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, samples, undersampled)
+    rarest = fewest / int(prepared.camera.region.size.prod())
+    undersampled = components.merging.Undersampled.of(max(spp, PREVIEW), FINE, rarest, isolated=True)
+    _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, undersampled)
     *of_light, vertices = np.array(undersampled.guidable).reshape(-1, len(names)).T / lanes
     return GuidableLight(*of_light, float(vertices.sum()))
 

@@ -104,7 +104,7 @@ class Render:
         if settings.merging and (why := components.merging.why_not(sensor, self.prepared.space is not None)):
             raise UnsupportedError(f"{why}; leave out merging")
         self.findings = like.findings if like else SceneCache(self.prepared, sensor)
-        self.planner = Planner(self.prepared, settings, spp, self.findings)
+        self.planner = Planner(self.prepared, settings, spp, self.findings, self._is_open)
         if not isinstance(seed, mi.UInt32):
             seed = integer(seed, "seed", 0)
         seed = mi.UInt32(seed)
