@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.measure.agreement import Sample, sidak, welch
 from scipy import stats
 
@@ -176,7 +177,7 @@ def _bsdf(folder: Path, seed: int) -> Tried:
     xml = Generator(seed, folder).bsdf(maps=False, version="3.0.0")
     plugin = mi.load_string(xml)
     traits, wrong, seen = bsdf.Traits.of([plugin]), [], 0.0
-    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
+    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (sample_adjoint, evaluate_adjoint)):
         numbers = _Numbers(seed)
         si = _surface(numbers)
         step, _ = take(plugin, si, numbers.one(), numbers.two(), mi.Bool(True), traits)

@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.transport import bsdf, draws, spectra
 from scipy import stats
 
@@ -158,7 +159,7 @@ def surface(draw, n: int, tilt: float = 0.0):
 
 
 def take_step(take, plugin, draw, si):
-    """``take`` as a subpath calls it: `bsdf.sample` or `bsdf.sample_adjoint`."""
+    """``take`` as a subpath calls it: `bsdf.sample` or `sample_adjoint`."""
     step, _ = take(plugin, si, draw.one(), draw.two(), mi.Bool(True), bsdf.Traits.of([plugin]))
     return step
 
@@ -284,22 +285,14 @@ def test_step_is_evaluation_over_density(name):
     plugin = mi.load_dict(PLUGINS[name]())
     draw = Draw(n, 3)
     si = surface(draw, n, tilt=0.4)
-    active = mi.Bool(True)
-    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
+    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (sample_adjoint, evaluate_adjoint)):
         step = take_step(take, plugin, draw, si)
-        ev = evaluate(plugin, si, step.wo, active, bsdf.Traits.of([plugin]))
+        ev = evaluate(plugin, si, step.wo, mi.Bool(True), bsdf.Traits.of([plugin]))
         use = ~step.delta & (dr.max(step.weight) > 0)
-        use, weight, value, fwd, rev, ev_fwd, ev_rev, cos = in_numpy(
-            n,
-            mi.Float(dr.select(use, 1, 0)),
-            step.weight,
-            ev.value,
-            step.pdf_fwd_w,
-            step.pdf_rev_w,
-            ev.pdf_fwd_w,
-            ev.pdf_rev_w,
-            step.cos_out,
-        )
+        use = mi.Float(dr.select(use, 1, 0))
+        use, weight, value, cos = in_numpy(n, use, step.weight, ev.value, step.cos_out)
+        pdfs = (getattr(of, name) for of in (step, ev) for name in ("pdf_fwd_w", "pdf_rev_w"))
+        fwd, rev, ev_fwd, ev_rev = in_numpy(n, *pdfs)
         use = use > 0
         normal, outgoing, wi = (np.array(v, dtype=np.float64) for v in (si.n, step.wo, si.wi))
         own_cos = np.abs((normal * outgoing).sum(0))
@@ -308,9 +301,8 @@ def test_step_is_evaluation_over_density(name):
         np.testing.assert_allclose(rev[use], ev_rev[use], rtol=1e-3, atol=1e-6)
         error = np.abs(weight - value / np.where(ev_fwd > 0, ev_fwd, 1)).max(0)
         assert (error <= 1e-3 * weight.max(0))[use].all()
-        if take is bsdf.sample_adjoint:
-            radiance = plugin.eval(mi.BSDFContext(), bsdf.with_wi(si, step.wo), si.wi)
-            (radiance,) = in_numpy(n, radiance)
+        if take is sample_adjoint:
+            (radiance,) = in_numpy(n, plugin.eval(mi.BSDFContext(), bsdf.with_wi(si, step.wo), si.wi))
             own = radiance * own_cos / np.abs((normal * wi).sum(0))
             error = np.abs(value - own).max(0)
             assert (error <= 1e-3 * own.max(0))[use].all()
@@ -330,11 +322,13 @@ def test_evaluation_beside_a_step(name):
     u1, u2, wo = draw.one(), draw.two(), mi.warp.square_to_uniform_sphere(draw.two())
     third = dr.arange(mi.UInt32, n) % 3
     sampled, joined = third != 0, third != 1
-    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (bsdf.sample_adjoint, bsdf.evaluate_adjoint)):
-        target = bsdf.Target(wo, joined, mi.Float(0.7))
-        step, f = take(plugin, si, u1, u2, sampled, traits, target)
+    for take, evaluate in ((bsdf.sample, bsdf.evaluate), (sample_adjoint, evaluate_adjoint)):
+        cos_ratio = mi.Float(0.7) if take is sample_adjoint else None
+        step, f = take(plugin, si, u1, u2, sampled, traits, bsdf.Target(wo, joined, cos_ratio))
         alone, nothing = take(plugin, si, u1, u2, sampled, traits)
-        expected = evaluate(plugin, si, wo, joined, traits, *([0.7] if take is bsdf.sample_adjoint else []))
+        expected = evaluate(
+            plugin, si, wo, joined, traits, *([mi.Float(0.7)] if take is sample_adjoint else [])
+        )
         assert nothing is None
         for ours, theirs, where in (
             *((getattr(step, k), getattr(alone, k), sampled) for k in ("wo", "weight", "pdf_fwd_w")),
@@ -382,7 +376,7 @@ def test_steps_find_what_is_evaluated(name):
     plugin = mi.load_dict(PLUGINS[name]())
     for take, evaluate, end in (
         (bsdf.sample, bsdf.evaluate, _towards_light),
-        (bsdf.sample_adjoint, bsdf.evaluate_adjoint, _towards_camera),
+        (sample_adjoint, evaluate_adjoint, _towards_camera),
     ):
         draw = Draw(n, 11)
         si = surface(draw, n)
@@ -420,7 +414,7 @@ def test_what_is_not_a_number_in_a_blend_is_counted(broken):
     plugin, draw = mi.load_dict(plugin), Draw(n, 13)
     si = surface(draw, n)
     si.wi.z = dr.abs(si.wi.z)
-    for take in (bsdf.sample, bsdf.sample_adjoint):
+    for take in (bsdf.sample, sample_adjoint):
         step = take_step(take, plugin, draw, si)
         (weight,) = in_numpy(n, step.weight)
         share = np.isnan(weight).any(0).mean()
@@ -441,7 +435,7 @@ def test_delta_events_of_a_blend():
         plugin, draw = mi.load_dict(make), Draw(n, 12)
         si = surface(draw, n)
         si.wi.z = dr.abs(si.wi.z)
-        for take in (bsdf.sample, bsdf.sample_adjoint):
+        for take in (bsdf.sample, sample_adjoint):
             step = take_step(take, plugin, draw, si)
             expected = take_step(take, alone, draw, si)
             share, pdf, weight, own = in_numpy(
@@ -475,7 +469,7 @@ def test_both_sides_carry_the_same(name, tilt):
     estimates = []
     for seed, take, start, end in (
         (4, bsdf.sample, _towards_camera, _towards_light),
-        (5, bsdf.sample_adjoint, _towards_light, _towards_camera),
+        (5, sample_adjoint, _towards_light, _towards_camera),
     ):
         draw = Draw(n, seed)
         si = surface(draw, n, tilt)
@@ -506,7 +500,7 @@ def test_mapped_delta_events_that_camera_subpaths_cannot_make(name):
     n = 1 << 20
     plugin = mi.load_dict(PLUGINS[name]())
     sums = []
-    for seed, take in ((6, bsdf.sample), (7, bsdf.sample_adjoint)):
+    for seed, take in ((6, bsdf.sample), (7, sample_adjoint)):
         draw = Draw(n, seed)
         si = surface(draw, n)
         step = take_step(take, plugin, draw, si)

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
+from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.transport import bsdf
 
 COUNT = 4096
@@ -144,7 +145,7 @@ def test_evaluations_are_of_light_from_either_side(name):
     """
     traits, shape, si = surface(SMOOTH[name])
     other = directions(np.random.default_rng(4))
-    ours = bsdf.evaluate_adjoint(shape.bsdf(), si, other, mi.Bool(True), traits)
+    ours = evaluate_adjoint(shape.bsdf(), si, other, mi.Bool(True), traits)
     theirs = shape.bsdf().eval(mi.BSDFContext(), bsdf.with_wi(si, other), si.wi)
     theirs = si.to_world_mueller(theirs, -si.wi, other)
     ratio = np.array(bsdf.geometric_cos(si, other) / bsdf.geometric_cos(si, si.wi))
@@ -163,7 +164,7 @@ def test_delta_events_are_of_light_from_either_side(name):
     latter does not make, of other lobes or under maps from one end alone, are left out.) The
     intensity is that of the variant that is not polarized, of the same numbers.
     """
-    step, shape, si, numbers = drawn(DELTA[name], bsdf.sample_adjoint)
+    step, shape, si, numbers = drawn(DELTA[name], sample_adjoint)
     back = bsdf.with_wi(si, step.wo)
     bs, weight = shape.bsdf().sample(mi.BSDFContext(), back, *numbers)
     theirs = matrices(si.to_world_mueller(weight, -bs.wo, back.wi))
@@ -173,7 +174,7 @@ def test_delta_events_are_of_light_from_either_side(name):
     assert used.sum() > COUNT / 20
     assert difference(ours[used], theirs[used]).max() < 2e-3
     mi.set_variant(variants.of("mono"))
-    plain, *_ = drawn(DELTA[name], bsdf.sample_adjoint)
+    plain, *_ = drawn(DELTA[name], sample_adjoint)
     weight = np.broadcast_to(np.array(plain.weight).ravel(), COUNT)
     np.testing.assert_allclose(ours[used, 0, 0], weight[used], rtol=2e-3)
 
@@ -183,7 +184,7 @@ def test_light_of_the_way_back_has_another_matrix(name):
     """Rationale: the tests above are worth nothing where the matrices of both ways are the same. Expected:
     they differ by more than a twentieth of the intensity for most directions.
     """
-    light, *_ = drawn(DELTA[name], bsdf.sample_adjoint)
+    light, *_ = drawn(DELTA[name], sample_adjoint)
     camera, *_ = drawn(DELTA[name], bsdf.sample)
     ours, theirs = matrices(light.weight), matrices(camera.weight)
     lit = ours[:, 0, 0] > 1e-3

@@ -158,7 +158,7 @@ def test_densities_by_parameters_are_those_of_samples(kind, alpha):
     not meet the axis of the lobe exactly) below and 3 above (the share of the lobe among others is left out;
     the clearcoat's bound is 4 times too large)."""
     bsdf = mi.load_dict(kind[1](alpha))
-    si = near_specular._interaction(1 << 14)
+    si = near_specular.spread_interactions(1 << 14)
     si.wi = mi.Vector3f(0, 0, dr.sign(si.wi.z))
     u = mi.Point3f(np.random.default_rng(5).random((3, 1 << 14), np.float32))
     bs, weight = bsdf.sample(mi.BSDFContext(), si, u.x, mi.Point2f(u.y, u.z))

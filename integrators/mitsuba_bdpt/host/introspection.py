@@ -190,9 +190,10 @@ def _sides(shape: mi.Shape) -> tuple:
     return shape.interior_medium(), shape.exterior_medium()
 
 
-def registry_id(medium: mi.Medium) -> int:
-    """Index of a medium in Dr.Jit's registry."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.MediumPtr(medium))[0])
+def registry_id(plugin: mi.Medium | mi.BSDF) -> int:
+    """Index of a medium or BSDF in Dr.Jit's registry."""
+    pointer = mi.MediumPtr(plugin) if isinstance(plugin, mi.Medium) else mi.BSDFPtr(plugin)
+    return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
 
 
 def versions() -> dict[str, str]:

@@ -135,6 +135,7 @@ class Sharing:
 
     def __init__(self, pixels: int, samples: int, camera_paths: int, seed: mi.UInt32):
         part = -(-pixels // camera_paths)
+        self._parts = camera_paths
         self.total, self.lanes = pixels * samples, part * samples
         run = run_pixels(part)
         rows, columns = table_size(part // run)
@@ -153,37 +154,25 @@ class Sharing:
         return LaneSlot(lane, row, column, pixel & self._last, sample)
 
     def slot(self, seat: LaneSlot, part: mi.UInt32) -> mi.UInt32:
-        """The slot of a lane in a ``part``; none if not below ``total``."""
-        keys = self._keys(part)
+        """The slot of a lane in a ``part``, the first of which stays in place; none from ``total`` on."""
+        key = sobol.hash_u32(self._seed, part + _WORDS_OF_POINTS)
+        keys = [key ^ word for word in _ROUNDS]
         row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))
         column = _turned(seat.column, self._columns, sobol.mix(row ^ keys[1]))
         hashed = sobol.mix(column ^ keys[2])
-        row = _turned(row, self._rows, hashed)
-        return part * self._lanes + self._place(seat, part, row, column, hashed)
+        run = _turned(row, self._rows, hashed) * self._columns + column
+        # Also permutes the pixels within a run, by the low bits of the hash whose high bits rotated the
+        # column: otherwise pixels that share lanes would lie multiples of a run apart.
+        dealt = ((run << self._bits) + (seat.pixel ^ (hashed & self._last))) * self._samples + seat.sample
+        place = dr.select((seat.row < self._rows) & (part > 0), dealt, seat.lane)
+        return part * self._lanes + place
 
     def lane(self, slot: mi.UInt32) -> mi.UInt32:
-        """The lane of a slot, the inverse of `slot`."""
-        part = slot // self._lanes
-        seat, keys = self.seat(slot - part * self._lanes), self._keys(part)
-        hashed = sobol.mix(seat.column ^ keys[2])
-        row = _turned_back(seat.row, self._rows, hashed)
-        column = _turned_back(seat.column, self._columns, sobol.mix(row ^ keys[1]))
-        row = _turned_back(row, self._rows, sobol.mix(column ^ keys[0]))
-        return self._place(seat, part, row, column, hashed)
-
-    def _keys(self, part):
-        key = sobol.hash_u32(self._seed, part + _WORDS_OF_POINTS)
-        return [key ^ word for word in _ROUNDS]
-
-    def _place(self, seat, part, row, column, hashed):
-        """Place in a part after the permutation; the first part is not permuted.
-
-        Also permutes the pixels within a run, by the low bits of the hash whose high bits rotated the column:
-        otherwise pixels that share lanes would lie multiples of a run apart.
-        """
-        run = row * self._columns + column
-        dealt = ((run << self._bits) + (seat.pixel ^ (hashed & self._last))) * self._samples + seat.sample
-        return dr.select((seat.row < self._rows) & (part > 0), dealt, seat.lane)
+        """The lane of a slot, the inverse of `slot`, from a table of all: for tools."""
+        lane, part = dr.meshgrid(dr.arange(mi.UInt32, self.lanes), dr.arange(mi.UInt32, self._parts))
+        table = dr.zeros(mi.UInt32, self._parts * self.lanes)
+        dr.scatter(table, lane, self.slot(self.seat(lane), part))
+        return dr.gather(mi.UInt32, table, slot)
 
 
 def run_pixels(part: int) -> int:
@@ -208,8 +197,3 @@ def _turned(place, count, hashed):
     """Rotate ``place`` in a cycle of ``count`` by a hash."""
     place = place + dr.mul_hi(hashed, count)
     return dr.select(place >= count, place - count, place)
-
-
-def _turned_back(place, count, hashed):
-    by = dr.mul_hi(hashed, count)
-    return dr.select(place >= by, place - by, place + (count - by))

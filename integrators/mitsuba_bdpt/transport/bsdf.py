@@ -18,8 +18,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import polarization
+from ..host.introspection import registry_id
 from . import draws
 from .draws import needs_full_pdf, nested
+from .near_specular import spread_interactions
 from .spectra import brightest, is_finite, is_zero
 
 # Two points of one plane are connected under a cosine that is rounding; its square underflows.
@@ -172,18 +174,6 @@ class BSDFDispatch:
         number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
         return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
 
-    def together(self, bsdf, call, *args):
-        """Return ``call(bsdf, *args)``, which calls through this object.
-
-        In one virtual call, or with `MANY` BSDFs in one per question.
-        """
-        return call(bsdf, *args) if self.many else self(bsdf, call, *args)
-
-
-def registry_id(bsdf: mi.BSDF) -> int:
-    """Index of a BSDF in Dr.Jit's registry."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
-
 
 @dataclass
 class Target:
@@ -209,15 +199,19 @@ def connectible(bsdf: mi.BSDFPtr):
     return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
 
 
-def evaluate(
-    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool, traits: Traits
-) -> Evaluation:
-    """Evaluate a camera vertex towards the local ``wo``, with both densities."""
-    return _evaluation(*_evaluated(bsdf, si, wo, active, traits))
+def evaluate(bsdf, si, wo, active, traits: Traits, cos_ratio: mi.Float | None = None) -> Evaluation:
+    """Evaluate a camera vertex towards the local ``wo``, with both densities; with ``cos_ratio`` a light one.
+
+    Its ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal.
+    """
+    return _evaluation(*_evaluated(bsdf, si, wo, active, traits, cos_ratio is not None), cos_ratio)
 
 
-def _evaluated(bsdf, si, wo, active, traits: Traits):
+def _evaluated(bsdf, si, wo, active, traits: Traits, adjoint: bool):
     """Value and densities of ``wo`` and the reverse; the other direction is ``si.wi``."""
+    if adjoint:
+        value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, traits, False)
+        return value, pdf_fwd_w, pdf_rev_w
 
     def ask(self, si, wo, active):
         value, pdf = _value_and_pdf(self, si, wo, active, traits)
@@ -237,33 +231,14 @@ def _value_and_pdf(bsdf, si, wo, active, traits: Traits):
     return polarization.in_world(si, value, -wo, si.wi), pdf
 
 
-def _evaluation(value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
+def _evaluation(value, pdf_fwd_w, pdf_rev_w, cos_ratio: mi.Float | None = None) -> Evaluation:
     """Build an `Evaluation`; its value is NaN also where a density is non-finite.
 
     No weight follows from such a density; NaN is counted later. Irrelevant where the value is 0.
     """
+    value = value if cos_ratio is None else value * cos_ratio
     finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
     return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
-
-
-def evaluate_adjoint(bsdf, si, wo, active, traits: Traits, cos_ratio=None) -> Evaluation:
-    """Evaluate a light vertex towards the local direction ``wo`` (camera's side).
-
-    ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal.
-    """
-    if cos_ratio is None:
-        cos_ratio = geometric_cos(si, wo) / geometric_cos(si, si.wi)
-    return _adjoint(cos_ratio, *_evaluated_adjoint(bsdf, si, wo, active, traits))
-
-
-def _evaluated_adjoint(bsdf, si, wo, active, traits: Traits):
-    """Like `_evaluated`, with the directions swapped."""
-    value, pdf_rev_w, pdf_fwd_w = _evaluated(bsdf, with_wi(si, wo), si.wi, active, traits)
-    return value, pdf_fwd_w, pdf_rev_w
-
-
-def _adjoint(cos_ratio, value, pdf_fwd_w, pdf_rev_w) -> Evaluation:
-    return _evaluation(value * cos_ratio, pdf_fwd_w, pdf_rev_w)
 
 
 def geometric_cos(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Float:
@@ -272,56 +247,38 @@ def geometric_cos(si: mi.SurfaceInteraction3f, w: mi.Vector3f) -> mi.Float:
 
 
 def sample(
-    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
+    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None, adjoint: bool = False
 ) -> tuple[Step, Evaluation | None]:
-    """Sample the next direction of a camera subpath; ``u1`` picks the lobe.
+    """Sample the next direction of a subpath; ``u1`` picks the lobe.
 
-    Returns the `Step`, and the `Evaluation` of ``target`` or None.
+    Returns the `Step`, and the `Evaluation` of ``target`` or None. The adjoint factor of a light subpath is
+    part of ``weight`` and of the evaluation's ``value``.
     """
+    dispatch = traits.dispatch
 
-    def call(bsdf, si, u1, u2, sampled, *joined):
-        drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=False)
-        return drawn, _evaluated(bsdf, si, *joined, traits) if target else None
+    def call(bsdf, si, u1, u2, sampled, *connected):
+        drawn, weight = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint), None
+        if adjoint:
+            if dispatch.shared and not traits.only_delta:
+                smooth = sampled & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
+                found = _evaluated(bsdf, si, drawn.bs.wo, smooth, traits, adjoint)
+                drawn = replace(drawn, value=_evaluation(*found).value)
+            weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
+        return drawn, weight, _evaluated(bsdf, si, *connected[:2], traits, adjoint) if target else None
 
-    drawn, evaluated = _called(call, traits.dispatch, target, bsdf, si, u1, u2, active)
-    step = _step(si, drawn, drawn.weight)
-    if traits.round_trip:  # no alternative has to sample this event from the other side
-        step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
-    return step, _evaluation(*evaluated) if target else None
-
-
-def sample_adjoint(
-    bsdf, si, u1, u2, active, traits: Traits, target: Target | None = None
-) -> tuple[Step, Evaluation | None]:
-    """Continue a light subpath; arguments and results as in `sample`.
-
-    The adjoint factor is part of ``weight`` and of the evaluation's ``value``.
-    """
-
-    def call(bsdf, si, u1, u2, sampled, *joined):
-        drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint=True)
-        if traits.dispatch.shared and not traits.only_delta:
-            smooth = sampled & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-            found = _evaluated_adjoint(bsdf, si, drawn.bs.wo, smooth, traits)
-            drawn = replace(drawn, value=_evaluation(*found).value)
-        weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
-        return drawn, weight, _evaluated_adjoint(bsdf, si, *joined, traits) if target else None
-
-    drawn, weight, evaluated = _called(call, traits.dispatch, target, bsdf, si, u1, u2, active)
-    cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
-    step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
-    return step, _adjoint(target.cos_ratio, *evaluated) if target else None
-
-
-def _called(call, dispatch: BSDFDispatch, target, bsdf, *args):
-    """Return ``call(bsdf, *args)`` for an optional ``target``.
-
-    The last of ``args`` is a mask; direction and mask of ``target`` are appended.
-    """
-    joined = (target.wo, target.active) if target else ()
-    mask = args[-1] | target.active if target else args[-1]
-    # The last argument is the call's mask.
-    return dispatch.together(bsdf, lambda bsdf, *args: call(bsdf, *args[:-1]), *args, *joined, mask)
+    given = bsdf, si, u1, u2, active
+    if target:  # the last argument is the call's mask
+        given = *given, target.wo, target.active, active | target.active
+    # One virtual call, or with `MANY` BSDFs one per question.
+    drawn, weight, evaluated = call(*given) if dispatch.many else dispatch(given[0], call, *given[1:])
+    if not adjoint:
+        step = _step(si, drawn, drawn.weight)
+        if traits.round_trip:  # no alternative has to sample this event from the other side
+            step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
+    else:
+        cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
+        step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
+    return step, _evaluation(*evaluated, target.cos_ratio) if target else None
 
 
 def _adjoint_weight(si, drawn: _Drawn, traits: Traits):
@@ -455,11 +412,7 @@ def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     """
     if not mi.is_polarized:
         return []
-    rng = np.random.default_rng(0)
-    si = dr.zeros(mi.SurfaceInteraction3f, _ASKED)
-    si.uv = mi.Point2f(rng.random((2, _ASKED)).astype(np.float32))
-    directions = rng.standard_normal((3, _ASKED)).astype(np.float32)
-    si.wi = dr.normalize(mi.Vector3f(directions))
+    si = spread_interactions(_ASKED)
     found = [b for b in nested(bsdfs) if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
     return [b for b in found if not _is_scalar(mi.Spectrum(b.eval_null_transmission(si)))]
 

@@ -179,13 +179,13 @@ def _bound(texture: mi.Texture, sign: int, cached: Callable) -> float:
 
 def _evaluated(texture: mi.Texture, sign: int) -> float:
     """`_bound` of values at points all over the unit square of texture coordinates."""
-    found = np.array(texture.eval_1(_interaction(_TEXTURE_POINTS), mi.Bool(True)), dtype=np.float64)
+    found = np.array(texture.eval_1(spread_interactions(_TEXTURE_POINTS), mi.Bool(True)), dtype=np.float64)
     return float(np.nanmin(sign * found, initial=math.inf))
 
 
 def _sampled(bsdf: mi.BSDF) -> float:
     """Largest density of samples of a BSDF, at points all over its textures, from both sides."""
-    si, ctx = _interaction(_SAMPLES), mi.BSDFContext()
+    si, ctx = spread_interactions(_SAMPLES), mi.BSDFContext()
     u = np.random.default_rng(1).random((3, _SAMPLES), dtype=np.float32)
     bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(u[1], u[2]), mi.Bool(True))
     glossy = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -194,7 +194,7 @@ def _sampled(bsdf: mi.BSDF) -> float:
     return float(np.nanmax(pdf, initial=0))
 
 
-def _interaction(count: int) -> mi.SurfaceInteraction3f:
+def spread_interactions(count: int) -> mi.SurfaceInteraction3f:
     """Points of a plane with all texture coordinates in the unit square, seen from both sides."""
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.uv = spread_points(count)

@@ -11,10 +11,10 @@ from .bsdf import Evaluation, Target
 
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
     """Continue a subpath: the `Step`, and the `Evaluation` of ``target`` or None."""
-    take = bsdf.sample_adjoint if adjoint else bsdf.sample
     step, f, on_surface = None, None, _of(target, ~vertex.volume)
     if kernel.surfaces:
-        step, f = take(vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits, on_surface)
+        given = vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits
+        step, f = bsdf.sample(*given, on_surface, adjoint)
     if (phase := kernel.space.phase) is None:
         return step, f
     in_volume = phase.sample(vertex, u1, u2, active & vertex.volume, _of(target, vertex.volume))
@@ -31,13 +31,12 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate ``vertex`` towards the local ``wo``, with both densities (``reverse``) or one.
 
-    ``cos_ratio``, of light vertices: see `bsdf.evaluate_adjoint`.
+    ``cos_ratio``, of light vertices: see `bsdf.evaluate`.
     """
     traits = kernel.traits if reverse else kernel.traits.from_one_side()
 
     def on_surface() -> Evaluation:
-        given = vertex.bsdf, vertex.si, wo, active & ~vertex.volume, traits
-        return bsdf.evaluate(*given) if cos_ratio is None else bsdf.evaluate_adjoint(*given, cos_ratio)
+        return bsdf.evaluate(vertex.bsdf, vertex.si, wo, active & ~vertex.volume, traits, cos_ratio)
 
     if (phase := kernel.space.phase) is None:
         return on_surface()
