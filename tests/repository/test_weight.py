@@ -20,11 +20,11 @@ MOST = {
     "files": 1226,
     "run": 1237,
     "scene sampling": 770,
-    "host": 1075,
+    "host": 1076,
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 6085, "tests": 44856}
+OUTSIDE = {"scripts": 6085, "tests": 44853}
 MOST_WORDS = 68538
 
 

@@ -326,9 +326,7 @@ def test_evaluation_beside_a_step(name):
         cos_ratio = mi.Float(0.7) if take is sample_adjoint else None
         step, f = take(plugin, si, u1, u2, sampled, traits, bsdf.Target(wo, joined, cos_ratio))
         alone, nothing = take(plugin, si, u1, u2, sampled, traits)
-        expected = evaluate(
-            plugin, si, wo, joined, traits, *([mi.Float(0.7)] if take is sample_adjoint else [])
-        )
+        expected = evaluate(plugin, si, wo, joined, traits, cos_ratio)
         assert nothing is None
         for ours, theirs, where in (
             *((getattr(step, k), getattr(alone, k), sampled) for k in ("wo", "weight", "pdf_fwd_w")),

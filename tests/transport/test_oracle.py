@@ -538,12 +538,10 @@ class Flat:
 class Directly:
     """`bsdf.BSDFDispatch` without virtual calls: stand-ins answer themselves."""
 
-    shared = False
+    many = shared = False
 
     def __call__(self, plugin, question, *args):
         return question(plugin, *args)
-
-    together = __call__
 
 
 class Nothing:
