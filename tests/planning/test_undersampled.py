@@ -377,3 +377,9 @@ def test_it_is_said_before_the_first_pass(monkeypatch):
         bdpt().render(scene, spp=64)
     assert begun == [1] and len(warnings) == 1
     assert float(re.search("about ([0-9]+) %", warnings[0])[1]) == pytest.approx(75, rel=0.3)
+
+
+def test_light_of_few_samples_is_in_the_image():
+    """Expected: a first image that has no sample of it, neither of 99 times as much, lacks a hundredth."""
+    lost = unsampled_light.UnsampledLight({0: np.ones(3)}, never=0.0, few=99.0)
+    assert lost.shares(0.5) == {0: 0.01}

@@ -98,7 +98,7 @@ class UnsampledLight:
         if of_pilot:
             intensity = float(sum(colour.mean() for colour in self.colours.values()))
             mean = (mean / intensity + 1 + self.few - self.never) * size
-        whole = max(mean + self.never * size, size)
+        whole = max(mean + self.never * size, (1 + self.few) * size)
         return {i: each / whole for i, each in radiance.items()}
 
 
