@@ -118,8 +118,8 @@ class Prediction:
 def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
     """Predictions for the candidates of finite variance, the best first.
 
-    One of them with photon-guided BSDF sampling, of those with light subpaths: path tracing alone would guide
-    more vertices than were counted. Its samples hardly add an error.
+    Those with light subpaths with photon-guided BSDF sampling too, whose samples hardly add an error; path
+    tracing alone would guide more vertices than were counted.
     """
     candidates, learnt = alternatives.candidates, alternatives.learnt
     both = (
@@ -127,7 +127,6 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
         for values in (moments.variance, moments.typical)
     )
     rows: list[Prediction] = []
-    guided: list[Prediction] = []
     mean, typical = moments.guidable
     for candidate, v, t in zip(candidates, *(values.tolist() for values in both), strict=True):
         if not math.isfinite(v):
@@ -138,10 +137,9 @@ def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
         if mean and candidate.light_paths:
             candidate = replace(candidate, guided=GUIDED)
             each = cost(candidate, moments.rays, alternatives.samples)
-            guided.append(Prediction(candidate, each, (v * t) ** 0.5, v))
+            rows.append(Prediction(candidate, each, (v * t) ** 0.5, v))
     alone = [row.error for row in rows if not row.candidate.light_paths]
     unit = min(alone or [row.error for row in rows], default=1.0)
-    rows += sorted(guided, key=lambda row: row.score)[:1]
     return sorted((replace(row, error=row.error / unit) for row in rows), key=lambda row: row.score)
 
 
