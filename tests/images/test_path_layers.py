@@ -308,7 +308,7 @@ def test_without_path_layers_nothing_is_recorded_for_them(monkeypatch):
     def refuse(*_, **__):
         raise AssertionError("recorded for path layers")
 
-    for name in ("sampled", "evaluated", "connected"):
+    for name in ("sampled", "evaluated"):
         monkeypatch.setattr(path_layers, name, refuse)
     monkeypatch.setattr(sink._Total, "begin", refuse)
     target = scene(**SURFACES["near-specular"])

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -144,7 +145,7 @@ class BSDFDispatch:
 
     def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
         by_id = {registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
-        self.bsdfs = list(by_id.values())
+        self.bsdfs, self.count = list(by_id.values()), len(by_id)
         self.many = len(by_id) >= MANY
         self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
         # Samples and evaluations are separate calls, whose functions all places share: less to compile.
@@ -153,10 +154,6 @@ class BSDFDispatch:
         for number, index in enumerate(by_id):
             numbers[index] = number
         self._numbers = mi.UInt32(numbers)
-
-    @property
-    def count(self) -> int:
-        return len(self.bsdfs)
 
     @cached_property
     def kinds(self) -> int:
@@ -256,7 +253,7 @@ def sample(
     """
     dispatch = traits.dispatch
 
-    def call(bsdf, si, u1, u2, sampled, *connected):
+    def call(bsdf, si, u1, u2, sampled, *connected) -> Any:
         drawn, weight = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint), None
         if adjoint:
             if dispatch.shared and not traits.only_delta:

@@ -15,7 +15,6 @@ from .alternatives import direct_coefficient, merges_up_to, newest_coefficient
 from .contribution import (
     Contribution,
     Counters,
-    counters_with_media,
     drop_non_finite,
     layers,
     one,
@@ -65,8 +64,10 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     )
     weight, shares = h.weigh(*sides, merges=merges)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
-    path_layer = path_layers.connected(z, f_z, y, f_y) if kernel.path_layers else None
-    return replace(c, light_group=y.light_group, path_layer=path_layer)
+    if kernel.path_layers:
+        of_camera = path_layers.evaluated(z.layer, f_z, adjoint=False)
+        c.path_layer = path_layers.joined(of_camera, path_layers.evaluated(y.layer, f_y, adjoint=True))
+    return replace(c, light_group=y.light_group)
 
 
 @dr.syntax
@@ -78,7 +79,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero = mi.UInt32(0), mi.UInt32(0)
-    counters = counters_with_media(kernel, "non_finite")
+    counters = Counters.zeros("non_finite", *kernel.space.counters)
     while dr.hint(
         slot < candidates, label="inner connections", exclude=[kernel, z, path, stream, add, candidates]
     ):

@@ -86,17 +86,12 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counters_with_media(kernel: Kernel, *names: str) -> Counters:
-    """Counters of these ``names`` and of the segments of shadow rays at 0."""
-    return Counters.zeros(*names, *kernel.space.counters)
-
-
 def counted_by_light(kernel: Kernel) -> Counters:
     """Counters of the vertices of light subpaths."""
     plan = kernel.plan
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
     names += ["non_finite"] * (plan.splat or plan.arrival)
-    return counters_with_media(kernel, *names)
+    return Counters.zeros(*names, *kernel.space.counters)
 
 
 def counted_by_camera(kernel: Kernel) -> Counters:
@@ -105,7 +100,7 @@ def counted_by_camera(kernel: Kernel) -> Counters:
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     names += ["shadow_inner", "evaluated", "zero"] * inner
-    counters = counters_with_media(kernel, *names)
+    counters = Counters.zeros(*names, *kernel.space.counters)
     return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
 
 
@@ -185,6 +180,5 @@ def roulette(
     return active & survived, survival, Counters(rouletted=one(active & ~survived))
 
 
-def size_of(value: mi.Spectrum):
-    """Size of a contribution; any measure works that is positive where f is."""
-    return spectra.brightest(value)
+# Size of a contribution; any measure works that is positive where f is.
+size_of = spectra.brightest

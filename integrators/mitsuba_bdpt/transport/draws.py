@@ -48,9 +48,10 @@ def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active
 
     ``bs.pdf``: Mitsuba's; of a blend ``pdf()`` (solid angle) or the probability of a delta event.
     """
-    if not by_parts(bsdf):
-        return _by_mitsuba(bsdf, si, u1, u2, active)
-    return _BY_PARTS[bsdf.class_name()](bsdf, si, u1, u2, active)
+    if by_parts(bsdf):
+        return _BY_PARTS[bsdf.class_name()](bsdf, si, u1, u2, active)
+    bs, weight = bsdf.sample(mi.BSDFContext(), si, u1, u2, active)
+    return Draw(bs, weight, bs.pdf, is_zero(weight))
 
 
 def draw_delta(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
@@ -69,11 +70,6 @@ def by_parts(bsdf) -> bool:
     if not isinstance(bsdf, mi.BSDF) or bsdf.class_name() not in _BY_PARTS:
         return False
     return any(b.class_name() == "BlendBSDF" for b in nested([bsdf]))
-
-
-def _by_mitsuba(bsdf, si, u1, u2, active) -> Draw:
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, u1, u2, active)
-    return Draw(bs, weight, bs.pdf, is_zero(weight))
 
 
 def _blend(bsdf, si, u1, u2, active) -> Draw:

@@ -42,12 +42,6 @@ def evaluated(layer: mi.UInt32, f: Evaluation, adjoint: bool) -> mi.UInt32:
     return _after(layer, is_narrow(f), adjoint)
 
 
-def connected(z, f_z: Evaluation, y, f_y: Evaluation) -> mi.UInt32:
-    """Layer of the path that connects the vertices ``z`` and ``y`` of a camera and a light subpath."""
-    of_camera = evaluated(z.layer, f_z, adjoint=False)
-    return joined(of_camera, evaluated(y.layer, f_y, adjoint=True))
-
-
 def joined(of_camera: mi.UInt32, of_light: mi.UInt32) -> mi.UInt32:
     """Layer of the path of a camera and a light subpath with these numbers, each after its last event."""
     seen = dr.select(of_camera == EMISSION, of_light, INDIRECT)

@@ -29,7 +29,7 @@ from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
 from .sds import PhotonStrategy
 from .vacuum import ShadowRay
-from .walk import Vertex, Walk
+from .walk import Vertex
 
 
 def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
@@ -267,7 +267,12 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     """
     h = kernel.heuristic
     directly = walk.edges == 1
-    z = kernel.camera.hit(_reaching(walk, y), y, emission.infinite & directly)
+    reaching = walk
+    if y.edge is not None:  # in scenes with media its edge ends at ``y``
+        pi = mi.PreliminaryIntersection3f(walk.pi)
+        pi.t = dr.select(y.hit, dr.norm(y.si.p - walk.previous), dr.inf)
+        reaching = replace(walk, pi=pi)
+    z = kernel.camera.hit(reaching, y, emission.infinite & directly)
     active = z.active & (walk.edges <= kernel.last_arrival)
     reached, throughput, tr = kernel.space.up_to_sensor(walk, y, z, active)
     active &= reached
@@ -300,15 +305,6 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     if walk.layer is not None:
         c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), walk.layer)
     return c
-
-
-def _reaching(walk: Walk, y: Vertex):
-    """``walk`` for `Sensor.hit`: in scenes with media its edge ends at ``y``."""
-    if y.edge is None:
-        return walk
-    pi = mi.PreliminaryIntersection3f(walk.pi)
-    pi.t = dr.select(y.hit, dr.norm(y.si.p - walk.previous), dr.inf)
-    return replace(walk, pi=pi)
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):
