@@ -267,7 +267,7 @@ MUTANTS = (
     ),
     Mutant(
         "unsampled light: lamps that rays hit lack light",
-        "transport/photons/photon_pass.py",
+        "merging/unsampled.py",
         "active=walk.active & e.delta)",
         "active=walk.active)",
         ("tests/planning/test_unsampled_light.py::test_only_lamps_that_no_ray_hits_lack_light",),
@@ -275,8 +275,8 @@ MUTANTS = (
     Mutant(
         "unsampled light: photons have no emitter",
         "transport/photons/photon_pass.py",
-        "y.edges, lanes, e.index\n",
-        "y.edges, lanes, mi.UInt32(0)\n",
+        "emitter=e.index,",
+        "emitter=mi.UInt32(0),",
         ("tests/planning/test_unsampled_light.py::test_lamps_of_several_colours_are_lost_together",),
     ),
     Mutant(
@@ -1358,9 +1358,9 @@ MUTANTS = (
     ),
     Mutant(
         "near-specular guiding: guided light counts as undersampled",
-        "transport/photons/photon_pass.py",
-        "kept is PhotonPolicy.UNSAMPLED or (kept.estimates and kernel.plan.guided)",
-        "kept is PhotonPolicy.UNSAMPLED",
+        "merging/undersampled.py",
+        "if kernel.plan.guided else walk",
+        "if False else walk",
         ("tests/images/test_near_specular_guiding.py::test_guided_light_is_not_undersampled",),
     ),
     Mutant(
@@ -1463,9 +1463,9 @@ MUTANTS = (
     ),
     Mutant(
         "merging: photons start with the density of their aim",
-        "transport/photons/photon_pass.py",
-        "unaimed = kernel.merges or kept is PhotonPolicy.UNDERSAMPLED",
-        "unaimed = kept is PhotonPolicy.UNDERSAMPLED",
+        "merging/merging.py",
+        "return replace(e, pdf_second=e.pdf_second * aim), aim",
+        "return e, aim",
         ("tests/images/test_near_specular_merging.py::test_images_are_those_without_merging[steel]",),
     ),
     Mutant(
@@ -1490,8 +1490,8 @@ MUTANTS = (
     Mutant(
         "merging: photons are not divided by the probability of being kept",
         "transport/photons/photon_pass.py",
-        "flux = flux / probability",
-        "flux = flux * 1",
+        "flux=y.throughput / probability",
+        "flux=y.throughput",
         ("tests/images/test_near_specular_merging.py::test_bounds_lose_no_light[near_pane-0.2-False]",),
     ),
     Mutant(

@@ -181,7 +181,7 @@ class Recursion:
     def _along_light(self):
         """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
 
-        As in subpaths.light_walk, walk._vertex and _scatter.
+        As in subpaths.light_subpath, walk._vertex and _scatter.
         """
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)

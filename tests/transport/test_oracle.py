@@ -137,9 +137,9 @@ def test_sums_of_guiding_pass_delta_events():
         pdf_fwd_w=mi.Float(0), pdf_rev_w=mi.Float(0), cos_out=mi.Float(0.5), delta=mi.Bool(True)
     )
     before = mis.Partial(mi.Float(1), mi.Float(3), mi.Float(3))
-    h, merge = mis.Heuristic("balance"), mis.Merge(mi.Float(7), mi.Bool(True))
-    d_vm, after = mis.scattered_on_sds_path(h, before, step, merge), mis.scatter(h, before, 1, step)
-    assert d_vm[0] == after.d_vc[0] == 1.5
+    h, guided = mis.Heuristic("balance"), mi.Float(7)
+    d_vm = mis.scattered_guided(h, before, step, guided, mi.Bool(True))
+    assert d_vm[0] == mis.scatter(h, before, 1, step).d_vc[0] == 1.5
 
 
 @pytest.mark.parametrize("name", settings.HEURISTICS)
@@ -397,6 +397,8 @@ class Scene:
 class Lights:
     """Stand-in for `emitters.Emitters`: the interface with the script's densities."""
 
+    count = 1
+
     def __init__(self, world):
         w, paths = world, world.paths
         self.world = world
@@ -589,6 +591,7 @@ class Inputs(SimpleNamespace):
 
     merges = inputs.Kernel.merges
     guides_near_specular = inputs.Kernel.guides_near_specular
+    replaced, bound = inputs.Kernel.replaced, inputs.Kernel.bound
 
 
 class Guide(guided_hits.Guiding):
@@ -782,10 +785,9 @@ def traced_photons(world: World, k_, merges, shared, monkeypatch):
     """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
     from mitsuba_bdpt.merging import passes  # a component, see test_components
 
-    k_.bound = lambda *_: Inputs(**vars(k_))
     with monkeypatch.context() as patch:
         patch.setattr(photon_pass, "_CAPACITY", float(world.k))  # else they are traced again
-        patch.setattr(subpaths, "shared_by_lane", lambda *_: shared)
+        patch.setattr(subpaths, "begin_lane", lambda *_: (k_.points.stream(), shared))
         patch.setattr(dr, "while_loop", python_loop(world.k - 1))
         world.scene.begin(from_light=True)
         return passes.trace(k_, merges, k_.points, world.n)[0]

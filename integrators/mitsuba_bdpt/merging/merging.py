@@ -39,6 +39,7 @@ from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon, same_surface
+from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.sds import PhotonStrategy, State, begun
 from ..transport.walk import Vertex
 from .radius import Radius
@@ -105,10 +106,15 @@ class Merging(PhotonStrategy):
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: Kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
+        """Mask: a merge at ``vertex`` may count, as far as its side knows.
+
+        ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
+        """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
         return possible & mis.exceeds(self.weighed(vertex.si.p), connection)
 
-    def kept(self, kernel: Kernel, vertex, survived=1.0):
+    def kept(self, kernel: Kernel, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
+        """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
         return dr.minimum(_probability(d_vc, self.weighed(vertex.si.p)) / survived, 1)
 
@@ -146,6 +152,31 @@ class Merging(PhotonStrategy):
             label="merges",
         )
         return total, replace(counters, non_finite=lost, merges=merges)
+
+
+class MergedPhotons(PhotonPolicy):
+    """Stores all vertices where merges may count."""
+
+    only_specular = 0.0
+
+    def __init__(self, merging: Merging):
+        self.sds = self._merging = merging
+
+    def last_edge(self, kernel):
+        return kernel.last_merged
+
+    def emission(self, e, aim):
+        return replace(e, pdf_second=e.pdf_second * aim), aim  # weights do not know of the aim
+
+    def begin(self, kernel, e, walk):
+        return replace(walk, sds=State(survived=mi.Float(1)))
+
+    def stored(self, kernel, y, walk: Any, stream):
+        merging, connection = self._merging, newest_connection(kernel, kernel.kappa.direct, y)
+        keep = merging.may_merge(kernel, y, kernel.heuristic.present(connection))
+        probability = merging.kept(kernel, y, walk.sds.survived)
+        u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
+        return keep & (u < probability), probability
 
 
 def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:

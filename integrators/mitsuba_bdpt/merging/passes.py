@@ -15,8 +15,7 @@ from ..transport.inputs import Kernel
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
-from ..transport.photons.photon_pass import PhotonPolicy
-from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
+from .merging import BUCKET_BITS, MergedPhotons, Merging, Photons, bucket_of, cell_at, coefficient, level_of
 from .radius import Footprints, after
 from .wavelength_sets import SETS, WavelengthSets
 
@@ -102,7 +101,8 @@ def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
 
 def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
-    traced = photon_pass.trace(kernel, merging, merging.aim, points, count, PhotonPolicy.MERGED)
+    kernel = kernel.replaced(sds=merging)
+    traced = photon_pass.trace(kernel, MergedPhotons(merging), merging.aim, points, count)
     return replace(merging, photons=sort(merging, traced.photons, traced.count)), traced.counters
 
 

@@ -7,17 +7,19 @@ how many samples of the path a render expects.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from ..transport import mis
-from ..transport.alternatives import newest_connection
+from ..transport.alternatives import has_lobe, is_sds_vertex, newest_connection
 from ..transport.inputs import Kernel
-from ..transport.near_specular import is_narrow
+from ..transport.near_specular import NARROW, is_narrow
+from ..transport.photons.guided_hits import Unguided
 from ..transport.walk import Vertex
 from .merging import Merging, Sample
+from .unsampled import Unsampled
 
 # Expected samples per pixel below which light is undersampled: nine of ten pixels have none of it, the others
 # at least ten times too much.
@@ -33,35 +35,36 @@ GUIDABLE = ("light", "second", "fourth", "vertices")
 
 
 @dataclass
-class Undersampled:
+class Undersampled(Unsampled):
     """Which merges count as missing in a render of ``samples`` per pixel.
 
-    ``kinds``: sums of sizes by kind, see `KINDS`. ``guidable``: by tile of the film, ``tiles`` per direction,
-    sums of `GUIDABLE` over camera samples; where fewer than ``rarest`` samples are expected in a pixel, s = 0
-    counts as not finding the light. ``isolated``: camera subpaths pass diffuse vertices too, as long as no
-    edge is connectible (see `sds`), and merge where s = 0 can be guided.
+    ``kinds``: sums of sizes by kind, see `KINDS`.
     """
 
     samples: mi.Float
-    rarest: mi.Float
-    tiles: int
-    isolated: bool
-    kinds: mi.Float64
-    guidable: mi.Float64
+    kinds: mi.Float64 = field()
+
+    only_specular = NARROW
 
     @staticmethod
-    def of(samples: float, tiles: int, rarest: float = 0.0, isolated: bool = False) -> Undersampled:
+    def of(samples: float) -> Undersampled:
         """Empty sums for a render of ``samples`` per pixel."""
-        sums = (dr.zeros(mi.Float64, count) for count in (len(KINDS), tiles**2 * len(GUIDABLE)))
-        numbers = (dr.opaque(mi.Float, number) for number in (samples, rarest))
-        return Undersampled(*numbers, tiles, isolated, *sums)
+        return Undersampled(dr.opaque(mi.Float, samples), dr.zeros(mi.Float64, len(KINDS)))
 
-    def missing(
-        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position: mi.Point2f
-    ) -> mi.Bool:
-        """Mask: the merge ``found`` at ``z`` counts; adds it to the sums.
+    def emission(self, e, aim):
+        return super().emission(replace(e, pdf_second=e.pdf_second * aim), aim)  # the render has no aim
 
-        ``position`` of the camera sample on the film.
+    def begin(self, kernel, e, walk):
+        return super().begin(kernel, e, walk) if kernel.plan.guided else walk
+
+    def stored(self, kernel, y, walk, stream):
+        return has_lobe(kernel, y), 1.0
+
+    def is_merged(self, kernel, z, walk):
+        return has_lobe(kernel, z)
+
+    def missing(self, kernel, merging, z, found, position):
+        """Adds the merge to the sums.
 
         Only where the vertex is not near-specular itself: the path is merged there alone.
         """
@@ -72,22 +75,7 @@ class Undersampled:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
         size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
         dr.scatter_add(self.kinds, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
-        if self.isolated:
-            self._add_guidable(kernel, found, active & (expected > 0), expected, position)
         return active & ~(expected >= FEWEST)  # NaN counts
-
-    def _add_guidable(self, kernel: Kernel, found: Sample, active, expected, position):
-        """Add the merge ``found`` where it is ``active`` and on a path that photons guide."""
-        photon = found.photon
-        active &= photon.hittable & ((photon.edges > 1) | ~mis.is_used(kernel.kappa.direct))
-        colours = mi.unpolarized_spectrum(found.value)
-        light = mi.Float64(dr.sum(colours) / len(colours))
-        size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
-        powers = [light, light * size, light * size * dr.square(size)]
-        active &= dr.isfinite(powers[-1])
-        sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
-        tile = kernel.camera.region.tile(position, self.tiles)
-        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile)
 
     def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
         """Expected number of samples per pixel of the merged path and its neighbours.
@@ -103,3 +91,47 @@ class Undersampled:
         area = photon.connection + photon.older * f.pdf_fwd_w + camera
         # The render's light subpaths are not aimed.
         return self.samples * area * (found.number * photon.aim / merging.eta(z.si.p))
+
+
+@dataclass
+class Guidable(Undersampled):
+    """Which merges are on paths that photons can guide.
+
+    Camera subpaths pass diffuse vertices too, as long as no edge is connectible (see `sds`), and merge where
+    s = 0 can be guided. ``guidable``: by tile of the film, ``tiles`` per direction, sums of `GUIDABLE` over
+    camera samples; where fewer than ``rarest`` samples are expected in a pixel, s = 0 counts as not finding
+    the light.
+    """
+
+    rarest: mi.Float = field()
+    tiles: int = field()
+    guidable: mi.Float64 = field()
+
+    @staticmethod
+    def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
+        """Empty sums for a render of ``samples`` per pixel."""
+        sums = dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE))
+        of_kinds = vars(Undersampled.of(samples))
+        return Guidable(**of_kinds, rarest=dr.opaque(mi.Float, rarest), tiles=tiles, guidable=sums)
+
+    def begin_camera(self, kernel, walk, side):
+        walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)
+        return walk, replace(side, connect=None, isolated=True)
+
+    def is_merged(self, kernel, z, walk):
+        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+
+    def missing(self, kernel, merging, z, found, position):
+        """Adds the merge to the sums where it is on a path that photons guide."""
+        photon, expected = found.photon, self.expected(kernel, merging, z, found)
+        active = (expected > 0) & found.active & ~is_narrow(found.f)
+        active &= photon.hittable & ((photon.edges > 1) | ~mis.is_used(kernel.kappa.direct))
+        colours = mi.unpolarized_spectrum(found.value)
+        light = mi.Float64(dr.sum(colours) / len(colours))
+        size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
+        powers = [light, light * size, light * size * dr.square(size)]
+        active &= dr.isfinite(powers[-1])
+        sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
+        tile = kernel.camera.region.tile(position, self.tiles)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile)
+        return super().missing(kernel, merging, z, found, position)

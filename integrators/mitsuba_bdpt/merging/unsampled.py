@@ -16,21 +16,19 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling.points import Points
-from ..transport import subpaths
-from ..transport.alternatives import has_lobe, is_sds_vertex
+from ..transport import spectra, subpaths
+from ..transport.alternatives import is_sds_vertex
 from ..transport.batch import Batch, Places
-from ..transport.inputs import Kernel, Observer
-from ..transport.near_specular import NARROW
+from ..transport.inputs import Kernel
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
-from ..transport.photons.guided_hits import Unguided
 from ..transport.photons.photon_pass import PhotonPolicy
-from ..transport.walk import random_walk
-from .merging import Merging
+from ..transport.sds import PhotonStrategy
+from ..transport.walk import Side, Vertex, Walk, random_walk
+from .merging import Merging, Sample
 from .merging import sample as draw
 from .passes import sort
 from .radius import Footprints
-from .undersampled import Undersampled
 from .wavelength_sets import SETS, WavelengthSets
 
 # Merging radius in distances between camera samples (of a set of wavelengths) on the film: discs overlap, and
@@ -42,7 +40,7 @@ UNMEASURED = 8.0
 
 
 @dataclass
-class Unsampled:
+class Estimate:
     """Sums over camera samples.
 
     ``by_emitter``: a spectrum for each emitter. Of each sample ``seen``: mask, it has a vertex for merging;
@@ -58,15 +56,44 @@ class Unsampled:
 
 
 @dataclass
-class _Discs(Merging):
-    """Photons in discs, of which weights do not know."""
+class Unsampled(PhotonPolicy):
+    """Photons and camera subpaths are merged at the only non-delta vertex of paths that are not sampled."""
 
-    merges = False
+    # Sums of sizes by kind of light, see `undersampled.KINDS`: none is sampled.
+    kinds = (1.0, 0.0, 0.0)
 
-    def begin_light(self, kernel, walk):
-        return walk
+    def emission(self, e, aim):
+        """Non-finite emissions are traced to see where their light arrives: their aim is NaN."""
+        finite = spectra.is_finite(e.weight)
+        return replace(e, weight=dr.select(finite, e.weight, 1)), dr.select(finite, aim, dr.nan)
 
-    begin_camera = begin_light
+    def begin(self, kernel, e, walk):
+        # s = 0 samples the others, guided if need be.
+        return replace(walk, active=walk.active & e.delta)
+
+    def stored(self, kernel, y, walk, stream):
+        return is_sds_vertex(kernel, kernel.kappa.direct, walk, y), 1.0
+
+    def begin_camera(self, kernel: Kernel, walk: Walk, side: Side) -> tuple[Walk, Side]:
+        """A camera subpath on its first edge."""
+        return walk, replace(side, connect=None, only_specular=self.only_specular)
+
+    def is_merged(self, kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
+        """Mask: a camera subpath may merge at ``z``; ``walk`` as before its arrival."""
+        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+
+    def missing(
+        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position: mi.Point2f
+    ) -> mi.Bool:
+        """Mask: the merge ``found`` at ``z`` counts; ``position`` of the camera sample on the film."""
+        return found.active
+
+
+@dataclass
+class _Unmerged(PhotonStrategy):
+    """No strategy: weights know of no merges. Subpaths have these sets of wavelengths."""
+
+    wavelengths: WavelengthSets | None
 
 
 def estimate(
@@ -76,12 +103,11 @@ def estimate(
     photon_points: Points,
     points: Points,
     aim: Aim,
-    undersampled: Undersampled | None = None,
-) -> Unsampled:
+    policy: Unsampled,
+) -> Estimate:
     """Merge the camera subpaths of a pilot's ``batch`` with ``count`` photon subpaths, which ``aim`` begins.
 
-    ``kernel``: samples delta lobes only. With ``undersampled`` it samples all lobes, and such
-    light is included.
+    ``policy``: where, and which merges count.
     """
     sets, wavelengths = 1, None
     if mi.is_spectral:
@@ -90,43 +116,29 @@ def estimate(
     of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
     discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     met = dr.opaque(mi.Float, count / sets)
-    merging = _Discs(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
-    kept = PhotonPolicy.UNSAMPLED if undersampled is None else PhotonPolicy.UNDERSAMPLED
-    traced = photon_pass.trace(kernel, merging, aim, photon_points, count, kept)
+    merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
+    kernel = kernel.replaced(sds=_Unmerged(wavelengths))
+    traced = photon_pass.trace(kernel, policy, aim, photon_points, count)
     merging.photons = sort(merging, traced.photons, traced.count)
-    found = _merged(kernel, merging, batch, points, undersampled)
-    return Unsampled(*found, traced.broken)
+    found = _merged(kernel.bound(points), merging, batch, policy)
+    return Estimate(*found, traced.broken)
 
 
-def _merged(
-    kernel: Kernel, merging: Merging, batch: Batch, points: Points, undersampled: Undersampled | None
-) -> tuple:
-    """`Unsampled` up to ``through``."""
-    kernel = kernel.bound(points, 1.0, Observer())
-    kernel.sds = merging
+def _merged(kernel: Kernel, merging: Merging, batch: Batch, policy: Unsampled) -> tuple:
+    """`Estimate` up to ``through``."""
     lane = dr.arange(mi.UInt32, batch.size)
     place = Places(kernel, batch, batch.samples)
     # By lane: photons have the same sets of wavelengths in turn.
-    shared = subpaths.shared_by_lane(kernel, points.stream("light", mi.UInt64(lane)), mi.UInt64(lane))
-    sample = subpaths.camera_sample(kernel, place, shared, lane, mi.Bool(True))
-    walk = subpaths.camera_walk(kernel, sample, mi.Bool(True) & (kernel.max_depth >= 1))
-    side = subpaths.camera_side(kernel, sample, shared, walk)
-    delta = undersampled is None
-    side = replace(side, connect=None, only_delta=delta, only_specular=0 if delta else NARROW, sds=None)
-    isolated = undersampled and undersampled.isolated
-    if isolated:
-        walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)
-        side = replace(side, only_specular=0, isolated=True)
+    _, shared = subpaths.begin_lane(kernel, mi.UInt64(lane))
+    sample, walk, side = subpaths.camera_subpath(kernel, place, shared, lane, mi.Bool(True))
+    walk, side = policy.begin_camera(kernel, walk, side)
     channels = len(mi.UnpolarizedSpectrum())
     sums = dr.zeros(mi.Float64, kernel.emitters.count * channels)
 
     def merge(z, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)
-        if undersampled is None:
-            active, flaw = found.active, found.photon.older  # 0, or NaN
-        else:
-            active = undersampled.missing(kernel, merging, z, found, sample.start.position)
-            flaw = 0 * found.photon.older
+        active = policy.missing(kernel, merging, z, found, sample.start.position)
+        flaw = dr.select(dr.isfinite(found.photon.older + found.photon.aim), mi.Float(0), dr.nan)
         value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i
@@ -137,10 +149,7 @@ def _merged(
 
     def visit(z, state, walk):
         seen, size, through = state
-        if delta or isolated:
-            there = is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
-        else:
-            there = has_lobe(kernel, z)
+        there = policy.is_merged(kernel, z, walk)
         size = dr.if_stmt((z, size), there, merge, lambda z, size: size, label="unsampled light")
         first = z.hit & (z.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, z.si.shape), through)
@@ -148,5 +157,5 @@ def _merged(
 
     state = mi.Bool(False), mi.Float(0), mi.UInt32(0)
     state, _ = random_walk(kernel, side, walk, visit, state)
-    dr.eval(sums, state, undersampled or ())
+    dr.eval(sums, state, policy)
     return sums, *state

@@ -289,12 +289,12 @@ def measure(
     )
     kernel = Kernel(prepared, everything, settings, mis.ByClass())
     if everything.guidable and (prepared.delta if guidable is None else guidable.second.any()):
-        kernel.sds = Unguided(kernel.near_specular and guidable is not None)
+        kernel = kernel.replaced(sds=Unguided(kernel.near_specular and guidable is not None))
     region, emission = prepared.camera.region, None
     if everything.teachable and everything.emission is None:
-        kernel.cells = components.guided_emission.Cells(prepared.emitters)
-        kernel.emitters = kernel.cells.emitters
-        emission = components.guided_emission.EmissionStatistics(EMISSION_TILES**2, kernel.cells.count)
+        cells = components.guided_emission.Cells(prepared.emitters)
+        kernel = kernel.replaced(cells=cells, emitters=cells.emitters)
+        emission = components.guided_emission.EmissionStatistics(EMISSION_TILES**2, cells.count)
     pixels = int(region.size.prod())
     samples = PER_PIXEL * max(1, lanes // (PER_PIXEL * pixels))
     chosen = min(lanes // samples, pixels)

@@ -8,6 +8,7 @@ estimate merges camera subpaths with as many photons, see `merging.unsampled`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -34,7 +35,7 @@ from .moments import FINE, GuidableLight
 from .possible import SHORTEST
 
 if TYPE_CHECKING:
-    from ..merging import Undersampled, Unsampled
+    from ..merging import Estimate, Unsampled
 
 # Subpaths from either end: the fewest, the most, and samples of the render per subpath. The noise of the
 # estimate suffices for `WARN_SHARE`, not for a figure to rely on; see experiments, "Vertex merging". Few
@@ -180,10 +181,10 @@ def estimate(
     Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
     value.
     """
-    undersampled = None
+    policy = components.merging.Unsampled()
     if is_undersampling_possible(prepared, plan, settings):
-        undersampled = components.merging.Undersampled.of(max(samples, PREVIEW), FINE)
-    found, lanes = _merged(prepared, plan, settings, samples, undersampled)
+        policy = components.merging.Undersampled.of(max(samples, PREVIEW))
+    found, lanes = _merged(prepared, plan, settings, samples, policy)
     # In spectral variants the mean over the wavelengths, of which subpaths have different ones.
     total = np.array(found.by_emitter).reshape(prepared.emitters.count, -1) / lanes
     if mi.is_spectral:
@@ -202,7 +203,7 @@ def estimate(
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    never, rare, few = np.array([1, 0, 0] if undersampled is None else undersampled.kinds)
+    never, rare, few = np.array(policy.kinds)
     size = max(never + rare, np.finfo(np.float32).tiny)
     if never < rare:
         meant = {id(bsdf) for bsdf in prepared.near_specular}
@@ -218,29 +219,25 @@ def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, 
     """SDS light that photons can guide s = 0 to find, in a render by ``plan``; ``fewest``: `FEWEST_HITS`."""
     names = components.merging.GUIDABLE
     rarest = fewest / int(prepared.camera.region.size.prod())
-    undersampled = components.merging.Undersampled.of(max(spp, PREVIEW), FINE, rarest, isolated=True)
-    _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, undersampled)
-    *of_light, vertices = np.array(undersampled.guidable).reshape(-1, len(names)).T / lanes
+    policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)
+    _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, policy)
+    *of_light, vertices = np.array(policy.guidable).reshape(-1, len(names)).T / lanes
     return GuidableLight(*of_light, float(vertices.sum()))
 
 
 def _merged(
-    prepared: PreparedScene,
-    plan: Plan,
-    settings: Settings,
-    samples: int,
-    undersampled: Undersampled | None,
-) -> tuple[Unsampled, int]:
+    prepared: PreparedScene, plan: Plan, settings: Settings, samples: int, policy: Unsampled
+) -> tuple[Estimate, int]:
     """Merge subpaths; returns the sums, and over how many camera samples they go."""
     pixels, count = int(prepared.camera.region.size.prod()), _subpaths(prepared, samples)
     chosen = min(count, pixels)
     batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
-    sharp = undersampled is not None
+    sharp = policy.only_specular < math.inf
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         kernel = _kernel(prepared, plan, settings, sharp)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if sharp else ())
         drawn = (Points(kind, dr.opaque(mi.UInt32, SEED)) for kind in ("sobol", "independent"))
-        return components.merging.estimate(kernel, batch, count, *drawn, aim, undersampled), batch.size
+        return components.merging.estimate(kernel, batch, count, *drawn, aim, policy), batch.size
 
 
 def _subpaths(prepared: PreparedScene, samples: int) -> int:
@@ -249,18 +246,15 @@ def _subpaths(prepared: PreparedScene, samples: int) -> int:
     return max(SUBPATHS, min(1 << (whole // SAMPLES_OF_ONE).bit_length(), MOST_SUBPATHS))
 
 
-def _kernel(prepared: PreparedScene, plan: Plan, settings: Settings, undersampled: bool) -> Kernel:
-    """A kernel whose subpaths follow delta lobes only; weights are not computed.
+def _kernel(prepared: PreparedScene, plan: Plan, settings: Settings, sharp: bool) -> Kernel:
+    """A kernel that computes no weights; its partial sums, of coefficients 1, are numbers of samples.
 
-    ``undersampled``: all lobes, and partial sums of coefficients 1, which are numbers of samples.
+    Its subpaths sample delta lobes only, or all with ``sharp`` ones.
     """
-    if undersampled:
-        plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
+    plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
     kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
-    kernel.reverse = undersampled
-    kernel.traits = prepared.traits if undersampled else prepared.traits.of_delta_lobes()
-    kernel.last_light = kernel.last_arrival = kernel.last_merged = kernel.max_depth
-    return kernel
+    traits = prepared.traits if sharp else prepared.traits.of_delta_lobes()
+    return kernel.replaced(traits=traits, last_merged=kernel.max_depth)
 
 
 def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:

@@ -240,11 +240,11 @@ class Render:
     def _kernel(self) -> Kernel:
         kernel = Kernel(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
         if self.planner.threshold and self.plan.roulette:
-            kernel.set_threshold(dr.opaque(mi.Float64, self.planner.threshold))
+            kernel = kernel.with_threshold(dr.opaque(mi.Float64, self.planner.threshold))
         if self.light_groups is not None:
-            kernel.use_light_groups(self.light_groups)
+            kernel = kernel.with_light_groups(self.light_groups)
         if self.settings.path_layers:
-            kernel.use_path_layers()
+            kernel = kernel.with_path_layers()
         return kernel
 
     def _steps(self) -> Iterator[Step]:
@@ -277,12 +277,13 @@ class Render:
     def _pass(self, step: Step):
         """Trace one pass, with a launch for each batch."""
         if len(self.passes) == 1 and self.planner.threshold is None and self._plays_roulette():
-            self.kernel.set_threshold(MOST_ROULETTE * self.accumulator.mean())
+            self.kernel = self.kernel.with_threshold(MOST_ROULETTE * self.accumulator.mean())
         if self.plan.guided:
             guide = self._guide()
-            self.kernel.sds = None if guide is None else Guiding(guide, self.kernel.near_specular)
+            guiding = None if guide is None else Guiding(guide, self.kernel.near_specular)
+            self.kernel = self.kernel.replaced(sds=guiding)
         if self.plan.merging and self.merging is not None:
-            self.kernel.sds = self._photons(step, self.merging)
+            self.kernel = self.kernel.replaced(sds=self._photons(step, self.merging))
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()

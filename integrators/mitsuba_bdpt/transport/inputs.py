@@ -85,9 +85,12 @@ class Observer:
 
 
 class Kernel:
-    """Inputs of a pass besides its batch. Holds the scene for one render only."""
+    """Inputs of a pass besides its batch. Holds the scene for one render only.
 
-    # Set by `bound` for one batch.
+    Constant once made: `replaced` and the methods ``with_...`` return another.
+    """
+
+    # Of one batch, see `bound`.
     points: Points
     count_light: mi.Float
     observer: Observer
@@ -137,16 +140,20 @@ class Kernel:
         # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 
-    def bound(self, points: Points, count_light: float, observer: Observer) -> Kernel:
+    def replaced(self, **changes) -> Kernel:
+        """A copy in which these attributes have other values."""
+        other = copy(self)
+        vars(other).update(changes)
+        return other
+
+    def bound(self, points: Points, count_light: float = 1.0, observer: Observer | None = None) -> Kernel:
         """The kernel for one batch with its ``points``.
 
         ``count_light``: exact number of light subpaths per camera subpath in the batch, the divisor of
         estimates of t <= 1 (weights use the nominal number).
         """
-        other = copy(self)
-        other.points, other.count_light = points, dr.opaque(mi.Float, count_light)
-        other.observer = observer
-        return other
+        count = dr.opaque(mi.Float, count_light)
+        return self.replaced(points=points, count_light=count, observer=observer or Observer())
 
     @property
     def merges(self) -> bool:
@@ -158,13 +165,13 @@ class Kernel:
         """Whether near-specular events count as specular, see `sds`."""
         return self.sds is not None and self.sds.near_specular
 
-    def use_light_groups(self, groups: LightGroups):
-        """Let contributions store their light group."""
-        self.light_groups, self.emitters = groups, self.emitters.with_indices()
+    def with_light_groups(self, groups: LightGroups) -> Kernel:
+        """The kernel whose contributions store their light group."""
+        return self.replaced(light_groups=groups, emitters=self.emitters.with_indices())
 
-    def use_path_layers(self):
-        """Let contributions store their path layer, for which events need both densities."""
-        self.path_layers, self.traits = True, replace(self.traits, reverse=True)
+    def with_path_layers(self) -> Kernel:
+        """The kernel whose contributions store their path layer, for which events need both densities."""
+        return self.replaced(path_layers=True, traits=replace(self.traits, reverse=True))
 
     def light_group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32 | None:
         """The light group of the emitter ``index``; None without such layers."""
@@ -174,14 +181,15 @@ class Kernel:
         """Mask: paths of ``k`` edges use all strategies; longer ones only s = 0 and s = 1."""
         return k <= self._reach
 
-    def set_threshold(self, size: mi.Float64):
-        """Set the roulette threshold to ``size`` (``Float64`` of width 1), 0 for none.
+    def with_threshold(self, size: mi.Float64) -> Kernel:
+        """The kernel with the roulette threshold ``size`` (``Float64`` of width 1), 0 for none.
 
         Rounded to a power of two, so that the order of atomic sums rarely changes a decision.
         """
         rounded = dr.exp2(dr.round(dr.log2(size)))
-        self.inverse_threshold = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
-        dr.eval(self.inverse_threshold)
+        inverse = mi.Float(dr.select(size > 0, dr.rcp(rounded), dr.inf))
+        dr.eval(inverse)
+        return self.replaced(inverse_threshold=inverse)
 
 
 def _coefficients(plan: Plan, by_class: bool) -> Coefficients:

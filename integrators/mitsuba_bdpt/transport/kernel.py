@@ -7,12 +7,12 @@ except in pilots, only the film grows with the image size, and nothing with the 
 Work of a lane. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
 k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
-    time, wavelengths <- drawn for all subpaths of the lane                 subpaths.shared_by_lane
+    time, wavelengths <- drawn for all subpaths of the lane                 subpaths.begin_lane
 
     # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
     y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   subpaths.emission
     (1,1): splat y_0 seen by the sensor                                     techniques.connect_endpoints
-    the first edge <- a ray; it ends here if the throughput is 0 or not     subpaths.light_walk
+    the first edge <- a ray; it ends here if the throughput is 0 or not     subpaths.light_subpath
         finite
     d_vcm <- 1 / densities of y_0 and direction (eq. 31)
     d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
@@ -31,8 +31,8 @@ k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
 
     # Its camera subpaths
     for M S pixels (fewer in the last lanes; one without light subpaths):   _camera_paths, _camera_subpath
-        z_0, direction, throughput <- the sensor, at a point of the pixel   subpaths.camera_sample
-        the first edge <- a ray                                             subpaths.camera_walk
+        z_0, direction, throughput <- the sensor, at a point of the pixel   subpaths._camera_sample
+        the first edge <- a ray                                             subpaths._camera_walk
         d_vcm <- 1 / density of the direction (of z_0, if all are parallel) subpaths._first_partial
         d_vc <- kappa of t = 0 * cos / densities of z_0 and direction;
             0 without area
@@ -165,8 +165,7 @@ def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
     """Trace the light subpaths of these lanes; returns the lanes."""
     place_in_sequence = place.index(index)
-    stream = kernel.points.stream("light", place_in_sequence)
-    shared = subpaths.shared_by_lane(kernel, stream, place_in_sequence)
+    stream, shared = subpaths.begin_lane(kernel, place_in_sequence)
     path = light_path.allocate_light_path(kernel, dr.width(index))
     counters, emitted = Counters(), None
     if kernel.plan.joined > 1:
@@ -235,11 +234,10 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     # t = 0 samples SDS paths; other strategies do so with near-specular events.
     near_specular = kernel.merges or kernel.guides_near_specular
     sds = kernel.sds if plan.arrival or near_specular else None
-    walk = subpaths.light_walk(kernel, e, stream, shared, sds)
-    active, side = walk.active, subpaths.light_side(kernel, e, stream, shared, walk, sds)
+    begun, side = subpaths.light_subpath(kernel, e, stream, shared, sds)
     state = path, counted_by_light(kernel)
-    (path, counted), walk = random_walk(kernel, side, walk, visit, state)
-    counters += counted + walk.counted("light", active)
+    (path, counted), walk = random_walk(kernel, side, begun, visit, state)
+    counters += counted + walk.counted("light", begun.active)
     return path, counters, emitted
 
 
@@ -263,14 +261,11 @@ def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Count
 
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and connect it with the lane's light subpath."""
-    sample = subpaths.camera_sample(kernel, lane.place, lane.shared, slot, active)
-    active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
-    walk = subpaths.camera_walk(kernel, sample, active)
-    side = subpaths.camera_side(kernel, sample, lane.shared, walk, sink.alpha)
+    sample, begun, side = subpaths.camera_subpath(kernel, lane.place, lane.shared, slot, active, sink.alpha)
     visit = _camera_visit(kernel, sink, lane, sample)
     state = sink.begin(), counted_by_camera(kernel)
-    (total, counters), walk = random_walk(kernel, side, walk, visit, state)
-    counters += walk.counted("camera", active)
+    (total, counters), walk = random_walk(kernel, side, begun, visit, state)
+    counters += walk.counted("camera", begun.active)
     return counters + sink.end(kernel, lane, sample, total, walk.seen)
 
 

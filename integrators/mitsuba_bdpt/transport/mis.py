@@ -68,18 +68,6 @@ class Partial:
     d_vm_newest: mi.Float | mi.Vector4f | int = 0
 
 
-@dataclass
-class Merge:
-    """Another strategy that samples SDS paths at a vertex.
-
-    ``ratio``: its partial sum; ``isolated``: no edge of the path up to the event there is connected by a
-    strategy in use.
-    """
-
-    ratio: mi.Float | mi.Vector4f
-    isolated: mi.Bool
-
-
 def is_connectible(partial: Partial, coefficient: Coefficient):
     """Mask: a strategy with this ``coefficient`` connects the edge to the vertex."""
     return mi.Bool(False) if is_absent(coefficient) else (partial.d_vcm > 0) & is_used(coefficient)
@@ -248,18 +236,21 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, st
     return Partial(dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))), kept)
 
 
-def scattered_on_sds_path(heuristic: Heuristic, partial: Partial, step: Step, merge: Merge) -> PartialSum:
-    """``d_vm`` after an event on SDS paths: earlier merges, and this vertex's unless delta."""
-    merges = heuristic.combine(
-        heuristic.scale(partial.d_vm, step.pdf_rev_w),
-        merge.ratio,
-    )
+def scattered_guided(
+    heuristic: Heuristic, partial: Partial, step: Step, guided: PartialSum, isolated: mi.Bool
+) -> PartialSum:
+    """``d_vm`` after an event on SDS paths: guided s = 0 at earlier vertices, and at this one unless delta.
+
+    ``guided``: its partial sum at this vertex; ``isolated``: no edge up to the event is connected by a
+    strategy in use.
+    """
+    total = heuristic.combine(heuristic.scale(partial.d_vm, step.pdf_rev_w), guided)
     kept = dr.select(
         step.delta,
         heuristic.scale(partial.d_vm, step.cos_out),
-        heuristic.scale(merges, step.cos_out / step.pdf_fwd_w),
+        heuristic.scale(total, step.cos_out / step.pdf_fwd_w),
     )
-    return dr.select(merge.isolated, kept, 0)
+    return dr.select(isolated, kept, 0)
 
 
 def is_merge_dominated(merges: PartialSum, others: PartialSum):

@@ -139,8 +139,8 @@ class PhotonStrategy:
     """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``merges``: it merges vertices, and `ratio`, `may_merge`, `kept` and `survival`
-    are defined; ``near_specular``: near-specular events count as specular, and `counts` is defined.
+    subpaths use, or None; ``merges``: it merges vertices, and `ratio` and `survival` are defined;
+    ``near_specular``: near-specular events count as specular, and `counts` is defined.
     """
 
     counters: tuple[str, ...] = ()
@@ -150,17 +150,6 @@ class PhotonStrategy:
 
     def ratio(self, kernel, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.scattered_merges`."""
-        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
-
-    def may_merge(self, kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
-        """Mask: a merge at ``vertex`` may count, as far as its side knows.
-
-        ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
-        """
-        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
-
-    def kept(self, kernel, vertex, survived: mi.Float | float) -> mi.Float:
-        """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
 
     def survival(self, state: State, partial: mis.Partial, p: mi.Point3f) -> tuple[mi.Float, State]:
@@ -182,9 +171,9 @@ class PhotonStrategy:
         """The guide at ``vertex``; ``walk`` as before its arrival, ``step`` from there."""
         return None
 
-    def merge(self, kernel, vertex, isolated: mi.Bool) -> mis.Merge:
-        """What samples SDS paths at ``vertex``; ``isolated``: `State.isolated` after its event."""
-        raise NotImplementedError(f"{type(self).__name__} has no merge")
+    def guided(self, kernel, vertex) -> mis.PartialSum:
+        """Partial sum of guided s = 0 at ``vertex`` of a light subpath, see `mis.scattered_guided`."""
+        raise NotImplementedError(f"{type(self).__name__} does not guide")
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
         """Contributions at the camera vertex ``z``.

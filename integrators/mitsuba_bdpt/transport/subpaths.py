@@ -34,8 +34,13 @@ class CameraSample:
     strip: mi.UInt32
 
 
-def shared_by_lane(kernel: Kernel, stream, index: mi.UInt64) -> Shared:
-    """Time and wavelengths of a lane's subpaths; ``index`` of its light subpath."""
+def begin_lane(kernel: Kernel, index: mi.UInt64) -> tuple[Stream, Shared]:
+    """Random numbers of the light subpath ``index``, and time and wavelengths of its lane's subpaths."""
+    stream = kernel.points.stream("light", index)
+    return stream, _shared(kernel, stream, index)
+
+
+def _shared(kernel: Kernel, stream: Stream, index: mi.UInt64) -> Shared:
     sensor, points = kernel.camera.sensor, kernel.points
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
@@ -71,8 +76,8 @@ def emission(kernel: Kernel, stream, shared):
     return e
 
 
-def light_walk(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) -> Walk:
-    """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in its weights on SDS paths."""
+def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) -> tuple[Walk, Side]:
+    """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in weights on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -86,12 +91,9 @@ def light_walk(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) ->
     edge = kernel.space.begin(kernel, "light", stream, ray, e)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     walk = replace(walk, broken=broken)
-    return walk if sds is None else sds.begin_light(kernel, walk)
-
-
-def light_side(kernel: Kernel, e, stream, shared, walk, sds: PhotonStrategy | None) -> Side:
-    """The `Side` of a light subpath."""
-    return Side(
+    if sds is not None:
+        walk = sds.begin_light(kernel, walk)
+    return walk, Side(
         "light",
         stream,
         shared,
@@ -108,38 +110,18 @@ def light_side(kernel: Kernel, e, stream, shared, walk, sds: PhotonStrategy | No
 # -- a camera subpath --------------------------------------------------------------------------
 
 
-def camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
-    """Sample z_0 and the first direction."""
-    points = kernel.points
-    stream = points.stream("camera", place.index(slot))
-    u_film = points.draw_2d("camera", stream, Purpose.FILM)
-    u_lens = mi.Point2f(0.5)
-    if kernel.camera.needs_aperture_sample:
-        u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
-    start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    return CameraSample(start, stream, u_lens, active, place.strip(slot))
-
-
-def camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
-    """A camera subpath on its first edge."""
-    start, ray = sample.start, sample.start.ray
-    edge = kernel.space.begin(kernel, "camera", sample.stream, ray)
-    if kernel.plan.hide_emitters and edge is None:
-        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
-    else:
-        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-    partial = _first_partial(kernel, start)
-    walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
-    return walk if kernel.sds is None else kernel.sds.begin_camera(kernel, walk)
-
-
-def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False) -> Side:
-    """The `Side` of a camera subpath."""
+def camera_subpath(
+    kernel: Kernel, place: Places, shared, slot, active, alpha=False
+) -> tuple[CameraSample, Walk, Side]:
+    """A camera subpath on its first edge; it starts with a `_camera_sample`."""
+    sample = _camera_sample(kernel, place, shared, slot, active)
+    active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
+    walk = _camera_walk(kernel, sample, active)
 
     def choose_emitter(z):
         return techniques.choose_emitter(kernel, z, sample.stream)
 
-    return Side(
+    side = Side(
         "camera",
         sample.stream,
         shared,
@@ -152,6 +134,31 @@ def camera_side(kernel: Kernel, sample: CameraSample, shared, walk, alpha=False)
         connect=choose_emitter if kernel.plan.direct else None,
         sds=kernel.sds,
     )
+    return sample, walk, side
+
+
+def _camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
+    """Sample z_0 and the first direction."""
+    points = kernel.points
+    stream = points.stream("camera", place.index(slot))
+    u_film = points.draw_2d("camera", stream, Purpose.FILM)
+    u_lens = mi.Point2f(0.5)
+    if kernel.camera.needs_aperture_sample:
+        u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
+    start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
+    return CameraSample(start, stream, u_lens, active, place.strip(slot))
+
+
+def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
+    start, ray = sample.start, sample.start.ray
+    edge = kernel.space.begin(kernel, "camera", sample.stream, ray)
+    if kernel.plan.hide_emitters and edge is None:
+        pi, ray = rays.intersect_past_emitters(kernel.scene, kernel.shape_errors, ray, active, coherent=True)
+    else:
+        pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    partial = _first_partial(kernel, start)
+    walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
+    return walk if kernel.sds is None else kernel.sds.begin_camera(kernel, walk)
 
 
 def _first_partial(kernel: Kernel, start):

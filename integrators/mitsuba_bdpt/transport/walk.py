@@ -160,9 +160,9 @@ class Side:
     roulette compares with; ``adjoint``: light travels with the walk; ``coefficient``: kappa of the class of
     the newest alternative at vertex 1 (next-event estimation on the light side, t = 1 on the camera side);
     ``alpha``: the film needs to know whether a non-null event happened; ``parallel``: the first edge has one
-    direction, with density one across it; ``isolated``, ``only_delta``: the subpath ends once the flag of
-    `Walk` is false; ``only_specular``: it ends at an event that is not delta and has a smaller density from
-    one side (1 / sr; 0: at none).
+    direction, with density one across it; ``isolated``: the subpath ends once an edge is connectible, see
+    `sds.State`; ``only_specular``: it ends at an event that is not delta and has a smaller density from one
+    side (1 / sr; 0: at none, infinity: at each).
     Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
@@ -182,7 +182,6 @@ class Side:
     parallel: bool = False
     connect: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
-    only_delta: bool = False
     only_specular: float = 0.0
     sds: PhotonStrategy | None = None
 
@@ -327,8 +326,6 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Wa
         useful, sds = side.sds.survival(sds, partial, si.p)
     elif side.isolated and sds is not None:
         active &= sds.isolated
-    if side.only_delta:
-        active &= step.delta
     if side.only_specular:
         active &= is_narrow(step, side.only_specular) | step.delta
     survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
@@ -388,5 +385,5 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     state = state.after(h, vertex, coefficient, step)
     if strategy is None or mis.is_absent(vertex.partial.d_vm):
         return state, (0, 0)
-    merge = strategy.merge(kernel, vertex, state.isolated)
-    return state, (mis.scattered_on_sds_path(h, vertex.partial, step, merge), 0)
+    guided = strategy.guided(kernel, vertex)
+    return state, (mis.scattered_guided(h, vertex.partial, step, guided, state.isolated), 0)

@@ -20,6 +20,7 @@ heuristic). So guided subpaths carry the throughput and the weight of s = 0 by t
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -84,9 +85,9 @@ class Guiding(PhotonStrategy):
         """Density of ``d`` by the guide, times the number of guided samples."""
         return kernel.plan.guided * photon_guide.density(self.guide, p, found, d)
 
-    def merge(self, kernel, vertex, isolated) -> mis.Merge:
-        """The density of the direction that a light subpath came from takes the place of a merge's."""
-        return mis.Merge(kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other), isolated)
+    def guided(self, kernel, vertex):
+        """By the density of the direction that the light subpath came from."""
+        return kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other)
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
         """Trace guided subpaths from ``z`` where the guide is active."""
@@ -215,8 +216,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         kernel.max_depth,
         kernel.kappa.splat,
         connect=(lambda z: techniques.choose_emitter(kernel, z, numbers)) if connects else None,
-        only_delta=not near_specular,
-        only_specular=GUIDED if near_specular else 0,
+        only_specular=GUIDED if near_specular else math.inf,
         sds=guided if near_specular else None,
     )
     begun = walk.active
