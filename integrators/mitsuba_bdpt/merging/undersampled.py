@@ -111,8 +111,7 @@ class Guidable(Undersampled):
     def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
         """Empty sums for a render of ``samples`` per pixel."""
         sums = dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE))
-        of_kinds = vars(Undersampled.of(samples))
-        return Guidable(**of_kinds, rarest=dr.opaque(mi.Float, rarest), tiles=tiles, guidable=sums)
+        return Guidable(*vars(Undersampled.of(samples)).values(), dr.opaque(mi.Float, rarest), tiles, sums)
 
     def begin_camera(self, kernel, walk, side):
         walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)

@@ -82,9 +82,7 @@ class Unsampled(PhotonPolicy):
         """Mask: a camera subpath may merge at ``z``; ``walk`` as before its arrival."""
         return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
 
-    def missing(
-        self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position: mi.Point2f
-    ) -> mi.Bool:
+    def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position) -> mi.Bool:
         """Mask: the merge ``found`` at ``z`` counts; ``position`` of the camera sample on the film."""
         return found.active
 

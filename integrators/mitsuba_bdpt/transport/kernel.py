@@ -83,12 +83,7 @@ import mitsuba as mi
 
 from ..emitters.records import Cell
 from ..sampling.points import Points, Purpose
-from . import (
-    contribution,
-    light_path,
-    subpaths,
-    techniques,
-)
+from . import contribution, light_path, subpaths, techniques
 from .batch import Batch, Places, Sharing
 from .contribution import Counters, counted_by_camera, counted_by_light
 from .inputs import Kernel, Observer, Shared

@@ -44,10 +44,8 @@ class Photon:
     @staticmethod
     def zeros(count: int, layered: bool = False) -> Photon:
         """Memory for ``count`` photons, ``layered`` with path layers."""
-        kinds = get_type_hints(Photon)  # Dr.Jit would keep the types of the first variant in use
-        kinds["layer"] = mi.UInt32
-        if not layered:
-            del kinds["layer"]
+        # Dr.Jit would keep the types of the first variant in use.
+        kinds = get_type_hints(Photon) | {"layer": mi.UInt32 if layered else type(None)}
         return Photon(**{name: dr.zeros(kind, count) for name, kind in kinds.items()})
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:

@@ -56,9 +56,7 @@ class PhotonPolicy:
         """The subpath ``walk`` on its first edge."""
         return walk
 
-    def stored(
-        self, kernel: Kernel, y: Vertex, walk: Walk, stream: Stream
-    ) -> tuple[mi.Bool, mi.Float | float]:
+    def stored(self, kernel: Kernel, y: Vertex, walk: Walk, stream: Stream) -> tuple:
         """Mask: ``y`` is stored; the probability of that. ``walk`` as before its arrival."""
         raise NotImplementedError(f"{type(self).__name__} stores no vertices")
 
