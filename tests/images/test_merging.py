@@ -469,7 +469,7 @@ def test_which_photons_are_near():
     """
     p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0, 0.99], 0, [0, 0, 0, 0.24, 0.26, 0, 0, 0.19])
     n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7, 0], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51), 1])
-    photon = Photon(p, None, n, *[None] * 7)
+    photon = Photon(p, None, n, *[None] * 11)
     si = SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1))
     for offset, rounded in ((0, False), (0.1, True)):
         z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=offset))

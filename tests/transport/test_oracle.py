@@ -397,11 +397,9 @@ class Scene:
 class Lights:
     """Stand-in for `emitters.Emitters`: the interface with the script's densities."""
 
-    count = 1
-
     def __init__(self, world):
         w, paths = world, world.paths
-        self.world = world
+        self.world, self.count = world, 1
         self.area, self.at = mi.Bool(paths.kind == AREA), mi.Bool(paths.kind == POSITION)
         self.infinite, self.delta = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
         self.first, self.second, self.direct = w.f(paths.first), w.f(paths.second), w.f(paths.direct)

@@ -280,8 +280,7 @@ class Render:
             self.kernel = self.kernel.with_threshold(MOST_ROULETTE * self.accumulator.mean())
         if self.plan.guided:
             guide = self._guide()
-            guiding = None if guide is None else Guiding(guide, self.kernel.near_specular)
-            self.kernel = self.kernel.replaced(sds=guiding)
+            self.kernel = self.kernel.replaced(sds=guide and Guiding(guide, self.kernel.near_specular))
         if self.plan.merging and self.merging is not None:
             self.kernel = self.kernel.replaced(sds=self._photons(step, self.merging))
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
