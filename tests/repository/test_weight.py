@@ -11,7 +11,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7690,
     "transport merging guided_emission": 6401,
-    "planning": 2162,
+    "planning": 2155,
     "emitters": 2680,
     "cli": 1812,
     "media": 1350,
@@ -19,7 +19,7 @@ MOST = {
     "image": 1508,
     "files": 1226,
     "run": 1237,
-    "scene sampling": 770,
+    "scene sampling": 777,
     "host": 1076,
     "sensors": 939,
     "": 1554,  # top files

@@ -15,7 +15,14 @@ from ..emitters.infinite import contrast
 from ..geometry.boxes import is_finite, known_box, scene_box
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import all_shapes, check_not_animated, is_instance, media_of, own_parameters
+from ..host.introspection import (
+    all_shapes,
+    check_not_animated,
+    is_instance,
+    media_of,
+    own_parameters,
+    registry_id,
+)
 from ..host.notices import State, cached
 from ..sensors.checks import check_sensor, views
 from ..sensors.kinds import prepare
@@ -113,7 +120,7 @@ def _near_specular(
     """
 
     def known(owner: mi.BSDF, name: str, find):
-        key = bsdf.registry_id(owner), name, State.of([owner])
+        key = registry_id(owner), name, State.of([owner])
         return cached(scene, sensor, "near-specular lobes", key, find, most=_LOBES)[0]
 
     hit = {id(owner) for owner in found}
