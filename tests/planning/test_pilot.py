@@ -855,9 +855,7 @@ def test_pilots_that_do_not_measure_guided_hits():
     other moments are those of one that does, but for the light of these paths in the brightness of a place
     (up to 18 %).
     """
-    target = caustic()
-    render = of(target)
-    assert render.plan.guidable
+    render = of(caustic())
     light = unsampled_light.guidable(render.prepared, render.plan, render.settings, 64, 0)
     without, measured = (
         pilot.measure(render.prepared, render.plan, render.settings, mi.UInt32(3), 2048, guidable=guidable)

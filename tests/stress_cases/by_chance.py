@@ -15,7 +15,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.measure.agreement import Sample, sidak, welch
 from scipy import stats
 
@@ -26,6 +25,7 @@ from mitsuba_bdpt.transport import bsdf, spectra
 
 from .agreement import LEVEL, smallest_seen, tiles
 from .case import Outcome, of_section
+from .light_side import evaluate_adjoint, sample_adjoint
 from .random_files import Generator, write_assets
 
 SEEDS = 8

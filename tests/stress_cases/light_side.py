@@ -1,10 +1,10 @@
 """`bsdf.sample` and `bsdf.evaluate` as light subpaths call them."""
 
+from functools import partial
+
 from mitsuba_bdpt.transport import bsdf
 
-
-def sample_adjoint(*given):
-    return bsdf.sample(*given, adjoint=True)
+sample_adjoint = partial(bsdf.sample, adjoint=True)
 
 
 def evaluate_adjoint(plugin, si, wo, active, traits, cos_ratio=None):
