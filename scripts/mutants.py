@@ -1466,7 +1466,7 @@ MUTANTS = (
         "merging/merging.py",
         "return replace(e, pdf_second=e.pdf_second * aim), aim",
         "return e, aim",
-        ("tests/images/test_near_specular_merging.py::test_images_are_those_without_merging[steel]",),
+        ("tests/images/test_near_specular_merging.py::test_images_are_those_without_merging[bumpy]",),
     ),
     Mutant(
         "merging: longer than stored for s = 0 alone",

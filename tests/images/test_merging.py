@@ -206,10 +206,10 @@ def test_spectral():
     samples and in passes of less than one for each set.
     """
     mi.set_variant(variants.of("spectral"))
-    lamp = ball() | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [10, 6, 2]}}}
+    lamp = ball(0.05) | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1000, 600, 200]}}}
     floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
     scene = mi.load_dict(under_glass(lamp, floor))
-    expected = coloured(scene, 256, 8, 100)
+    expected = coloured(scene, 256, 8, 100, guiding="always", merging=False)
     for first, spp, more in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
         found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **more)
         family = [st.compare_images(st.tiles(found[..., i]), st.tiles(expected[..., i])) for i in range(3)]
