@@ -1,4 +1,4 @@
-"""Photon-guided BSDF sampling through near-specular lobes; scenes as in `test_hard_paths`."""
+"""Photon-guided BSDF sampling through near-specular lobes; scenes as in `test_near_specular_merging`."""
 
 import json
 from pathlib import Path
@@ -17,6 +17,7 @@ from mitsuba_bdpt.transport import sds
 from mitsuba_bdpt.transport.photons import guided_hits
 from sds_scenes import (
     NEAR_SPECULAR,
+    STRATEGIES,
     ball,
     images,
     near_specular_scene,
@@ -53,10 +54,7 @@ def test_images_are_those_without_guiding(case):
 @pytest.mark.parametrize(
     "parameters",
     [
-        {"skip": "none"},
-        {"light_paths": 0},
-        {"connections": "none"},
-        {"heuristic": "power"},
+        *STRATEGIES,
         {"skip": "none", "stored_vertices": 1},
         {"rr_depth": 1},
     ],

@@ -19,6 +19,7 @@ from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
     NEAR_SPECULAR,
     SIZE,
+    STRATEGIES,
     ball,
     images,
     matte,
@@ -61,13 +62,7 @@ def test_images_are_those_without_merging(case):
 
 @pytest.mark.parametrize(
     "parameters",
-    [
-        {"skip": "none"},
-        {"light_paths": 0},
-        {"connections": "none"},
-        {"heuristic": "power"},
-        {"skip": "none", "stored_vertices": 3},
-    ],
+    [*STRATEGIES, {"skip": "none", "stored_vertices": 3}],
     ids=str,
 )
 def test_any_choice_of_strategies_has_the_same_mean(parameters):

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 6085, "tests": 44859}
+OUTSIDE = {"scripts": 6085, "tests": 44855}
 MOST_WORDS = 68538
 
 

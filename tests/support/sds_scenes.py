@@ -131,6 +131,9 @@ def steel(alpha):
     return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
 
 
+# Choices of strategies and weights that change no expectation.
+STRATEGIES = ({"skip": "none"}, {"light_paths": 0}, {"connections": "none"}, {"heuristic": "power"})
+
 # Near-specular lobes, between what is a delta lobe and what is none.
 NEAR_SPECULAR = {
     "alpha .005": {"plate": rough(0.005)},

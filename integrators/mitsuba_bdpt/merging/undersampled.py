@@ -103,15 +103,18 @@ class Guidable(Undersampled):
     the light.
     """
 
-    rarest: mi.Float = field()
-    tiles: int = field()
-    guidable: mi.Float64 = field()
+    rarest: mi.Float
+    tiles: int
+    guidable: mi.Float64
 
     @staticmethod
     def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
         """Empty sums for a render of ``samples`` per pixel."""
         sums = dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE))
         return Guidable(*vars(Undersampled.of(samples)).values(), dr.opaque(mi.Float, rarest), tiles, sums)
+
+    def begin(self, kernel, e, walk):
+        return replace(walk, active=walk.active & ~e.delta)  # s = 0 samples no others
 
     def begin_camera(self, kernel, walk, side):
         walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)
@@ -124,7 +127,7 @@ class Guidable(Undersampled):
         """Adds the merge to the sums where it is on a path that photons guide."""
         photon, expected = found.photon, self.expected(kernel, merging, z, found)
         active = (expected > 0) & found.active & ~is_narrow(found.f)
-        active &= photon.hittable & ((photon.edges > 1) | ~mis.is_used(kernel.kappa.direct))
+        active &= (photon.edges > 1) | ~mis.is_used(kernel.kappa.direct)
         colours = mi.unpolarized_spectrum(found.value)
         light = mi.Float64(dr.sum(colours) / len(colours))
         size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
@@ -133,4 +136,4 @@ class Guidable(Undersampled):
         sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
         tile = kernel.camera.region.tile(position, self.tiles)
         dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile)
-        return super().missing(kernel, merging, z, found, position)
+        return active

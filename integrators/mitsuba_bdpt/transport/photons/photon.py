@@ -21,8 +21,8 @@ class Photon:
     times the coefficient of the connection of the last edge; ``older``, its ``d_vc``; ``d_vm`` and
     ``d_vm_newest``. ``aim``: the emitter's own density of the first direction over that of `Aim`;
     ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``:
-    index in the scene; ``hittable``: a ray can hit that; ``layer`` of its subpath before the event at it, see
-    `path_layers`, None without such layers.
+    index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`, None without such
+    layers.
     """
 
     p: mi.Point3f
@@ -38,7 +38,6 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
     emitter: mi.UInt32
-    hittable: mi.Bool
     layer: mi.UInt32 | None = None
 
     @staticmethod

@@ -137,7 +137,6 @@ def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Pho
             edges=y.edges,
             lane=lanes,
             emitter=e.index,
-            hittable=~e.delta,
             layer=y.layer,
         )
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
