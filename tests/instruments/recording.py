@@ -135,9 +135,9 @@ def _slots(launch: Launch, rows) -> list[int]:
     lane, x, y, splat = (rows[:, i].astype(int) for i in (0, 1, 2, 6))
     pixel = y * launch.width + x - batch.first_pixel
     sharing = kernel.shared_by(launch.kernel, batch, launch.points)
-    seat, slot = sharing.seat(mi.UInt32(lane)), mi.UInt32(lane)
+    slots, slot = sharing.slots(mi.UInt32(lane)), mi.UInt32(lane)
     for part in range(launch.kernel.plan.camera_paths):
-        taken = sharing.slot(seat, mi.UInt32(part))
+        taken = slots(mi.UInt32(part))
         here = (taken // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
         slot = dr.select(here, taken, slot)
     return np.broadcast_to(np.array(slot), len(rows)).tolist()

@@ -14,7 +14,7 @@ def slots_of(pixels, samples, camera_paths, seed) -> tuple[Sharing, np.ndarray]:
     """The map and the slots of all parts (part, lane); -1 where a lane has none."""
     sharing = Sharing(pixels, samples, camera_paths, mi.UInt32(seed))
     lane, part = dr.meshgrid(dr.arange(mi.UInt32, sharing.lanes), dr.arange(mi.UInt32, camera_paths))
-    slots = sharing.slot(sharing.seat(lane), part).numpy().astype(int).reshape(camera_paths, sharing.lanes)
+    slots = sharing.slots(lane)(part).numpy().astype(int).reshape(camera_paths, sharing.lanes)
     return sharing, np.where(slots < sharing.total, slots, -1)
 
 

@@ -1,21 +1,21 @@
 """The samples of one kernel launch: their pixels, and which share a light subpath.
 
-The pixels of a batch are cut into S parts of equal size (the last ones may be short); a lane serves a sample
-of one pixel of each part. Equal offsets in all parts would correlate pixels at one distance all over the
-image, and the noise would show stripes. So the pixels of each part are permuted:
+The pixels of a batch are cut into S parts of equal size (the last ones may be short); a lane has a sample of
+one pixel of each part. Equal offsets in all parts would correlate pixels at one distance all over the image,
+and the noise would show stripes. So the pixels of each part are permuted:
 
 * All samples of a pixel share with the same other pixels in all passes, so that its light subpaths are
   neighbours in the sequence and form a net where its camera samples do (see `points`).
 * Runs of neighbouring pixels stay together in large parts, which keeps rays of neighbouring lanes coherent.
-* A Feistel network permutes runs: with their numbers in a table of rows and columns, each column is rotated
-  by a hash of its number, then each row, then each column. It is a bijection for any number of runs and needs
-  neither memory nor, in the loop over the parts, a division.
+* A Feistel network permutes runs in a table of rows and columns: each column is rotated by a hash of its
+  number, then each row, then each column. It is a bijection for any number of runs and needs no memory.
 
 The remainder, less than a run and the few runs that fill no row of the table, stays in place.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isqrt
 
@@ -40,10 +40,8 @@ class Batch:
     """The samples of one launch: of a pass, of a band of its rows, or of a pilot.
 
     ``pixels`` pixels from ``first_pixel`` on (row by row in the film region), with ``samples`` samples of
-    each from ``first_sample`` on.
-
-    For pilots, ``spread`` > 0: one random pixel in each of ``pixels`` equal parts of the first ``spread``,
-    with independent samples; ``light``: light subpaths per camera sample.
+    each from ``first_sample`` on. For pilots, ``spread`` > 0: one random pixel in each of ``pixels`` equal
+    parts of the first ``spread``, with independent samples; ``light``: light subpaths per camera sample.
     """
 
     first_pixel: int
@@ -79,8 +77,7 @@ class Places:
         self._spp = dr.opaque(mi.UInt64, spp)
 
     def _split(self, slot):
-        pixel = slot // self._samples
-        sample = slot - pixel * self._samples
+        pixel, sample = _divided(slot, self._samples)
         if self._pilot:
             # Random: a regular stride would miss columns of films of that width.
             within = mi.UInt64(sobol.mix(pixel + 1)) % self._spread
@@ -95,14 +92,13 @@ class Places:
 
     def strip(self, slot: mi.UInt32) -> mi.UInt32:
         """Index of the sum of its pixel to which a camera sample is added."""
-        return (slot - slot // self._samples * self._samples) // STRIP
+        return _divided(slot, self._samples)[1] // STRIP
 
     def pixel(self, slot: mi.UInt32) -> mi.Point2i:
-        pixel, _ = self._split(slot)
-        return self._camera.region.pixel(pixel)
+        return self._camera.region.pixel(self._split(slot)[0])
 
 
-# Most pixels of a run; runs of one pixel are 4 to 8 % slower with one sample per pass.
+# Most pixels of a run, a power of two; runs of one pixel are 4 to 8 % slower with one sample per pass.
 LONGEST_RUN = 16
 
 # Parts of fewer runs use runs of one pixel: few runs would meet at few distances.
@@ -112,17 +108,6 @@ LEAST_RUNS = 256
 _WORDS_OF_POINTS = 2
 
 _ROUNDS = (0x3C6EF372, 0xDAA66D2B, 0x78DDE6E4)  # distinguish the keys of the rounds
-
-
-@dataclass
-class LaneSlot:
-    """A lane's place in a part: ``row`` and ``column`` of its run, pixel, and sample."""
-
-    lane: mi.UInt32
-    row: mi.UInt32
-    column: mi.UInt32
-    pixel: mi.UInt32
-    sample: mi.UInt32
 
 
 class Sharing:
@@ -137,53 +122,43 @@ class Sharing:
         part = -(-pixels // camera_paths)
         self._parts = camera_paths
         self.total, self.lanes = pixels * samples, part * samples
-        run = run_pixels(part)
-        rows, columns = table_size(part // run)
+        bits = max(min(LONGEST_RUN, part // LEAST_RUNS), 1).bit_length() - 1  # of the pixels of a run
+        rows, columns = _table_size(part >> bits)
         u32 = mi.UInt32
         self._seed = seed
         self._lanes, self._samples = dr.opaque(u32, self.lanes), dr.opaque(u32, samples)
-        self._last, self._bits = dr.opaque(u32, run - 1), dr.opaque(u32, run.bit_length() - 1)
+        self._last, self._bits = dr.opaque(u32, (1 << bits) - 1), dr.opaque(u32, bits)
         self._rows, self._columns = dr.opaque(u32, rows), dr.opaque(u32, columns)
 
-    def seat(self, lane: mi.UInt32) -> LaneSlot:
-        """The `LaneSlot` of a ``lane`` (``UInt32``), the same for all parts."""
-        pixel = lane // self._samples
-        run = pixel >> self._bits
-        row = run // self._columns
-        column, sample = run - row * self._columns, lane - pixel * self._samples
-        return LaneSlot(lane, row, column, pixel & self._last, sample)
+    def slots(self, lane: mi.UInt32) -> Callable[[mi.UInt32], mi.UInt32]:
+        """The slots of a ``lane`` by part; the first one is the lane, none from ``total`` on."""
+        pixel, sample = _divided(lane, self._samples)
+        in_run, (row, column) = pixel & self._last, _divided(pixel >> self._bits, self._columns)
 
-    def slot(self, seat: LaneSlot, part: mi.UInt32) -> mi.UInt32:
-        """The slot of a lane in a ``part``, the first of which stays in place; none from ``total`` on."""
-        key = sobol.hash_u32(self._seed, part + _WORDS_OF_POINTS)
-        keys = [key ^ word for word in _ROUNDS]
-        row = _turned(seat.row, self._rows, sobol.mix(seat.column ^ keys[0]))
-        column = _turned(seat.column, self._columns, sobol.mix(row ^ keys[1]))
-        hashed = sobol.mix(column ^ keys[2])
-        run = _turned(row, self._rows, hashed) * self._columns + column
-        # Also permutes the pixels within a run, by the low bits of the hash whose high bits rotated the
-        # column: otherwise pixels that share lanes would lie multiples of a run apart.
-        dealt = ((run << self._bits) + (seat.pixel ^ (hashed & self._last))) * self._samples + seat.sample
-        place = dr.select((seat.row < self._rows) & (part > 0), dealt, seat.lane)
-        return part * self._lanes + place
+        def slot(part: mi.UInt32) -> mi.UInt32:
+            key = sobol.hash_u32(self._seed, part + _WORDS_OF_POINTS)
+            keys = [key ^ word for word in _ROUNDS]
+            turned = _turned(row, self._rows, sobol.mix(column ^ keys[0]))
+            cycled = _turned(column, self._columns, sobol.mix(turned ^ keys[1]))
+            hashed = sobol.mix(cycled ^ keys[2])
+            run = _turned(turned, self._rows, hashed) * self._columns + cycled
+            # Also permutes the pixels within a run, by the low bits of the hash whose high bits rotated the
+            # column: otherwise pixels that share lanes would lie multiples of a run apart.
+            dealt = ((run << self._bits) + (in_run ^ (hashed & self._last))) * self._samples + sample
+            place = dr.select((row < self._rows) & (part > 0), dealt, lane)
+            return part * self._lanes + place
+
+        return slot
 
     def lane(self, slot: mi.UInt32) -> mi.UInt32:
-        """The lane of a slot, the inverse of `slot`, from a table of all: for tools."""
+        """The lane of a slot, the inverse of `slots`, from a table of all: for tools."""
         lane, part = dr.meshgrid(dr.arange(mi.UInt32, self.lanes), dr.arange(mi.UInt32, self._parts))
         table = dr.zeros(mi.UInt32, self._parts * self.lanes)
-        dr.scatter(table, lane, self.slot(self.seat(lane), part))
+        dr.scatter(table, lane, self.slots(lane)(part))
         return dr.gather(mi.UInt32, table, slot)
 
 
-def run_pixels(part: int) -> int:
-    """Pixels of a run, a power of two, in parts of ``part`` pixels."""
-    run = 1
-    while run < LONGEST_RUN and part >= 2 * run * LEAST_RUNS:
-        run *= 2
-    return run
-
-
-def table_size(runs: int) -> tuple[int, int]:
+def _table_size(runs: int) -> tuple[int, int]:
     """Rows and columns of a table of at most ``runs`` runs; 0 rows without runs.
 
     Among column counts from half to twice the root, the table that leaves out least, then the squarest.
@@ -191,6 +166,12 @@ def table_size(runs: int) -> tuple[int, int]:
     root = isqrt(runs)
     sizes = ((runs // columns, columns) for columns in range(max(root // 2, 1), 2 * root + 2))
     return min(sizes, key=lambda size: (runs - size[0] * size[1], abs(size[0] - size[1])))
+
+
+def _divided(n, by):
+    """Quotient and remainder."""
+    quotient = n // by
+    return quotient, n - quotient * by
 
 
 def _turned(place, count, hashed):

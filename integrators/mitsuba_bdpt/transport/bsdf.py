@@ -31,10 +31,10 @@ _LEAST_COS = 1e-18
 
 @dataclass
 class Evaluation:
-    """``value`` f |cos| (light side: with adjoint factor); densities in solid angle.
+    """``value`` f |cos| (light side: with adjoint factor); ``volume``: mask, scattering in a medium.
 
-    ``pdf_fwd_w`` of the new direction, ``pdf_rev_w`` of the reverse (0 without `Traits.reverse`); ``volume``:
-    mask, scattering in a medium.
+    Densities in solid angle: ``pdf_fwd_w`` of the new direction, ``pdf_rev_w`` of the reverse (0 without
+    `Traits.reverse`).
     """
 
     value: mi.Spectrum
@@ -45,9 +45,9 @@ class Evaluation:
 
 @dataclass
 class Step:
-    """A sampled event, on a surface, in a ``volume``, or ``null``.
+    """A sampled event; ``cos_out``: geometric cosine of ``wo``.
 
-    ``pdf_*`` as in `Evaluation`, unset where ``delta``; ``cos_out``: geometric cosine of ``wo``.
+    ``pdf_*`` as in `Evaluation`, unset where ``delta``.
     """
 
     wo: mi.Vector3f
@@ -65,10 +65,12 @@ class Step:
 class Traits:
     """Properties of the BSDFs that rays can hit.
 
-    See `needs_full_pdf`, `needs_round_trip`, `BSDFDispatch`. ``glossy``: one has a glossy lobe;
+    ``full_pdf``: see `draws.needs_full_pdf`; ``round_trip``: a delta event may exist from one end only, with
+    maps: Mitsuba's reject sampled directions (not incident ones) on different sides of the surface and of the
+    perturbed normal, and flip the normal towards the incident direction; ``glossy``: one has a glossy lobe;
     ``transmits``: one has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map;
-    ``parts``: one is sampled by its parts, see `draws`; ``reverse``: a strategy in use starts from the other
-    side, so that weights need reverse densities; ``only_delta``: only delta lobes are sampled.
+    ``parts``: one is sampled by its parts, see `draws`; ``reverse``: weights need reverse densities;
+    ``only_delta``: only delta lobes are sampled.
     """
 
     full_pdf: bool
@@ -105,25 +107,24 @@ class Traits:
         """
         hit = {id(bsdf): bsdf for bsdf in bsdfs}
         inner = {id(bsdf): bsdf for bsdf in family or nested(hit.values())}
-        flags = [int(bsdf.flags()) for bsdf in hit.values()]
-        through = int(mi.BSDFFlags.DiffuseTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+        maps = [bsdf for bsdf in inner.values() if bsdf.class_name() in draws.MAPS]
+        flags, f = [int(bsdf.flags()) for bsdf in hit.values()], mi.BSDFFlags
         parts = any(draws.by_parts(b) for b in hit.values())
         full_pdf = needs_full_pdf(inner.values())
         unhit += len(inner.keys() - hit.keys())
         return Traits(
             full_pdf=full_pdf,
-            round_trip=needs_round_trip(inner.values()),
+            round_trip=any(mi.has_flag(b.flags(), f.Delta) for b in maps),
             dispatch=BSDFDispatch(hit.values(), None if full_pdf or parts else unhit),
-            glossy=any(f & int(mi.BSDFFlags.Glossy) for f in flags),
-            transmits=any(f & through for f in flags),
-            mapped=any(b.class_name() in draws.MAPS for b in inner.values()),
+            glossy=any(has & int(f.Glossy) for has in flags),
+            transmits=any(has & (int(f.DiffuseTransmission) | int(f.GlossyTransmission)) for has in flags),
+            mapped=bool(maps),
             parts=parts,
         )
 
 
-# From this number of BSDFs on virtual calls are small. One call of everything that a vertex needs passes the
-# interaction once (6 % faster in a Cornell box), but each call site compiles its own functions, one per BSDF;
-# equal small calls are compiled once.
+# From this number of BSDFs on virtual calls are small: each call site compiles its own functions, one per
+# BSDF, equal ones once. One call of all that a vertex needs is 6 % faster in a Cornell box.
 MANY = 10
 
 # Largest number of the scene's BSDFs that no ray hits, relative to the others, up to which Mitsuba's virtual
@@ -135,16 +136,16 @@ _ASKED = 4096
 
 
 class BSDFDispatch:
-    """Virtual calls of ``bsdfs``.
+    """Virtual calls of ``bsdfs``, which are distinct.
 
     Mitsuba's visit all BSDFs of the process, each with a function in the kernel: also nested ones, which no
-    ray hits, and those of other scenes. They are used for `MANY` BSDFs none of which needs a correction,
-    beside few that no ray hits (``unhit``; None: some need a correction). Other scenes do not decide, since
-    an image must not depend on them. Else calls go through Python to ``bsdfs`` alone.
+    ray hits, and those of other scenes. They are used for `MANY` BSDFs beside few that no ray hits
+    (``unhit``; None: some of ``bsdfs`` need a correction), whatever other scenes hold. Else calls go through
+    Python to ``bsdfs`` alone.
     """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
-        by_id = {registry_id(b): b for b in {id(b): b for b in bsdfs}.values()}
+        by_id = {registry_id(b): b for b in bsdfs}
         self.bsdfs, self.count = list(by_id.values()), len(by_id)
         self.many = len(by_id) >= MANY
         self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
@@ -199,7 +200,7 @@ def connectible(bsdf: mi.BSDFPtr):
 def evaluate(bsdf, si, wo, active, traits: Traits, cos_ratio: mi.Float | None = None) -> Evaluation:
     """Evaluate a camera vertex towards the local ``wo``, with both densities; with ``cos_ratio`` a light one.
 
-    Its ``value`` includes the adjoint factor ``cos_ratio``, |n.wo| / |n.wi| with the geometric normal.
+    Its ``value`` includes the adjoint factor ``cos_ratio``, see `Target`.
     """
     return _evaluation(*_evaluated(bsdf, si, wo, active, traits, cos_ratio is not None), cos_ratio)
 
@@ -212,10 +213,9 @@ def _evaluated(bsdf, si, wo, active, traits: Traits, adjoint: bool):
 
     def ask(self, si, wo, active):
         value, pdf = _value_and_pdf(self, si, wo, active, traits)
-        pdf_rev_w = (
-            self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active) if traits.reverse else mi.Float(0)
-        )
-        return value, pdf, pdf_rev_w
+        if not traits.reverse:
+            return value, pdf, mi.Float(0)
+        return value, pdf, self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active)
 
     return traits.dispatch(bsdf, ask, si, wo, active)
 
@@ -229,10 +229,7 @@ def _value_and_pdf(bsdf, si, wo, active, traits: Traits):
 
 
 def _evaluation(value, pdf_fwd_w, pdf_rev_w, cos_ratio: mi.Float | None = None) -> Evaluation:
-    """Build an `Evaluation`; its value is NaN also where a density is non-finite.
-
-    No weight follows from such a density; NaN is counted later. Irrelevant where the value is 0.
-    """
+    """Build an `Evaluation`; its nonzero value is NaN, to be counted, where a density is non-finite."""
     value = value if cos_ratio is None else value * cos_ratio
     finite = dr.isfinite(pdf_fwd_w + pdf_rev_w)
     return Evaluation(dr.select(finite | is_zero(value), value, dr.nan), pdf_fwd_w, pdf_rev_w)
@@ -251,75 +248,45 @@ def sample(
     Returns the `Step`, and the `Evaluation` of ``target`` or None. The adjoint factor of a light subpath is
     part of ``weight`` and of the evaluation's ``value``.
     """
-    dispatch = traits.dispatch
 
     def call(bsdf, si, u1, u2, sampled, *connected) -> Any:
-        drawn, weight = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint), None
-        if adjoint:
-            if dispatch.shared and not traits.only_delta:
-                smooth = sampled & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-                found = _evaluated(bsdf, si, drawn.bs.wo, smooth, traits, adjoint)
-                drawn = replace(drawn, value=_evaluation(*found).value)
-            weight, drawn = _adjoint_weight(si, drawn, traits), replace(drawn, value=None)
-        return drawn, weight, _evaluated(bsdf, si, *connected[:2], traits, adjoint) if target else None
+        drawn = _drawn(bsdf, si, u1, u2, sampled, traits, adjoint)
+        return drawn, _evaluated(bsdf, si, *connected[:2], traits, adjoint) if target else None
 
-    given = bsdf, si, u1, u2, active
+    given = si, u1, u2, active
     if target:  # the last argument is the call's mask
         given = *given, target.wo, target.active, active | target.active
     # One virtual call, or with `MANY` BSDFs one per question.
-    drawn, weight, evaluated = call(*given) if dispatch.many else dispatch(given[0], call, *given[1:])
-    if not adjoint:
-        step = _step(si, drawn, drawn.weight)
-        if traits.round_trip:  # no alternative has to sample this event from the other side
-            step.cos_out = dr.select(~step.delta | (brightest(drawn.back) > 0), step.cos_out, 0)
-    else:
-        cos_ratio = geometric_cos(si, drawn.bs.wo) / geometric_cos(si, si.wi)
-        step = _step(si, drawn, dr.select(is_zero(weight), 0, weight * cos_ratio))
-    return step, _evaluation(*evaluated, target.cos_ratio) if target else None
-
-
-def _adjoint_weight(si, drawn: _Drawn, traits: Traits):
-    """Weight of a light subpath's sample without the ratio of geometric cosines."""
-    bs, delta = drawn.bs, mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
-    weight = mi.Spectrum(0) if drawn.value is None else drawn.value / drawn.density
-    # Removes the factor eta^-2 of radiance on camera subpaths.
-    eta2 = dr.square(bs.eta)
-    delta_weight = drawn.back / eta2 if _asks_back(traits, adjoint=True) else drawn.weight * eta2
-    weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), weight)
-    # Mitsuba may return a density for a rejected direction. NaN is kept, to be counted.
-    return dr.select((drawn.pdf_fwd_w == 0) | drawn.rejected, 0, weight)
+    many = traits.dispatch.many
+    drawn, evaluated = call(bsdf, *given) if many else traits.dispatch(bsdf, call, *given)
+    return _step(si, drawn, adjoint), _evaluation(*evaluated, target.cos_ratio) if target else None
 
 
 @dataclass
 class _Drawn:
-    """A sample of a BSDF (`draws.draw`), ``bs`` in radiance mode.
+    """A sample of a BSDF, ``bs`` in radiance mode; delta: ``pdf_fwd_w`` is the probability of the event.
 
-    ``weight`` and densities (delta: ``pdf_fwd_w`` is the probability of the event, ``pdf_rev_w`` unset);
-    ``back``, if `_asks_back`: weight of the delta event sampled from its other end, 0 if it does not lead
-    back; ``value``, of light subpaths with more than delta lobes, unless `BSDFDispatch.shared`: of the
-    direction from its other end (NaN as in `_evaluation`); ``of_parts``: density and rejection as in
-    `draws.Draw` in scenes with BSDFs sampled by parts.
+    ``back``, if needed: weight of the delta event sampled from its other end, 0 if it does not lead back;
+    ``value``, of light subpaths with more than delta lobes: of the direction from its other end (NaN as in
+    `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled by
+    parts.
     """
 
     bs: mi.BSDFSample3f
     weight: mi.Spectrum
     pdf_fwd_w: mi.Float
     pdf_rev_w: mi.Float
-    back: mi.Spectrum
-    value: mi.Spectrum | None = None
-    of_parts: tuple[mi.Float, mi.Bool] | None = None
-
-    @property
-    def density(self):
-        return self.pdf_fwd_w if self.of_parts is None else self.of_parts[0]
-
-    @property
-    def rejected(self):
-        return is_zero(self.weight) if self.of_parts is None else self.of_parts[1]
+    back: mi.Spectrum | None
+    value: mi.Spectrum | None
+    of_parts: tuple[mi.Float, mi.Bool] | None
 
 
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
-    """Sample a direction with densities both ways, in one virtual call."""
+    """Sample a direction with densities both ways, in one virtual call (two with `BSDFDispatch.shared`)."""
+    valued, shared = adjoint and not traits.only_delta, traits.dispatch.shared
+    # Light: the Mueller matrix of the other direction does not follow. (Mitsuba's importance mode turns
+    # retarders the wrong way.)
+    asks_back = traits.round_trip or (adjoint and bool(mi.is_polarized))
 
     def ask(self, si, u1, u2, active):
         ctx = mi.BSDFContext()
@@ -338,27 +305,53 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
             pdf_fwd_w = dr.select(full, self.pdf(ctx, si, bs.wo, full), bs.pdf)
         density = found.density if draws.by_parts(self) else pdf_fwd_w
         value, pdf_rev_w = None, mi.Float(0)
-        if adjoint and not traits.only_delta and not traits.dispatch.shared:
+        if valued and not shared:
             value, pdf = _value_and_pdf(self, with_wi(si, bs.wo), si.wi, smooth, traits)
             value = _evaluation(value, pdf_fwd_w, pdf).value
             pdf_rev_w = pdf if traits.reverse else pdf_rev_w
         elif traits.reverse:
             pdf_rev_w = self.pdf(ctx, with_wi(si, bs.wo), si.wi, smooth)
-        asks = _asks_back(traits, adjoint)
-        back = _back(self, si, bs, u1, u2, active & delta) if asks else mi.Spectrum(0)
-        answers = bs, weight, pdf_fwd_w, pdf_rev_w, back, value
-        return (*answers, (density, found.rejected)) if traits.parts else answers
+        back = _back(self, si, bs, u1, u2, active & delta) if asks_back else None
+        of_parts = (density, found.rejected) if traits.parts else None
+        return _Drawn(bs, weight, pdf_fwd_w, pdf_rev_w, back, value, of_parts)
 
-    return _Drawn(*traits.dispatch(bsdf, ask, si, u1, u2, active))
+    drawn = traits.dispatch(bsdf, ask, si, u1, u2, active)
+    if valued and shared:
+        smooth = active & ~mi.has_flag(drawn.bs.sampled_type, mi.BSDFFlags.Delta)
+        drawn.value = _evaluation(*_evaluated(bsdf, si, drawn.bs.wo, smooth, traits, adjoint)).value
+    return drawn
 
 
-def _asks_back(traits: Traits, adjoint: bool) -> bool:
-    """Whether delta events are also sampled from their other end.
-
-    On light subpaths of polarized variants for the Mueller matrix, which does not follow from that of the
-    other direction. (Mitsuba's importance mode turns retarders the wrong way.)
-    """
-    return traits.round_trip or (adjoint and bool(mi.is_polarized))
+def _step(si, drawn: _Drawn, adjoint: bool) -> Step:
+    """The `Step` of a sample."""
+    bs, weight, cos_out = drawn.bs, drawn.weight, geometric_cos(si, drawn.bs.wo)
+    density, rejected = drawn.of_parts or (drawn.pdf_fwd_w, is_zero(weight))
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    # A NaN direction hits nothing and would go unnoticed.
+    finite = dr.isfinite(dr.select(delta, cos_out, cos_out + drawn.pdf_fwd_w + drawn.pdf_rev_w))
+    finite &= is_finite(weight) & dr.isfinite(bs.eta)  # roulette uses eta
+    if adjoint:
+        smooth = mi.Spectrum(0) if drawn.value is None else drawn.value / density
+        # Removes the factor eta^-2 of radiance on camera subpaths.
+        eta2 = dr.square(bs.eta)
+        delta_weight = weight * eta2 if drawn.back is None else drawn.back / eta2
+        weight = dr.select(delta, delta_weight * _event_cos_ratio(si, bs), smooth)
+        # Mitsuba may return a density for a rejected direction. NaN is kept, to be counted.
+        weight = dr.select((drawn.pdf_fwd_w == 0) | rejected, 0, weight)
+        cos_ratio = cos_out / geometric_cos(si, si.wi)
+        weight = dr.select(is_zero(weight), 0, weight * cos_ratio)
+    elif drawn.back is not None:  # no alternative has to sample this event from the other side
+        cos_out = dr.select(~delta | (brightest(drawn.back) > 0), cos_out, 0)
+    return Step(
+        wo=bs.wo,
+        weight=dr.select(finite | rejected, weight, dr.nan),
+        pdf_fwd_w=drawn.pdf_fwd_w,
+        pdf_rev_w=drawn.pdf_rev_w,
+        cos_out=cos_out,
+        delta=delta,
+        null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
+        eta=bs.eta,
+    )
 
 
 def _back(bsdf, si, bs, u1, u2, active):
@@ -383,25 +376,6 @@ def _event_cos_ratio(si, bs):
     return dr.select(refracted, ratio, 1)
 
 
-def _step(si, drawn: _Drawn, weight) -> Step:
-    """The `Step` of a sample with this ``weight``."""
-    bs = drawn.bs
-    delta, cos_out = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), geometric_cos(si, bs.wo)
-    # A NaN direction hits nothing and would go unnoticed.
-    finite = dr.isfinite(dr.select(delta, cos_out, cos_out + drawn.pdf_fwd_w + drawn.pdf_rev_w))
-    finite &= is_finite(drawn.weight) & dr.isfinite(bs.eta)  # roulette uses eta
-    return Step(
-        wo=bs.wo,
-        weight=dr.select(finite | drawn.rejected, weight, dr.nan),
-        pdf_fwd_w=drawn.pdf_fwd_w,
-        pdf_rev_w=drawn.pdf_rev_w,
-        cos_out=cos_out,
-        delta=delta,
-        null=mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null),
-        eta=bs.eta,
-    )
-
-
 def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     """The ``bsdfs``, and nested ones, whose null transmission polarizes.
 
@@ -416,17 +390,5 @@ def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
 
 def _is_scalar(matrix: mi.Spectrum) -> bool:
     """Whether Mueller matrices are multiples of the identity per wavelength."""
-    rows = [[np.array(matrix[i, j]) for j in range(4)] for i in range(4)]
-    first = rows[0][0]
-    return all(np.abs(rows[i][j] - (i == j) * first).max() < 1e-6 for i in range(4) for j in range(4))
-
-
-def needs_round_trip(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether a delta event of ``bsdfs``, nested ones included, may exist from one end only.
-
-    That is, with bump or normal maps.
-
-    Mitsuba's maps reject sampled directions (not incident ones) on different sides of the surface and of the
-    perturbed normal, and flip the normal towards the incident direction.
-    """
-    return any(b.class_name() in draws.MAPS and mi.has_flag(b.flags(), mi.BSDFFlags.Delta) for b in bsdfs)
+    entries = np.array(matrix)
+    return np.abs(entries - np.multiply.outer(np.eye(4), entries[0, 0])).max() < 1e-6

@@ -120,7 +120,7 @@ def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UI
         return _camera_subpath(kernel, sink, lane, slot, active)
 
     if kernel.plan.light:
-        of_camera = _camera_paths(kernel, sharing, sharing.seat(index), trace_sample)
+        of_camera = _camera_paths(kernel, sharing.slots(index), trace_sample)
     else:
         of_camera = trace_sample(index)
     return (of_light + of_camera).summed()
@@ -240,16 +240,16 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
 
 @dr.syntax
-def _camera_paths(kernel: Kernel, sharing: Sharing, seat, trace_sample) -> Counters:
-    """Call ``trace_sample`` for each camera sample of the lane; returns the counters."""
+def _camera_paths(kernel: Kernel, slot_of, trace_sample) -> Counters:
+    """Call ``trace_sample`` for each camera sample of the lane (`Sharing.slots`); returns the counters."""
     counters = Counters.zeros("camera") + counted_by_camera(kernel)
     number = mi.UInt32(0)
     while dr.hint(
         number < kernel.camera_paths,
         label="camera subpaths of one light subpath",
-        exclude=[kernel, sharing, seat, trace_sample],
+        exclude=[kernel, slot_of, trace_sample],
     ):
-        counters = counters + trace_sample(sharing.slot(seat, number))
+        counters = counters + trace_sample(slot_of(number))
         number += 1
     return counters
 
