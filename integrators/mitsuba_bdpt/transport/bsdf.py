@@ -131,9 +131,6 @@ MANY = 10
 # calls are used. Recorded in C++, a call of a simple BSDF costs a quarter of one through Python.
 _UNHIT = 0.25
 
-# Points at which null transmission is tested.
-_ASKED = 4096
-
 
 class BSDFDispatch:
     """Virtual calls of ``bsdfs``, which are distinct.
@@ -383,7 +380,7 @@ def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     """
     if not mi.is_polarized:
         return []
-    si = spread_interactions(_ASKED)
+    si = spread_interactions()
     found = [b for b in nested(bsdfs) if mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
     return [b for b in found if not _is_scalar(mi.Spectrum(b.eval_null_transmission(si)))]
 

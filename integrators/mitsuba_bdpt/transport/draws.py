@@ -2,9 +2,8 @@
 
 Multiple importance sampling requires that the density of a sample equals ``pdf()`` of its direction.
 Mitsuba's ``blendbsdf`` (3.9.1) violates it: it keeps directions that one part sampled and rejected (a
-``diffuse`` from behind, a ``roughdielectric`` below the horizon), with the value of the other part, and it
-mixes the probability of a delta event with the density of the other part, which darkens mirrors. So a blend
-is sampled here by its parts.
+``diffuse`` from behind, a ``roughdielectric`` below the horizon), with the value of the other part, and mixes
+the probability of a delta event with the other part's density. So a blend is sampled here by its parts.
 """
 
 from __future__ import annotations
@@ -29,6 +28,9 @@ _SAMPLED_PDF_IS_PDF = frozenset(
 # Plugins that change the frame of nested BSDFs.
 MAPS = "BumpMap", "NormalMap"
 
+# Plugins that are sampled here if they contain a blend.
+_BY_PARTS = "BlendBSDF", "TwoSidedBRDF", "MaskBSDF"
+
 
 @dataclass
 class Draw:
@@ -48,10 +50,15 @@ def draw(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active
 
     ``bs.pdf``: Mitsuba's; of a blend ``pdf()`` (solid angle) or the probability of a delta event.
     """
-    if by_parts(bsdf):
-        return _BY_PARTS[bsdf.class_name()](bsdf, si, u1, u2, active)
-    bs, weight = bsdf.sample(mi.BSDFContext(), si, u1, u2, active)
-    return Draw(bs, weight, bs.pdf, is_zero(weight))
+    if not by_parts(bsdf):
+        bs, weight = bsdf.sample(mi.BSDFContext(), si, u1, u2, active)
+        return Draw(bs, weight, bs.pdf, is_zero(weight))
+    if bsdf.class_name() == "TwoSidedBRDF":
+        return _two_sided(bsdf, si, u1, u2, active)
+    share = _share(bsdf, si, active)
+    found = (_blend if bsdf.class_name() == "BlendBSDF" else _mask)(bsdf, si, share, u1, u2, active)
+    bad = dr.isnan(share)  # to be counted
+    return Draw(found.bs, dr.select(bad, dr.nan, found.weight), found.density, found.rejected & ~bad)
 
 
 def draw_delta(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, active: mi.Bool) -> Draw:
@@ -63,19 +70,18 @@ def draw_delta(bsdf, si: mi.SurfaceInteraction3f, u1: mi.Float, u2: mi.Point2f, 
 
 
 def by_parts(bsdf) -> bool:
-    """Whether `draw` samples the parts of a BSDF: it contains a blend.
+    """Whether `draw` samples the parts of a BSDF: it is or contains a blend.
 
-    Not under bump and normal maps, nor through a pointer, which may refer to any BSDF: Mitsuba samples these.
+    Mitsuba samples blends under bump and normal maps, and those of pointers.
     """
     if not isinstance(bsdf, mi.BSDF) or bsdf.class_name() not in _BY_PARTS:
         return False
     return any(b.class_name() == "BlendBSDF" for b in nested([bsdf]))
 
 
-def _blend(bsdf, si, u1, u2, active) -> Draw:
+def _blend(bsdf, si, share, u1, u2, active) -> Draw:
     """Sample one part of a ``blendbsdf``, and evaluate both unless it rejects."""
-    parts, share = children(bsdf), _share(bsdf, si, active)
-    second = u1 < share
+    parts, second = children(bsdf), u1 < share
     found = [
         _part(parts["bsdf_0"], si, (u1 - share) / (1 - share), u2, active & ~second),
         _part(parts["bsdf_1"], si, u1 / share, u2, active & second),
@@ -86,10 +92,10 @@ def _blend(bsdf, si, u1, u2, active) -> Draw:
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
     bs.pdf = dr.select(delta, bs.pdf * dr.select(second, share, 1 - share), pdf)
     density = dr.select(delta, bs.pdf, _density(bsdf, si, bs.wo, pdf, smooth))
-    # A NaN direction has density 0; like a NaN share it is counted, not rejected.
+    # A NaN direction has density 0; it is counted, not rejected.
     rejected = mine.rejected | ((density == 0) & ~dr.isnan(bs.wo.z))
     weight = dr.select(rejected, 0, dr.select(delta, mine.weight, value / density))
-    return _unless_nan(share, Draw(bs, weight, density, rejected))
+    return Draw(bs, weight, density, rejected)
 
 
 def _share(bsdf, si, active) -> mi.Float:
@@ -97,11 +103,6 @@ def _share(bsdf, si, active) -> mi.Float:
     texture = children(bsdf)["weight" if bsdf.class_name() == "BlendBSDF" else "opacity"]
     share = texture.eval_1(si, active)
     return dr.select(dr.isnan(share), share, dr.clip(share, 0, 1))
-
-
-def _unless_nan(share, found: Draw) -> Draw:
-    bad = dr.isnan(share)
-    return Draw(found.bs, dr.select(bad, dr.nan, found.weight), found.density, found.rejected & ~bad)
 
 
 def _part(bsdf, si, u1, u2, active) -> Draw:
@@ -131,13 +132,14 @@ def _density(bsdf, si, wo, pdf, active):
 
     From behind, a ``principled`` without transmission has a density but samples nothing.
     """
-    kind = bsdf.class_name()
-    if kind == "TwoSidedBRDF" or not any(_is_blind_behind(b) for b in nested([bsdf])):
+    kind, through = bsdf.class_name(), mi.BSDFFlags.Transmission
+    blind = [
+        b for b in nested([bsdf]) if b.class_name() == "Principled" and not mi.has_flag(b.flags(), through)
+    ]
+    if not blind or kind in ("TwoSidedBRDF", *MAPS):
         return pdf
-    if _is_blind_behind(bsdf):
+    if kind == "Principled":
         return dr.select(mi.Frame3f.cos_theta(si.wi) > 0, pdf, 0)
-    if kind not in _BY_PARTS:  # a map
-        return pdf
 
     def of(part):
         return _density(part, si, wo, part.pdf(mi.BSDFContext(), si, wo, active), active)
@@ -148,44 +150,33 @@ def _density(bsdf, si, wo, pdf, active):
     return (1 - share) * of(parts["bsdf_0"]) + share * of(parts["bsdf_1"])
 
 
-def _is_blind_behind(bsdf) -> bool:
-    return bsdf.class_name() == "Principled" and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
-
-
 def _two_sided(bsdf, si, u1, u2, active) -> Draw:
     """Sample a ``twosided``: its parts are mirrored from behind."""
     parts, back = children(bsdf), mi.Frame3f.cos_theta(si.wi) < 0
     si = mi.SurfaceInteraction3f(si)
     si.wi = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
-    first, second = parts["brdf_0"], parts["brdf_1"]
-    found = draw(first, si, u1, u2, active & ~back if second is not first else active)
-    if second is not first:
-        found = dr.select(back, draw(second, si, u1, u2, active & back), found)
+    found = draw(parts["brdf_0"], si, u1, u2, active)
+    if parts["brdf_1"] is not parts["brdf_0"]:
+        found = dr.select(back, draw(parts["brdf_1"], si, u1, u2, active), found)
     wo = found.bs.wo
     found.bs.wo = mi.Vector3f(wo.x, wo.y, dr.select(back, -wo.z, wo.z))
     return found
 
 
-def _mask(bsdf, si, u1, u2, active) -> Draw:
+def _mask(bsdf, si, opacity, u1, u2, active) -> Draw:
     """Sample a ``mask``: null event or the nested BSDF."""
-    opacity, straight_on = _share(bsdf, si, active), dr.zeros(mi.BSDFSample3f)
-    seen = u1 < opacity
+    seen, straight_on = u1 < opacity, dr.zeros(mi.BSDFSample3f)
     straight_on.wo, straight_on.eta, straight_on.pdf = -si.wi, mi.Float(1), 1 - opacity
     straight_on.sampled_type = mi.UInt32(int(mi.BSDFFlags.Null))
     found = draw(children(bsdf)["nested_bsdf"], si, u1 / opacity, u2, active & seen)
     found.bs.pdf, found.density = found.bs.pdf * opacity, found.density * opacity
-    passing = Draw(straight_on, mi.Spectrum(1), 1 - opacity, mi.Bool(False))
-    return _unless_nan(opacity, dr.select(seen, found, passing))
-
-
-_BY_PARTS = {"BlendBSDF": _blend, "TwoSidedBRDF": _two_sided, "MaskBSDF": _mask}
+    return dr.select(seen, found, Draw(straight_on, mi.Spectrum(1), 1 - opacity, mi.Bool(False)))
 
 
 def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
     """Mask: no direction was sampled on the back of a rough conductor of ``bsdfs``.
 
-    Mitsuba's (Beckmann) samples NaN there with weight 0; Mitsuba's blend multiplies that by the density, NaN.
-    NaN of other BSDFs is counted.
+    Mitsuba samples NaN there (Beckmann) with weight 0, in a blend NaN. NaN of other BSDFs is counted.
     """
     if not any(b.class_name() == "RoughConductor" for b in nested(bsdfs)):
         return mi.Bool(False)
@@ -193,10 +184,9 @@ def none_from_behind(bsdfs: Iterable[mi.BSDF], si, bs: mi.BSDFSample3f):
 
 
 def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
-    """Whether sample() of one of ``bsdfs``, nested ones included, may report a density other than its pdf().
+    """Whether sample() of one of ``bsdfs`` may report a density other than pdf(), as of the picked lobe.
 
-    The density of the picked lobe gives an unbiased ``weight``, but serves neither in weights of multiple
-    importance sampling nor as divisor of a full evaluation.
+    This serves neither in weights of multiple importance sampling nor as divisor of a full evaluation.
     """
     return any(b.class_name() not in _SAMPLED_PDF_IS_PDF for b in bsdfs)
 

@@ -1,14 +1,13 @@
 """Which BSDFs have near-specular lobes: not delta, but so narrow that connections rarely sample them.
 
 A connection over a distance d finds a lobe of density P (solid angle) with a probability proportional to
-d^2 / P. This test of a scene needs no kernel: the density of a lobe follows from the parameters of Mitsuba's
-BSDFs. Only BSDFs of other classes are sampled, once.
+d^2 / P. P follows from the parameters of Mitsuba's BSDFs; only those of other classes are sampled, once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -29,40 +28,32 @@ NARROW = 20.0
 # "Photon-guided BSDF sampling".
 GUIDED = 4.0
 
-# Points at which textures are evaluated, and samples of a BSDF of another class.
-_TEXTURE_POINTS, _SAMPLES = 4096, 4096
-
-# Least cosine of incidence of these samples: at grazing incidence all glossy lobes are narrow.
+# Least cosine of incidence of sampled BSDFs: at grazing incidence all glossy lobes are narrow.
 _LEAST_COS = 0.5
 
 # ``cached(bsdf, name, find)``: the result of ``find()``, called ``name``, of the BSDF's parameters alone.
 Cached = Callable[[Any, str, Callable[[], float]], float]
 
-# Least or, with the sign -1, the negative largest value of a BSDF's parameter by name.
+# Least or, with the sign -1, the negative largest value of a BSDF's parameter, the first one in use of
+# these names, or 0.
 Bound = Callable[..., float]
 
 
-def near_specular(family: Iterable[tuple[mi.BSDF, dict]], cached: Cached) -> list[tuple[mi.BSDF, float]]:
-    """The BSDFs of a `draws.family` with a near-specular lobe, of their own or of nested BSDFs.
+def near_specular(family: Collection[tuple[mi.BSDF, dict]], cached: Cached) -> list[tuple[mi.BSDF, float]]:
+    """The BSDFs of a `draws.family` with a near-specular lobe, also of nested BSDFs, and its `density`."""
+    own = {id(bsdf): (density(bsdf, held, cached), held) for bsdf, held in family}
 
-    With the largest `density` of their lobes.
-    """
-    family = list(family)
-    found = {id(bsdf): density(bsdf, held, cached) for bsdf, held in family}
-    before = {}
-    while found != before:  # from nested BSDFs to those around them
-        before = dict(found)
-        for bsdf, held in family:
-            inner = (found.get(id(value), 0.0) for value in held.values())
-            found[id(bsdf)] = max(found[id(bsdf)], *inner, 0.0)
-    return [(bsdf, found[id(bsdf)]) for bsdf, _ in family if found[id(bsdf)] >= NARROW]
+    def largest(bsdf: mi.BSDF) -> float:
+        found, held = own[id(bsdf)]
+        return max(found, *(largest(inner) for inner in held.values() if id(inner) in own), 0.0)
+
+    return [(bsdf, peak) for bsdf, _ in family if (peak := largest(bsdf)) >= NARROW]
 
 
 def is_narrow(f, least: float | None = None):
     """Mask: near-specular scattering, by its densities from both sides, so that both subpaths agree.
 
-    Never in a medium. ``f``: an `Evaluation`, or a `Step` that is not delta; ``least`` density, by default
-    `NARROW`.
+    ``f``: an `Evaluation`, or a `Step` that is not delta; ``least`` density, by default `NARROW`.
     """
     least = NARROW if least is None else least
     return ~f.volume & (dr.minimum(f.pdf_fwd_w, f.pdf_rev_w) >= least)
@@ -79,12 +70,15 @@ def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:
     if peak is None:
         return cached(bsdf, "density", partial(_sampled, bsdf))
 
-    def bound(name: str, sign: int = 1) -> float:
+    def bound(*names: str, sign: int = 1) -> float:
+        name = next((name for name in names if name in held), None)
+        if name is None:
+            return 0.0
         if isinstance(held[name], mi.Texture):
             return _bound(held[name], sign, partial(cached, bsdf, f"{name} {sign}"))
         return sign * float(number(own_parameters(bsdf)[name]))
 
-    return peak(bsdf, held, bound)
+    return peak(bsdf, bound)
 
 
 # -- Mitsuba's BSDFs --------------------------------------------------------------------------
@@ -103,27 +97,21 @@ def _refracted(alpha: float, eta: float) -> float:
     return _microfacets(alpha) * (max(eta, 1.0) / max(abs(eta - 1), 1e-6)) ** 2
 
 
-def _alpha(held: dict, least: Bound) -> float:
-    names = ("alpha", "alpha") if "alpha" in held else ("alpha_u", "alpha_v")
-    return math.sqrt(max(least(names[0]), 0) * max(least(names[1]), 0))
+def _alpha(least: Bound) -> float:
+    return math.sqrt(max(least("alpha_u", "alpha"), 0) * max(least("alpha_v", "alpha"), 0))
 
 
-def _rough(bsdf, held: dict, least: Bound) -> float:
-    return _microfacets(_alpha(held, least)) / 4
+def _rough(bsdf, least: Bound) -> float:
+    return _microfacets(_alpha(least)) / 4
 
 
-def _rough_dielectric(bsdf, held: dict, least: Bound) -> float:
-    return _refracted(_alpha(held, least), least("eta"))
-
-
-def _principled(bsdf, held: dict, least: Bound) -> float:
-    alpha = max(least("roughness"), 0) ** 2
-    found = _microfacets(max(alpha, 1e-3)) / 4
+def _principled(bsdf, least: Bound) -> float:
+    alpha = max(max(least("roughness"), 0) ** 2, 1e-3)
+    found = _microfacets(alpha) / 4
     if mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
-        eta = least("eta") if "eta" in held else _eta(least("specular"))
-        found = max(found, _refracted(max(alpha, 1e-3), eta))
-    if coat := -least("clearcoat", -1):
-        found = max(found, coat * _clearcoat(-least("clearcoat_gloss", -1)))
+        found = max(found, _refracted(alpha, least("eta") or _eta(least("specular"))))
+    if coat := -least("clearcoat", sign=-1):
+        found = max(found, coat * _clearcoat(-least("clearcoat_gloss", sign=-1)))
     return found
 
 
@@ -138,9 +126,9 @@ def _clearcoat(gloss: float) -> float:
     return (a**2 - 1) / (2 * math.pi * math.log(a) * a**2) / 4 / 4
 
 
-def _thin(bsdf, held: dict, least: Bound) -> float:
+def _thin(bsdf, least: Bound) -> float:
     """Of `principledthin`, which is specular only with ``spec_trans``; it refracts by a narrower lobe."""
-    if not least("spec_trans", -1):
+    if not least("spec_trans", sign=-1):
         return 0.0
     narrower = min(max(0.65 * least("eta") - 0.35, 0), 1)
     return _microfacets(max((narrower * max(least("roughness"), 0)) ** 2, 1e-3)) / 4
@@ -149,7 +137,7 @@ def _thin(bsdf, held: dict, least: Bound) -> float:
 _PEAKS = {
     "RoughConductor": _rough,
     "RoughPlastic": _rough,
-    "RoughDielectric": _rough_dielectric,
+    "RoughDielectric": lambda _, least: _refracted(_alpha(least), least("eta")),
     "Principled": _principled,
     "PrincipledThin": _thin,
 }
@@ -179,14 +167,14 @@ def _bound(texture: mi.Texture, sign: int, cached: Callable) -> float:
 
 def _evaluated(texture: mi.Texture, sign: int) -> float:
     """`_bound` of values at points all over the unit square of texture coordinates."""
-    found = np.array(texture.eval_1(spread_interactions(_TEXTURE_POINTS), mi.Bool(True)), dtype=np.float64)
+    found = np.array(texture.eval_1(spread_interactions(), mi.Bool(True)), dtype=np.float64)
     return float(np.nanmin(sign * found, initial=math.inf))
 
 
 def _sampled(bsdf: mi.BSDF) -> float:
     """Largest density of samples of a BSDF, at points all over its textures, from both sides."""
-    si, ctx = spread_interactions(_SAMPLES), mi.BSDFContext()
-    u = np.random.default_rng(1).random((3, _SAMPLES), dtype=np.float32)
+    si, ctx = spread_interactions(), mi.BSDFContext()
+    u = np.random.default_rng(1).random((3, dr.width(si)), dtype=np.float32)
     bs, weight = bsdf.sample(ctx, si, mi.Float(u[0]), mi.Point2f(u[1], u[2]), mi.Bool(True))
     glossy = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     glossy &= dr.max(mi.unpolarized_spectrum(weight)) > 0
@@ -194,7 +182,7 @@ def _sampled(bsdf: mi.BSDF) -> float:
     return float(np.nanmax(pdf, initial=0))
 
 
-def spread_interactions(count: int) -> mi.SurfaceInteraction3f:
+def spread_interactions(count: int = 4096) -> mi.SurfaceInteraction3f:
     """Points of a plane with all texture coordinates in the unit square, seen from both sides."""
     si = dr.zeros(mi.SurfaceInteraction3f, count)
     si.uv = spread_points(count)
