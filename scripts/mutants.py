@@ -1334,7 +1334,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: guided subpaths know of no later vertex that guides",
         "transport/photons/guided_hits.py",
-        "possible &= is_specular(step) & ~walk.sds.diffuse",
+        "possible &= is_specular(step) & ~vertex.sds.diffuse",
         "possible = mi.Bool(False)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1380,15 +1380,15 @@ MUTANTS = (
     Mutant(
         "merging: walks compare merges with the coefficient of t = 1, merges with its count",
         "transport/walk.py",
-        "rival = newest_coefficient(kernel, kernel.kappa.splat_count, walk.edges)",
+        "rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)",
         "rival = coefficient",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[power-quarter-True-1.0]",),
     ),
     Mutant(
         "merging: the count of t = 1 is its coefficient in the weight of a merge",
         "merging/merging.py",
-        "connections = h.combine(y.connection, newest_connection(kernel, kernel.kappa.splat, z))",
-        "connections = h.combine(y.connection, newest_connection(kernel, kernel.kappa.splat_count, z))",
+        "connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))",
+        "connections = h.combine(y.connection, _rival(kernel, z))",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[power-quarter-True-1.0]",),
     ),
     Mutant(
@@ -1436,22 +1436,22 @@ MUTANTS = (
     Mutant(
         "merging: t = 1 does not know of merges",
         "transport/techniques.py",
-        "merges = merges_up_to(kernel, y, kernel.kappa.direct, *densities, kernel.kappa.splat_count)",
-        "merges = 0",
+        "light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_count)",
+        "light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_count)[0], 0",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-odd-True-1.0]",),
     ),
     Mutant(
         "merging: s = 1 does not know of merges",
         "transport/techniques.py",
-        "merges = merges_up_to(kernel, z, kernel.kappa.splat_count, *densities, kernel.kappa.direct)",
-        "merges = 0",
+        "camera_side, merges = side_of(kernel, z, False, *densities, kernel.kappa.direct)",
+        "camera_side, merges = side_of(kernel, z, False, *densities, kernel.kappa.direct)[0], 0",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-n0c0-True-1.0]",),
     ),
     Mutant(
         "merging: only t = 0 knows of merges on the light's side",
         "transport/kernel.py",
-        "sds = kernel.sds if plan.arrival or near_specular else None",
-        "sds = kernel.sds if plan.arrival else None",
+        "sds = kernel.sds if plan.arrival or near_specular else PhotonStrategy()",
+        "sds = kernel.sds if plan.arrival else PhotonStrategy()",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[power-n1c1-False-0.0]",),
     ),
     Mutant(
@@ -1625,8 +1625,8 @@ MUTANTS = (
     Mutant(
         "guided s = 0: t = 0 counts it at all diffuse vertices of a light subpath",
         "transport/photons/guided_hits.py",
-        "walk, vertex) & walk.sds.only_delta",
-        "walk, vertex)",
+        "vertex, adjoint) & vertex.sds.only_delta",
+        "vertex, adjoint)",
         ("tests/images/test_sds_paths.py::test_light_subpaths_with_two_diffuse_vertices",),
     ),
     Mutant(

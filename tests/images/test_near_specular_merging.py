@@ -219,14 +219,13 @@ def test_stored_vertices_keep_their_merges():
     )
     kernel = SimpleNamespace(
         store_size=2,
-        merges=True,
-        guides_near_specular=True,
+        sds=SimpleNamespace(merges=True, near_specular=True),
         heuristic=mis.Heuristic("balance"),
         light_groups=None,
         path_layers=False,
         has_media=False,
         plan=SimpleNamespace(joined=1),
-        last_stored=mi.UInt32(9),
+        reach=mi.UInt32(9),
         shape_errors=SimpleNamespace(any=False),
     )
     path = light_path.allocate_light_path(kernel, 2)

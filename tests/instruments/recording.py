@@ -165,7 +165,7 @@ def render(scene, integrator, least, spp: int, seed: int):
     outliers = []
 
     def trace(traced, image, batch, points, of):
-        if traced.sds is not None:
+        if traced.plan.guided:
             raise CommandError("paths that are guided are not looked at; set guiding=never")
         if traced.plan.emission is not None:  # whose densities nobody but the kernel knows
             raise CommandError("paths whose emission is guided are not looked at; set guiding=photons")
@@ -303,7 +303,7 @@ class Recorder(Observer):
         start = dr.select(emission.infinite, mi.Point3f(-emission.d), mi.Point3f(emission.si.p))
         self.light = _Subpath(self._numbers(start, 3), self._numbers(emission.infinite).astype(bool))
 
-    def started(self, traced, side, walk, stream):
+    def started(self, traced, side, walk):
         """The camera subpath begins; of the light subpath `emitted` knows more."""
         if not side.adjoint:
             self.camera = self._begun(self._numbers(walk.previous, 3))

@@ -190,13 +190,13 @@ class Capture(Observer):
         dr.eval(emission)
         self.emission = emission
 
-    def started(self, bound, side, walk, stream):
+    def started(self, bound, side, walk):
         """A subpath begins."""
-        self.kernel, self.stream, self.walking = bound, stream, self.walked[side.name]
+        self.kernel, self.stream, self.walking = bound, side.stream, self.walked[side.name]
         self.walking.origin = mi.Point3f(walk.previous)
         dr.eval(self.walking.origin)
         if side.adjoint and self.plan.endpoints:
-            u = techniques._sensor_points(bound, stream)
+            u = techniques._sensor_points(bound, side.stream)
             connection = bound.camera.connect(self.emission.si.p, *u)
             if not bound.camera.parallel:
                 distant = bound.camera.connect_direction(self.emission.d, *u)

@@ -587,8 +587,6 @@ def python_loop(times):
 class Inputs(SimpleNamespace):
     """Stand-in for `inputs.Kernel`."""
 
-    merges = inputs.Kernel.merges
-    guides_near_specular = inputs.Kernel.guides_near_specular
     replaced, bound = inputs.Kernel.replaced, inputs.Kernel.bound
 
 
@@ -662,10 +660,7 @@ def kernel_weights(
         observer=Observer(),
         max_depth=u32(k),
         rr_depth=u32(10**6),
-        last_stored=u32(k - 2 if k > 2 else 0),
-        last_inner=u32(k),
-        last_splat=u32(k - 1),
-        last_arrival=u32(k),
+        reach=u32(k),
         last_light=u32(k if plan.arrival else k - 1),
         last_merged=u32(k),
         count_light=f(1),
@@ -680,19 +675,17 @@ def kernel_weights(
         ),
         refracts=True,
         points=Nothing(),
-        within_store=lambda edges: mi.Bool(edges <= k),
         shape_errors=Flat(),
         hits=Hits(scene, None),
         has_media=False,
         space=Vacuum(scene, Flat()),
         light_media=None,
-        sds=None,
+        sds=sds.PhotonStrategy(),
         cells=None,
         light_groups=None,
         light_group=lambda index, active: None,
         path_layers=world.path_layers,
         sensor_medium=None,
-        scatters=True,
     )
     shared = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     if merges is not None:

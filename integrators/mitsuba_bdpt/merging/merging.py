@@ -120,16 +120,16 @@ class Merging(PhotonStrategy):
 
     def is_merged(self, kernel, z, walk, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
-        asks = self.may_merge(kernel, z, newest_connection(kernel, kernel.kappa.splat_count, z))
+        asks = self.may_merge(kernel, z, _rival(kernel, z))
         return self.photons.exist & asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
         light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
-        camera = z.partial, newest_connection(kernel, kernel.kappa.splat_count, z), f.pdf_rev_w
+        camera = z.partial, _rival(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
-        connections = h.combine(y.connection, newest_connection(kernel, kernel.kappa.splat, z))
+        connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
         weight = mis.weigh_merge(h, self.ratio(kernel, z.si.p), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
@@ -172,11 +172,16 @@ class MergedPhotons(PhotonPolicy):
         return replace(walk, sds=State(survived=mi.Float(1)))
 
     def stored(self, kernel, y, walk: Any, stream):
-        merging, connection = self._merging, newest_connection(kernel, kernel.kappa.direct, y)
+        merging, connection = self._merging, newest_connection(kernel, y, adjoint=True)
         keep = merging.may_merge(kernel, y, kernel.heuristic.present(connection))
         probability = merging.kept(kernel, y, walk.sds.survived)
         u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
         return keep & (u < probability), probability
+
+
+def _rival(kernel: Kernel, z: Vertex) -> mis.PartialSum:
+    """The connection of the edge to the camera vertex ``z``, in comparisons with merges."""
+    return newest_connection(kernel, z, adjoint=False, beside_merges=True)
 
 
 def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:

@@ -86,7 +86,7 @@ class Undersampled(Unsampled):
         they are the expected number per camera sample.
         """
         h, photon, f = kernel.heuristic, found.photon, found.f
-        newest = newest_connection(kernel, kernel.kappa.splat, z)
+        newest = newest_connection(kernel, z, adjoint=False)
         camera = h.combine(newest, h.scale(z.partial.d_vc, f.pdf_rev_w))
         area = photon.connection + photon.older * f.pdf_fwd_w + camera
         # The render's light subpaths are not aimed.
@@ -121,7 +121,7 @@ class Guidable(Undersampled):
         return walk, replace(side, connect=None, isolated=True)
 
     def is_merged(self, kernel, z, walk):
-        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+        return is_sds_vertex(kernel, z, adjoint=False)
 
     def missing(self, kernel, merging, z, found, position):
         """Adds the merge to the sums where it is on a path that photons guide."""

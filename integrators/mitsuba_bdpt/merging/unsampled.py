@@ -72,7 +72,7 @@ class Unsampled(PhotonPolicy):
         return replace(walk, active=walk.active & e.delta)
 
     def stored(self, kernel, y, walk, stream):
-        return is_sds_vertex(kernel, kernel.kappa.direct, walk, y), 1.0
+        return is_sds_vertex(kernel, y, adjoint=True), 1.0
 
     def begin_camera(self, kernel: Kernel, walk: Walk, side: Side) -> tuple[Walk, Side]:
         """A camera subpath on its first edge."""
@@ -80,7 +80,7 @@ class Unsampled(PhotonPolicy):
 
     def is_merged(self, kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
         """Mask: a camera subpath may merge at ``z``; ``walk`` as before its arrival."""
-        return is_sds_vertex(kernel, kernel.kappa.splat, walk, z)
+        return is_sds_vertex(kernel, z, adjoint=False)
 
     def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position) -> mi.Bool:
         """Mask: the merge ``found`` at ``z`` counts; ``position`` of the camera sample on the film."""

@@ -278,9 +278,8 @@ class Render:
         """Trace one pass, with a launch for each batch."""
         if len(self.passes) == 1 and self.planner.threshold is None and self._plays_roulette():
             self.kernel = self.kernel.with_threshold(MOST_ROULETTE * self.accumulator.mean())
-        if self.plan.guided:
-            guide = self._guide()
-            self.kernel = self.kernel.replaced(sds=guide and Guiding(guide, self.kernel.near_specular))
+        if self.plan.guided and (guide := self._guide()):
+            self.kernel = self.kernel.replaced(sds=Guiding(guide, self.kernel.near_specular))
         if self.plan.merging and self.merging is not None:
             self.kernel = self.kernel.replaced(sds=self._photons(step, self.merging))
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):

@@ -1,6 +1,7 @@
 """The other strategies that sample a path up to a vertex: coefficients of the newest alternative, merges.
 
-Each vertex's newest alternative connects the edge to it, see `mis`.
+Each vertex's newest alternative connects the edge to it, see `mis`. Vertices are those of light subpaths
+where ``adjoint``, else of camera subpaths.
 """
 
 from __future__ import annotations
@@ -11,28 +12,27 @@ from . import mis
 from .inputs import Kernel
 
 
-def direct_coefficient(kernel: Kernel, vertex) -> mis.Coefficient:
-    """kappa of next-event estimation at ``vertex``, 0 where a medium does not allow it."""
-    return where_lit(kernel, kernel.space.allows_next_event(vertex))
-
-
 def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
     """kappa of next-event estimation where ``lit`` (None: everywhere), else 0."""
     direct = kernel.kappa.direct
     return direct if lit is None else mis.choose(lit, direct, 0)
 
 
-def newest_coefficient(kernel: Kernel, first: mis.Coefficient, edges: mi.UInt32) -> mis.Coefficient:
-    """kappa of the newest alternative's class at vertex ``edges``, for s >= 1.
+def newest_coefficient(kernel: Kernel, vertex, adjoint: bool, beside_merges: bool = False) -> mis.Coefficient:
+    """kappa of the newest alternative's class at ``vertex``, for s >= 1; ``beside_merges``: see `mis`.
 
-    s = 0 differs, see `techniques.hit_emitter`. ``first``: kappa at vertex 1, see `Side`.
+    s = 0 differs, see `techniques.hit_emitter`.
     """
-    return mis.choose(edges == 1, first, kernel.kappa.inner)
+    if adjoint:
+        first = where_lit(kernel, kernel.space.allows_next_event(vertex))
+    else:
+        first = kernel.kappa.splat_count if beside_merges else kernel.kappa.splat
+    return mis.choose(vertex.edges == 1, first, kernel.kappa.inner)
 
 
-def newest_connection(kernel: Kernel, first: mis.Coefficient, vertex) -> mis.PartialSum:
+def newest_connection(kernel: Kernel, vertex, adjoint: bool, beside_merges: bool = False) -> mis.PartialSum:
     """The newest alternative at ``vertex``: ``d_vcm`` times `newest_coefficient`."""
-    newest = newest_coefficient(kernel, first, vertex.edges)
+    newest = newest_coefficient(kernel, vertex, adjoint, beside_merges)
     return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
 
 
@@ -41,44 +41,45 @@ def has_lobe(kernel: Kernel, vertex) -> mi.Bool:
     return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth) & ~vertex.volume
 
 
-def is_sds_vertex(kernel: Kernel, first: mis.Coefficient, walk, vertex) -> mi.Bool:
+def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
     """Mask: the diffuse ``vertex`` of an SDS path, if the other subpath matches.
 
     No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
-    path may have a further edge. ``first`` as in `newest_coefficient`; ``walk`` as before its arrival.
+    path may have a further edge.
     """
-    newest = newest_coefficient(kernel, first, vertex.edges)
-    if vertex.sds is not None:
-        return has_lobe(kernel, vertex) & vertex.sds.isolated & ~vertex.sds.is_connectible(False, newest)
-    connectible = mis.is_connectible(vertex.partial, newest)
+    newest, state = newest_coefficient(kernel, vertex, adjoint), vertex.sds
+    if state is None or state.specular is None:
+        connectible = mis.is_connectible(vertex.partial, newest)
+    else:
+        connectible = state.is_connectible(False, newest)
     possible = has_lobe(kernel, vertex) & ~connectible
-    isolated = None if walk.sds is None else walk.sds.isolated
-    return possible if isolated is None else possible & isolated
+    return possible if state is None or state.isolated is None else possible & state.isolated
 
 
-def merges_up_to(
-    kernel: Kernel, vertex, first: mis.Coefficient, pdf_rev_w, pdf_a, own: mis.Coefficient
-) -> mis.PartialSum:
-    """Merges at the vertices up to ``vertex``, which a strategy connects; see `mis.merges`.
+def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
+    """Other strategies on the side of a ``vertex`` that one of coefficient ``own`` connects.
 
-    ``first``: as in `newest_coefficient`, of the rival of merges. The number 0 without merging.
+    Returns `mis.alternatives`, and the merges up to the vertex, see `mis.merges`.
     """
-    if kernel.sds is None or not kernel.sds.merges:
-        return 0
-    h, ratio = kernel.heuristic, kernel.sds.ratio(kernel, vertex.si.p)
-    coefficient = newest_coefficient(kernel, first, vertex.edges)
-    return mis.merges(h, vertex.partial, coefficient, pdf_rev_w, pdf_a, own, ratio)
+    h, partial = kernel.heuristic, vertex.partial
+    newest = newest_coefficient(kernel, vertex, adjoint)
+    found = mis.alternatives(h, partial, newest, pdf_rev_w, pdf_a)
+    if not kernel.sds.merges:
+        return found, 0
+    rival = newest_coefficient(kernel, vertex, adjoint, beside_merges=True)
+    ratio = kernel.sds.ratio(kernel, vertex.si.p)
+    return found, mis.merges(h, partial, rival, pdf_rev_w, pdf_a, own, ratio)
 
 
 def merges_before_end(
     kernel: Kernel, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
 ) -> mis.PartialSum:
-    """The same before the end of a subpath, on an emitter or the sensor.
+    """Merges before the end of a subpath, on an emitter or the sensor.
 
     ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the rival that
     connects the last edge, times the density of the end if ``pdf`` contains it.
     """
-    if not kernel.merges:
+    if not kernel.sds.merges:
         return 0
     connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
     return mis.older_merges(kernel.heuristic, partial, connection, pdf)

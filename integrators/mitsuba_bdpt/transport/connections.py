@@ -10,8 +10,8 @@ import mitsuba as mi
 from ..geometry import rays, rounding
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
-from . import mis, path_layers, scattering, spectra
-from .alternatives import direct_coefficient, merges_up_to, newest_coefficient
+from . import path_layers, scattering, spectra
+from .alternatives import newest_coefficient, side_of
 from .contribution import (
     Contribution,
     Counters,
@@ -37,7 +37,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     """
     h = kernel.heuristic
     k = z.edges + y.edges + 1
-    active = z.hit & (k <= kernel.last_inner)
+    active = z.hit & (k <= kernel.reach)
     between = y.si.p - z.si.p
     dist2 = dr.squared_norm(between)
     active &= dist2 > 0
@@ -50,19 +50,16 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
     active &= ~spectra.is_zero(value)
 
-    newest_y = newest_coefficient(kernel, direct_coefficient(kernel, y), y.edges)
-    at_y = newest_y, f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
-    newest_z = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
-    at_z = newest_z, f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
-    light_side, camera_side = mis.alternatives(h, y.partial, *at_y), mis.alternatives(h, z.partial, *at_z)
-    sides, own = (kernel.kappa.inner, light_side, camera_side), kernel.kappa.inner
-    if kernel.guides_near_specular:
+    own = kernel.kappa.inner
+    at_y = f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
+    at_z = f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
+    light_side, merges_y = side_of(kernel, y, True, *at_y, own)
+    camera_side, merges_z = side_of(kernel, z, False, *at_z, own)
+    if kernel.sds.near_specular:
+        newest_y, newest_z = newest_coefficient(kernel, y, True), newest_coefficient(kernel, z, False)
         active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
-    merges = h.combine(
-        merges_up_to(kernel, y, kernel.kappa.direct, *at_y[1:], own),
-        merges_up_to(kernel, z, kernel.kappa.splat_count, *at_z[1:], own),
-    )
-    weight, shares = h.weigh(*sides, merges=merges)
+    sides = own, light_side, camera_side
+    weight, shares = h.weigh(*sides, merges=h.combine(merges_y, merges_z))
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
     if kernel.path_layers:
         of_camera = path_layers.evaluated(z.layer, f_z, adjoint=False)
@@ -206,7 +203,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     probability `EVENLY`, and where all approximations are 0. ``total`` is the size of the estimate.
     """
     some = candidates > 0
-    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    newest = newest_coefficient(kernel, z, adjoint=False)
     at_z = ProxyVertex.of(kernel, z, newest, some, alone=False)
     count = mi.Float(candidates)
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_GUESSES))
@@ -220,7 +217,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
         slot < candidates, label="guess inner connections", exclude=[kernel, z, path, candidates, at_z, even]
     ):
         y, edges = read_proxy(path, slot)
-        reached = z.edges + edges + 1 <= kernel.last_inner
+        reached = z.edges + edges + 1 <= kernel.reach
         size = dr.select(reached, guess(kernel, at_z, y), 0)
         total, take, u = offer(total, size, u)
         chosen, of_chosen = dr.select(take, slot, chosen), dr.select(take, size, of_chosen)
@@ -258,10 +255,10 @@ def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> tuple[mi.Ray3f, r
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to connect with ``z``.
 
-    Slot i holds y_{i+1} or a later one; paths have at most `Kernel.last_inner` edges. With media (null events
+    Slot i holds y_{i+1} or a later one; paths have at most `Kernel.reach` edges. With media (null events
     are no edges), or slots of several light subpaths, several vertices may have the same number.
     """
-    possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.last_inner)
+    possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.reach)
     if kernel.has_media or path.guesses:
         return dr.select(possible, path.count, 0)
-    return dr.select(possible, dr.minimum(path.count, kernel.last_inner - z.edges - 1), 0)
+    return dr.select(possible, dr.minimum(path.count, kernel.reach - z.edges - 1), 0)

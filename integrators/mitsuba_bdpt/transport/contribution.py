@@ -100,8 +100,7 @@ def counted_by_camera(kernel: Kernel) -> Counters:
     one, inner = plan.connections == "one", plan.connections != "none"
     names = ["non_finite"] + ["shadow_s1"] * plan.direct + ["rouletted"] * (one and plan.roulette)
     names += ["shadow_inner", "evaluated", "zero"] * inner
-    counters = Counters.zeros(*names, *kernel.space.counters)
-    return counters if kernel.sds is None else counters + Counters.zeros(*kernel.sds.counters)
+    return Counters.zeros(*names, *kernel.space.counters, *kernel.sds.counters)
 
 
 @dataclass

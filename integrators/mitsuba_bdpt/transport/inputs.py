@@ -71,7 +71,7 @@ class Observer:
     def emitted(self, emission):
         """A light subpath starts: y_0 and the first direction, an `emitters.Emission`."""
 
-    def started(self, kernel, side, walk, stream):
+    def started(self, kernel, side, walk):
         """A subpath is on its first edge; ``side``: its `walk.Side`."""
 
     def vertex(self, side, walk, vertex, step):
@@ -112,25 +112,22 @@ class Kernel:
         if self.light_media is not None and plan.light:
             self.light_media.settle()
         self.sensor_medium = u32(self.space.media.sensor) if self.has_media else None
-        self.scatters = self.surfaces or self.space.phase is not None
         depth = settings.max_depth
         reach = min(depth, prepared.stored_vertices(settings))
         kept = plan.joined * (min(reach - 2, KEPT) if self.has_media else reach - 2)
         self.store_size = next(size for size in STORE_SIZES if size >= kept)
         self.strategy_images = settings.strategy_images
         self.max_depth, self.rr_depth = u32(depth), u32(settings.rr_depth)
-        self._reach = u32(reach)
-        self.last_stored, self.last_inner = u32(max(reach - 2, 0)), u32(reach)
-        self.last_splat, self.last_arrival = u32(max(reach - 1, 0)), u32(reach)
+        # Most edges of a path by all strategies; longer ones are sampled by s = 0 and s = 1 only.
+        self.reach = u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
         # Longest merged path: weights of merges do not tell s = 0 and s = 1, alone beyond, from the others.
-        self.last_merged = self.last_inner if plan.light else self.max_depth
+        self.last_merged = self.reach if plan.light else self.max_depth
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
         self.inverse_threshold = f32(dr.inf)
-        # The further strategy for SDS paths: that of a pass, or None.
-        self.sds: PhotonStrategy | None = None
+        self.sds = PhotonStrategy()  # of a pass
         # Whether photons guide through near-specular events too.
         self.near_specular = bool(prepared.near_specular)
         # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
@@ -155,16 +152,6 @@ class Kernel:
         count = dr.opaque(mi.Float, count_light)
         return self.replaced(points=points, count_light=count, observer=observer or Observer())
 
-    @property
-    def merges(self) -> bool:
-        """Whether vertices are merged."""
-        return self.sds is not None and self.sds.merges
-
-    @property
-    def guides_near_specular(self) -> bool:
-        """Whether near-specular events count as specular, see `sds`."""
-        return self.sds is not None and self.sds.near_specular
-
     def with_light_groups(self, groups: LightGroups) -> Kernel:
         """The kernel whose contributions store their light group."""
         return self.replaced(light_groups=groups, emitters=self.emitters.with_indices())
@@ -176,10 +163,6 @@ class Kernel:
     def light_group(self, index: mi.UInt32, active: mi.Bool) -> mi.UInt32 | None:
         """The light group of the emitter ``index``; None without such layers."""
         return None if self.light_groups is None else self.light_groups.at(index, active)
-
-    def within_store(self, k: mi.UInt32) -> mi.Bool:
-        """Mask: paths of ``k`` edges use all strategies; longer ones only s = 0 and s = 1."""
-        return k <= self._reach
 
     def with_threshold(self, size: mi.Float64) -> Kernel:
         """The kernel with the roulette threshold ``size`` (``Float64`` of width 1), 0 for none.

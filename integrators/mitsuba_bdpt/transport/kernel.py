@@ -87,6 +87,7 @@ from . import contribution, light_path, subpaths, techniques
 from .batch import Batch, Places, Sharing
 from .contribution import Counters, counted_by_camera, counted_by_light
 from .inputs import Kernel, Observer, Shared
+from .sds import PhotonStrategy
 from .subpaths import CameraSample
 from .walk import random_walk
 
@@ -227,8 +228,8 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
     # t = 0 samples SDS paths; other strategies do so with near-specular events.
-    near_specular = kernel.merges or kernel.guides_near_specular
-    sds = kernel.sds if plan.arrival or near_specular else None
+    near_specular = kernel.sds.merges or kernel.sds.near_specular
+    sds = kernel.sds if plan.arrival or near_specular else PhotonStrategy()
     begun, side = subpaths.light_subpath(kernel, e, stream, shared, sds)
     state = path, counted_by_light(kernel)
     (path, counted), walk = random_walk(kernel, side, begun, visit, state)
@@ -273,9 +274,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
         return sink.add(kernel, c, total, start, shared), lost + c.counted.non_finite
 
     def visit(z, state, walk):
-        total, counters = state
-        if kernel.sds is not None:
-            total, counters = kernel.sds.visit(kernel, z, walk, sample.stream, shared, add, state)
+        total, counters = kernel.sds.visit(kernel, z, walk, sample.stream, shared, add, state)
         if plan.hit:
             # A separate branch: few lanes hit an emitter.
             total, lost = dr.if_stmt(

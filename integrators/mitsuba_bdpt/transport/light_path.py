@@ -131,14 +131,14 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
         "si": (mi.SurfaceInteraction3f, True),
         "d_vcm": (mi.Float, True),
         "d_vc": (type(kernel.heuristic.zero()), True),
-        "d_vm": (mi.Float, kernel.merges),
-        "d_vm_newest": (mi.Float, kernel.merges),
+        "d_vm": (mi.Float, kernel.sds.merges),
+        "d_vm_newest": (mi.Float, kernel.sds.merges),
         "rounding": (mi.Vector2f, True),
         "edges": (mi.UInt32, True),
         "medium": (mi.UInt32, kernel.has_media),
         "light_group": (mi.UInt32, several and groups),
         "layer": (mi.UInt32, kernel.path_layers),
-        "flags": (mi.UInt32, kernel.guides_near_specular),
+        "flags": (mi.UInt32, kernel.sds.near_specular),
         "proxy": (Diffuse, several),
         "lobe": (Lobe, several and kernel.traits.glossy),
         **{f"stokes_{i}": (kind, True) for i, kind in enumerate(polarization.stokes_types())},
@@ -154,7 +154,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
 
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     """Store a light vertex if inner connections can use it."""
-    keep = vertex.hit & (vertex.edges <= kernel.last_stored) & vertex.connectible()
+    keep = vertex.hit & (vertex.edges + 2 <= kernel.reach) & vertex.connectible()
     y, slot = StoredVertex.of(vertex), path.count
     if path.thinning is not None:
         y, slot, keep = _thinned(path, y, keep)
@@ -168,10 +168,10 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
         "layer": y.layer,
         **{f"stokes_{i}": value for i, value in enumerate(polarization.stokes(y.throughput_over_cos))},
     }
-    if kernel.guides_near_specular:
+    if kernel.sds.near_specular:
         entries["flags"] = one(y.sds.isolated) + 2 * one(y.sds.specular)
     if path.guesses:
-        newest = newest_coefficient(kernel, kernel.kappa.direct, vertex.edges)
+        newest = newest_coefficient(kernel, vertex, adjoint=True)
         proxy = ProxyVertex.of(kernel, vertex, newest, keep, alone=True)
         entries |= {"proxy": proxy.diffuse, "lobe": proxy.lobe}
     for name, local in path.entries.items():

@@ -49,7 +49,7 @@ def _shared(kernel: Kernel, stream: Stream, index: mi.UInt64) -> Shared:
     if not mi.is_spectral:
         return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     number = None
-    if kernel.sds is None or kernel.sds.wavelengths is None:
+    if kernel.sds.wavelengths is None:
         u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
     else:
         number = kernel.sds.wavelengths.number(index)
@@ -76,7 +76,7 @@ def emission(kernel: Kernel, stream, shared):
     return e
 
 
-def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None) -> tuple[Walk, Side]:
+def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tuple[Walk, Side]:
     """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in weights on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
@@ -91,19 +91,15 @@ def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy | None)
     edge = kernel.space.begin(kernel, "light", stream, ray, e)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
     walk = replace(walk, broken=broken)
-    if sds is not None:
-        walk = sds.begin_light(kernel, walk)
-    return walk, Side(
+    return sds.begin_light(kernel, walk), Side(
         "light",
         stream,
         shared,
-        spectra.brightest(walk.throughput),
         True,
         kernel.last_light,
-        kernel.kappa.direct,
+        sds,
         complete=lambda si, first: kernel.emitters.connection_density(e, si, first),
         connect=(lambda y: techniques.look_at_sensor(kernel, y, stream)) if kernel.plan.splat else None,
-        sds=sds,
     )
 
 
@@ -125,14 +121,11 @@ def camera_subpath(
         "camera",
         sample.stream,
         shared,
-        spectra.brightest(walk.throughput),
         False,
         kernel.max_depth,
-        kernel.kappa.splat,
+        kernel.sds,
         alpha=alpha,
-        parallel=kernel.camera.parallel,
         connect=choose_emitter if kernel.plan.direct else None,
-        sds=kernel.sds,
     )
     return sample, walk, side
 
@@ -158,7 +151,7 @@ def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
         pi = kernel.scene.ray_intersect_preliminary(ray, coherent=True, active=active)
     partial = _first_partial(kernel, start)
     walk = Walk.begin(kernel, pi, ray, start.p, mi.Spectrum(start.weight), partial, active, edge)
-    return walk if kernel.sds is None else kernel.sds.begin_camera(kernel, walk)
+    return kernel.sds.begin_camera(kernel, walk)
 
 
 def _first_partial(kernel: Kernel, start):

@@ -18,13 +18,7 @@ from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, spectra
-from .alternatives import (
-    direct_coefficient,
-    merges_before_end,
-    merges_up_to,
-    newest_coefficient,
-    where_lit,
-)
+from .alternatives import merges_before_end, side_of, where_lit
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
 from .sds import PhotonStrategy
@@ -40,7 +34,7 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     return active & ~z.volume
 
 
-def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contribution:
+def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
     """s = 0: the subpath has hit an emitter (eqs. 42, 43); ``sds``: the strategy beside it on SDS paths."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
@@ -55,7 +49,7 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
         endpoints = mis.choose(z.hit, endpoints, 0)
     direct = where_lit(kernel, z.edge and z.edge.lit)
     newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
-    older = dr.select(kernel.within_store(z.edges), pdf_first * pdf_second, 0)
+    older = dr.select(z.edges <= kernel.reach, pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # no light subpath comes straight from infinity past all shapes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
     camera_side = h.combine(
@@ -63,12 +57,12 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy | None) -> Contri
         h.scale(z.partial.d_vc, older),
     )
     sides = 0, camera_side
-    if sds is not None and sds.near_specular:
+    if sds.near_specular:
         on_sds_path = z.sds.ends(z.edges, mis.choose(directly, kernel.kappa.endpoints, direct))
         alone = h.scale(z.partial.d_vcm, newest)
         sides = _beside_guided(kernel, z.sds.guided, on_sds_path, sides, alone, kernel.kappa.hit)
         active = sds.counts(active, on_sds_path)
-    elif sds is not None:
+    else:
         connectible = mis.is_connectible(z.partial, newest)
         sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
     merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
@@ -116,7 +110,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
 
 
-def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | None) -> Contribution:
+def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -> Contribution:
     """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45).
 
     ``sds`` as in `hit_emitter`.
@@ -129,15 +123,11 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy | 
     active = active & ~spectra.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
-    older = mis.choose(kernel.within_store(k), z.partial.d_vc, 0)
-    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
     densities = f.pdf_rev_w, e.emission_ratio * z.cosine(e.d)
-    merges = merges_up_to(kernel, z, kernel.kappa.splat_count, *densities, kernel.kappa.direct)
+    camera_side, merges = side_of(kernel, z, False, *densities, kernel.kappa.direct)
     merges = mis.choose(k <= kernel.last_merged, merges, 0)
-    newest = mis.choose(kernel.within_store(k), newest, 0)
-    camera_side = mis.alternatives(h, mis.Partial(z.partial.d_vcm, older), newest, *densities)
-    ends = light_side, camera_side
-    if sds is not None and sds.near_specular:
+    ends = light_side, mis.choose(k <= kernel.reach, camera_side, 0)
+    if sds.near_specular:
         on_sds_path = z.sds.meets_end(z.edges, f) & ~e.delta
         guided = None if z.sds.guided is None else z.sds.guided_before_last(h)
         ends = _beside_guided(kernel, guided, on_sds_path, ends, light_side, kernel.kappa.direct)
@@ -213,7 +203,7 @@ def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraCon
 
     Returns the result of `Sensor.connect` and its `bsdf.Target`.
     """
-    active = y.hit & y.connectible() & (y.edges <= kernel.last_splat)
+    active = y.hit & y.connectible() & (y.edges + 1 <= kernel.reach)
     connection = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
     active &= connection.valid
     if kernel.plan.hide_emitters:
@@ -233,17 +223,14 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
-    direct = direct_coefficient(kernel, y)
-    newest = newest_coefficient(kernel, direct, y.edges)
     densities = f.pdf_rev_w, connection.pdf_w * to_area
-    light_side = mis.alternatives(h, y.partial, newest, *densities)
+    light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_count)
     camera_side = 0
     if kernel.plan.arrival:
         camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
-    if kernel.guides_near_specular:
+    if kernel.sds.near_specular:
         active &= ~y.sds.meets_end(y.edges, f)
-    merges = merges_up_to(kernel, y, kernel.kappa.direct, *densities, kernel.kappa.splat_count)
     weight, shares = h.weigh(*sides, merges=merges)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
@@ -273,7 +260,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
         pi.t = dr.select(y.hit, dr.norm(y.si.p - walk.previous), dr.inf)
         reaching = replace(walk, pi=pi)
     z = kernel.camera.hit(reaching, y, emission.infinite & directly)
-    active = z.active & (walk.edges <= kernel.last_arrival)
+    active = z.active & (walk.edges <= kernel.reach)
     reached, throughput, tr = kernel.space.up_to_sensor(walk, y, z, active)
     active &= reached
     if kernel.plan.hide_emitters:
@@ -290,9 +277,9 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     rival = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_count)
     merged = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
-    if kernel.guides_near_specular:
+    if kernel.sds.near_specular:
         active &= ~walk.sds.ends(walk.edges, newest)
-    elif kernel.sds is not None and walk.sds is not None and not kernel.merges:
+    elif walk.sds is not None:
         merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
         # The last edge is not connected either.
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))

@@ -18,7 +18,7 @@ from ..geometry import polarization, rays
 from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, scattering, spectra
-from .alternatives import direct_coefficient, newest_coefficient
+from .alternatives import newest_coefficient
 from .contribution import Counters, one
 from .inputs import Kernel, Shared
 from .mis import choose
@@ -105,7 +105,7 @@ class Vertex:
     geometric cosine of the edge to it; ``anchor``: starts rays; ``hit``: false in the environment;
     ``endpoint`` of its connection and the BSDF ``f`` towards it (a `bsdf.Evaluation`), where
     ``endpoint_active``, see `Side`; ``event``: index of its random numbers; ``volume``, ``edge``: see
-    `vacuum.Arrival`. ``layer``: that of `Walk` on arrival.
+    `vacuum.Arrival`; ``layer`` and ``sds``: those of `Walk` on arrival.
     """
 
     si: mi.SurfaceInteraction3f
@@ -126,10 +126,7 @@ class Vertex:
     endpoint: Any = None  # a `Direct`, or a `CameraConnection`
     endpoint_active: Any = None
     f: Any = None  # a `bsdf.Evaluation`
-    # Set with guiding: `sds.State.guided` on arrival, and the guide; the whole state where near-specular
-    # events count as specular.
-    guided: mi.Float | None = None
-    advice: Any = None  # an `sds.Advice`
+    advice: Any = None  # an `sds.Advice`, with guiding
     layer: mi.UInt32 | None = None
     sds: Any = None  # an `sds.State`
 
@@ -156,13 +153,10 @@ def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool) -> mi.Float:
 class Side:
     """Constants of a subpath, which distinguish the two kinds.
 
-    ``stream`` of its random numbers; ``shared``: time and wavelengths; ``reference``: throughput that
-    roulette compares with; ``adjoint``: light travels with the walk; ``coefficient``: kappa of the class of
-    the newest alternative at vertex 1 (next-event estimation on the light side, t = 1 on the camera side);
-    ``alpha``: the film needs to know whether a non-null event happened; ``parallel``: the first edge has one
-    direction, with density one across it; ``isolated``: the subpath ends once an edge is connectible, see
-    `sds.State`; ``only_specular``: it ends at an event that is not delta and has a smaller density from one
-    side (1 / sr; 0: at none, infinity: at each).
+    ``stream`` of its random numbers; ``shared``: time and wavelengths; ``adjoint``: light travels with the
+    walk; ``alpha``: the film needs to know whether a non-null event happened; ``isolated``: the subpath ends
+    once an edge is connectible, see `sds.State`; ``only_specular``: it ends at an event that is not delta and
+    has a smaller density from one side (1 / sr; 0: at none, infinity: at each).
     Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
@@ -173,17 +167,14 @@ class Side:
     name: str
     stream: Stream
     shared: Shared
-    reference: mi.Float
     adjoint: bool
     last_edge: mi.UInt32
-    coefficient: mi.Float | mi.Vector4f | int
+    sds: PhotonStrategy
     complete: Callable[[mi.SurfaceInteraction3f, mi.Bool], mi.Float] | None = None
     alpha: bool = False
-    parallel: bool = False
     connect: Callable[[Vertex], tuple[Direct | CameraConnection, bsdf.Target]] | None = None
     isolated: bool = False
     only_specular: float = 0.0
-    sds: PhotonStrategy | None = None
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
@@ -203,18 +194,19 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
 
     ``visit(vertex, state, walk)`` returns the new state; ``walk`` as before its arrival.
     """
-    kernel.observer.started(kernel, side, walk, side.stream)
+    kernel.observer.started(kernel, side, walk)
+    first = spectra.brightest(walk.throughput)
     while dr.hint(
         walk.active,
         # Dr.Jit's kernel cache does not distinguish sizes of local memory; the label does.
         label=f"{side.name} subpath, {kernel.store_size} stored",
-        exclude=[kernel, side, visit],  # constants, see `Walk`
+        exclude=[kernel, side, visit, first],  # constants, see `Walk`
     ):
         vertex = _vertex(kernel, side, walk)
         step = _interact(kernel, side, walk, vertex)
         kernel.observer.vertex(side, walk, vertex, step)
         state = visit(vertex, state, walk)
-        walk = _scatter(kernel, side, walk, vertex, step)
+        walk = _scatter(kernel, side, walk, vertex, step, first)
     return state, walk
 
 
@@ -235,7 +227,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         throughput = dr.select(dr.isfinite(pdf_connect), throughput, dr.nan)
         partial = replace(partial, d_vcm=h.scale(partial.d_vcm, pdf_connect))
         dist2 = dr.select(walk.edges == 1, 1, dist2)  # the density contains it
-    if side.parallel:
+    elif kernel.camera.parallel:
         dist2 = dr.select(walk.edges == 1, 1, dist2)
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
@@ -265,15 +257,14 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         event=walk.event,
         volume=volume,
         edge=edge,
-        guided=None if walk.sds is None else walk.sds.guided,
         layer=walk.layer,
-        sds=None if walk.sds is None or walk.sds.specular is None else walk.sds,
+        sds=walk.sds,
     )
 
 
 def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     """Sample the next direction, and connect ``vertex`` with an endpoint."""
-    if not kernel.scatters:  # a virtual call needs a target
+    if not kernel.surfaces and kernel.space.phase is None:  # a virtual call needs a target
         return None
     points = kernel.points
     target = None
@@ -284,8 +275,7 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     u2 = points.draw_2d(side.name, side.stream, Purpose.BSDF, walk.event)
     sampled = _is_sampled(kernel, side, walk, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
-    if side.sds is not None:
-        vertex.advice = side.sds.advise(kernel, side.adjoint, vertex, walk, step)
+    vertex.advice = side.sds.advise(kernel, side.adjoint, vertex, walk, step)
     return step
 
 
@@ -299,8 +289,11 @@ def _is_sampled(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     return vertex.hit & (at_last | (walk.edges < side.last_edge))
 
 
-def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Walk:
-    """Take the sampled ``step``, play roulette and trace the next edge."""
+def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first: mi.Float) -> Walk:
+    """Take the sampled ``step``, play roulette and trace the next edge.
+
+    ``first``: brightest colour of the throughput of the first edge.
+    """
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
     h, si = kernel.heuristic, vertex.si
@@ -308,8 +301,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Wa
     # Null events are no edges, with media.
     passes = step.null & sampled if kernel.has_media else mi.Bool(False)
     active = vertex.hit & (walk.edges < side.last_edge) | passes
-    first = direct_coefficient(kernel, vertex) if side.adjoint else side.coefficient
-    coefficient = newest_coefficient(kernel, first, walk.edges)
+    coefficient = newest_coefficient(kernel, vertex, side.adjoint)
     sds, merges = _sds(kernel, side, walk, vertex, coefficient, step)
     before, after = walk.partial, mis.scatter(h, vertex.partial, coefficient, step)
     d_vcm, d_vc = choose(passes, before.d_vcm, after.d_vcm), choose(passes, before.d_vc, after.d_vc)
@@ -322,13 +314,13 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step) -> Wa
     broken = walk.broken | not_finite(active, throughput, si.wi)
     active &= (brightest > 0) & ~broken
     useful = None
-    if sds is not None and sds.survived is not None and side.sds is not None:
+    if sds is not None and sds.survived is not None:
         useful, sds = side.sds.survival(sds, partial, si.p)
     elif side.isolated and sds is not None:
         active &= sds.isolated
     if side.only_specular:
         active &= is_narrow(step, side.only_specular) | step.delta
-    survive = dr.minimum(brightest / side.reference * (1 if side.adjoint else eta * eta), 0.95)
+    survive = dr.minimum(brightest / first * (1 if side.adjoint else eta * eta), 0.95)
     throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, useful)
     active &= goes_on
 
@@ -374,16 +366,14 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     ``coefficient``: that of the class that connects the edge to it.
     """
     state, strategy, h = walk.sds, side.sds, kernel.heuristic
-    if strategy is not None and strategy.merges:
-        rival = coefficient
-        if not side.adjoint:
-            rival = newest_coefficient(kernel, kernel.kappa.splat_count, walk.edges)
+    if strategy.merges:
+        rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
         ratio = strategy.ratio(kernel, vertex.si.p)
         return state, mis.scattered_merges(h, vertex.partial, step, ratio, rival)
     if state is None:
         return None, (0, 0)
     state = state.after(h, vertex, coefficient, step)
-    if strategy is None or mis.is_absent(vertex.partial.d_vm):
+    if mis.is_absent(vertex.partial.d_vm):
         return state, (0, 0)
     guided = strategy.guided(kernel, vertex)
     return state, (mis.scattered_guided(h, vertex.partial, step, guided, state.isolated), 0)

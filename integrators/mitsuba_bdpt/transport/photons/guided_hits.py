@@ -66,9 +66,9 @@ class Guiding(PhotonStrategy):
         if adjoint and self.near_specular:
             return None
         if adjoint:
-            possible = is_sds_vertex(kernel, kernel.kappa.direct, walk, vertex) & walk.sds.only_delta
+            possible = is_sds_vertex(kernel, vertex, adjoint) & vertex.sds.only_delta
             return self._evaluated(kernel, vertex, -walk.d, possible)
-        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
+        possible = is_sds_vertex(kernel, vertex, adjoint)
         return self._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
 
     def _evaluated(self, kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
@@ -117,8 +117,8 @@ class _Guided(PhotonStrategy):
 
     def advise(self, kernel, adjoint, vertex, walk, step) -> Advice:
         """Only further vertices of a path of specular events guide too."""
-        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
-        possible &= is_specular(step) & ~walk.sds.diffuse
+        possible = is_sds_vertex(kernel, vertex, adjoint)
+        possible &= is_specular(step) & ~vertex.sds.diffuse
         return self.guiding._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
 
     def counts(self, active, on_sds_path):
@@ -149,7 +149,7 @@ class Unguided(Guiding):
         """A guide that has the BSDF's density of the walk's direction."""
         if adjoint or self.near_specular:
             return None
-        possible = is_sds_vertex(kernel, kernel.kappa.splat, walk, vertex)
+        possible = is_sds_vertex(kernel, vertex, adjoint)
         return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
@@ -159,12 +159,12 @@ class Unguided(Guiding):
         return active & ~on_sds_path
 
     def hit(self, kernel, z, connectible, densities, sides, active):
-        return sides, active & (connectible | (z.guided == 0))
+        return sides, active & (connectible | (z.sds.guided == 0))
 
 
 def _other(kernel: Kernel, z: Vertex, connectible: mi.Bool) -> mis.PartialSum:
     """Ratio of the other density of the path to its own: s = 0 by the guide and by the BSDF."""
-    return kernel.heuristic.scale(dr.select(connectible, 0, z.guided), kernel.kappa.hit)
+    return kernel.heuristic.scale(dr.select(connectible, 0, z.sds.guided), kernel.kappa.hit)
 
 
 def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
@@ -211,13 +211,11 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         "camera",
         numbers,
         shared,
-        spectra.brightest(walk.throughput),  # reference of roulette
         False,
         kernel.max_depth,
-        kernel.kappa.splat,
+        guided if near_specular else PhotonStrategy(),
         connect=(lambda z: techniques.choose_emitter(kernel, z, numbers)) if connects else None,
         only_specular=GUIDED if near_specular else math.inf,
-        sds=guided if near_specular else None,
     )
     begun = walk.active
     state = (total, lost, traced) if connects else (total, lost)
@@ -235,7 +233,7 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     d, active = photon_guide.draw(guiding.guide, p, z.advice.found, u1, u2)
     pdf, local = guiding.density(kernel, p, z.advice.found, d), z.si.to_local(d)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
-    newest = newest_coefficient(kernel, kernel.kappa.splat, z.edges)
+    newest = newest_coefficient(kernel, z, adjoint=False)
     active &= f.pdf_fwd_w > 0
     if guiding.near_specular:  # of a diffuse vertex and those after it the former guides
         specular = is_specular(f)

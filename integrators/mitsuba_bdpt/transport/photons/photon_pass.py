@@ -41,7 +41,7 @@ class PhotonPolicy:
     ``sds``: the strategy of their weights; ``only_specular``: see `Side`.
     """
 
-    sds: PhotonStrategy | None = None
+    sds = PhotonStrategy()
     only_specular: float = math.inf
 
     def last_edge(self, kernel: Kernel) -> mi.UInt32:
@@ -69,7 +69,7 @@ class GuidePhotons(PhotonPolicy):
             self.sds, self.only_specular = Unguided(near_specular=True), GUIDED
 
     def stored(self, kernel, y, walk, stream):
-        keep = is_sds_vertex(kernel, kernel.kappa.direct, walk, y)
+        keep = is_sds_vertex(kernel, y, adjoint=True)
         return keep & (kernel.heuristic.present(y.partial.d_vc) > 0), 1.0
 
 
@@ -91,12 +91,12 @@ def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[G
 
     The guide is None without photons. ``aim`` samples first directions.
     """
-    traced = trace(kernel.replaced(sds=None), GuidePhotons(kernel.near_specular), aim, points, count)
+    traced = trace(kernel, GuidePhotons(kernel.near_specular), aim, points, count)
     return Guide.of(traced.photons, traced.count) if traced.count else None, traced.counters
 
 
 def trace(kernel: Kernel, policy: PhotonPolicy, aim: Aim, points: Points, count: int) -> Traced:
-    """Trace ``count`` photon subpaths; ``kernel.sds`` is the strategy that uses them, None for a guide."""
+    """Trace ``count`` photon subpaths; ``kernel.sds`` is the strategy that uses them."""
     kernel = kernel.bound(points).replaced(last_light=policy.last_edge(kernel))
     capacity = max(int(count * _CAPACITY), 1)
     while True:
@@ -128,7 +128,7 @@ def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Pho
             d=-walk.d,
             n=y.si.n,
             flux=y.throughput / probability,
-            connection=present(newest_connection(kernel, kernel.kappa.direct, y)),
+            connection=present(newest_connection(kernel, y, adjoint=True)),
             older=present(y.partial.d_vc),
             d_vm=present(y.partial.d_vm),
             d_vm_newest=present(y.partial.d_vm_newest),
