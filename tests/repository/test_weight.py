@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7690,
-    "transport merging guided_emission": 6317,
+    "transport merging guided_emission": 6269,
     "planning": 2155,
     "emitters": 2680,
     "cli": 1812,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 6085, "tests": 44855}
+OUTSIDE = {"scripts": 6085, "tests": 44847}
 MOST_WORDS = 68538
 
 
