@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
 .PHONY: render test costly slow one-core costs lint gallery pictures notebook docs package references benchmark sweep stress same \
-	endurance mutants scale
+	mutants scale
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -102,7 +102,7 @@ sweep: $(INSTALLED)
 	$(VENV)/bin/python scripts/report.py results/small
 	$(VENV)/bin/mitsuba-bdpt page results/small
 
-# What was tried to break it, under twenty minutes on two cores: docs/reports/stress.md.
+# What was tried to break it, under twenty minutes on two cores: docs/reports/stress.json.
 stress: $(INSTALLED)
 	$(VENV)/bin/python scripts/stress.py
 
@@ -116,24 +116,20 @@ same: $(INSTALLED)
 mutants: $(INSTALLED)
 	$(VENV)/bin/python scripts/mutants.py
 
-# Hours of renders that look for values that are not finite; can be interrupted, and adds to docs/reports/endurance.json.
-endurance: $(INSTALLED)
-	$(VENV)/bin/python scripts/endurance.py
-
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)
 	$(VENV)/bin/mitsuba-bdpt reference --all --seconds 3600
 	$(VENV)/bin/mitsuba-bdpt reference glass_caustics --spp 256 --seconds 7200
 	$(VENV)/bin/mitsuba-bdpt reference cornell_box --spp 256 --seconds 3600
 
-# The tables and plots of docs/reports, about an hour, best on a quiet machine; goes on where it was stopped.
+# The data and plots of docs/reports/benchmark, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
 	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
 	$(VENV)/bin/python scripts/floor.py --record results/benchmark/probes.json
-	cp results/benchmark/rows.parquet results/benchmark/probes.json docs/reports/benchmark
-	$(VENV)/bin/python scripts/report.py docs/reports/benchmark --readme docs/reports/figures.md
+	$(VENV)/bin/python scripts/report.py results/benchmark
+	cp $(addprefix results/benchmark/,rows.parquet probes.json *.png) docs/reports/benchmark
 
-# What is fixed per render, per object and per pass, over `path`: docs/reports/scale.json and its tables.
+# What is fixed per render, per object and per pass, over `path`: docs/reports/scale.json.
 scale: $(INSTALLED)
 	$(VENV)/bin/python scripts/scale.py
 

@@ -1,11 +1,18 @@
 """The site of the documentation, by Sphinx: `make docs`.
 
 Its source folder is the repository, so that links between files lead where they lead on GitHub. A file that
-is no page (source, a test, a scene) is copied into the site where a page links to it.
+is no page (source, a test, a scene) is copied into the site where a page links to it. Tables are made of the
+data of docs/reports.
 """
+
+import sys
+from pathlib import Path
 
 import mitsuba_bdpt  # isort: skip (before mitsuba, which autodoc imports)
 from sphinx.writers.html5 import HTML5Translator
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "scripts"))
+import pages  # isort: skip
 
 project = "mitsuba-bdpt"
 release = mitsuba_bdpt.__version__
@@ -58,3 +65,8 @@ class Translator(HTML5Translator):
 def setup(app):
     """Called by Sphinx."""
     app.set_translator("html", Translator)
+    app.connect("source-read", _fill)
+
+
+def _fill(app, docname, source):
+    source[0] = pages.filled(source[0])

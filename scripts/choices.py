@@ -15,8 +15,8 @@ fixed choices, with the interval of nine in ten resamplings of the seeds (the sa
 same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its two
 ratios; the pilot's predicted time to an error over the measured one (trimmed), the largest ratio of two
 candidates; and what was chosen. The least of several noisy products is below the true one: figures are on the
-safe side. References of 8,192 samples per pixel are made for scenes of small_casters, and for those whose
-stored reference has light that only `merging` finds, which no choice has. A scene in OUTPUT is measured again
+safe side. References of 8,192 samples per pixel are made for scenes of small_casters; in others some
+references have light that the default merges and no fixed choice samples. A scene in OUTPUT is measured again
 if the pilot's candidates have changed.
 """
 
@@ -63,9 +63,7 @@ def loaded(name: str):
     else:
         scene = repository.load_scene(name, resolution=repository.RESOLUTION)
         depth = repository.benchmark_depth(name)
-        stored = repository.load_reference(name, repository.RESOLUTION, depth)
-        if not stored.merged:
-            return scene, depth, stored.image
+        return scene, depth, repository.load_reference(name, repository.RESOLUTION, depth).image
     made = mi.load_dict({"type": "bdpt", "max_depth": depth, "light_paths": 1, "connections": "one"})
     halves = [np.array(made.render(scene, seed=REFERENCE_SEED + i, spp=REFERENCE_SPP)) for i in (0, 1)]
     return scene, depth, np.mean(halves, axis=0, dtype=np.float64)[..., :3]
@@ -184,6 +182,21 @@ def shown(row: dict) -> list[str]:
     return [f"`{row['scene']}`", *cells, best, f"{max(wrong) / min(wrong):.2g}", counts]
 
 
+HEAD = (
+    "scene",
+    "raw: default, worst pilot",
+    "trimmed: default, worst pilot",
+    "best by both",
+    "predicted / measured",
+    "chosen (pilots)",
+)
+
+
+def choices_table(record: list[dict]) -> str:
+    """The table of a record, as Markdown."""
+    return table(HEAD, map(shown, record))
+
+
 def main(arguments=None) -> int:
     """Print the table."""
     parser = command_line.parser(__doc__)
@@ -207,15 +220,7 @@ def main(arguments=None) -> int:
             print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
         if options.output:
             write_json(options.output, list(rows.values()))
-    head = [
-        "scene",
-        "raw: default, worst pilot",
-        "trimmed: default, worst pilot",
-        "best by both",
-        "predicted / measured",
-        "chosen (pilots)",
-    ]
-    print(table(head, [shown(rows[name]) for name in names]))
+    print(choices_table([rows[name] for name in names]))
     return 0
 
 

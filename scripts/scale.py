@@ -1,6 +1,6 @@
 """What is fixed per render, per object and per pass: times of `bdpt` over `path` as scenes grow.
 
-    python scripts/scale.py                          # all rows; writes docs/reports/scale.* and figures.md
+    python scripts/scale.py                          # all rows; writes docs/reports/scale.json
     python scripts/scale.py lamps film               # rows of these kinds, printed
     python scripts/scale.py lamps --sizes 300 1000
     python scripts/scale.py --list
@@ -41,14 +41,12 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
-from mitsuba_bdpt.measure.tables import met_text, ratio, replace_part, table
+from mitsuba_bdpt.measure.tables import met_text, ratio, table
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
 RECORD = repository.ROOT / "docs" / "reports" / "scale.json"
-PAGE = RECORD.with_suffix(".md")
-FIGURES_PAGE = RECORD.with_name("figures.md")
 DEPTH = 6
 METHODS = {
     "path": {"type": "path"},
@@ -509,17 +507,10 @@ def goals(record: dict) -> str:
     return table(["over `path`", "at most", "measured", "met"], lines)
 
 
-def write(record: dict) -> None:
-    """The record as data, its tables as a page, and the goals in the page of figures."""
-    write_text(RECORD, json.dumps(record, indent=1) + "\n")
-    write_text(PAGE, replace_part(PAGE.read_text(), "scale", tables(record)))
-    write_text(FIGURES_PAGE, replace_part(FIGURES_PAGE.read_text(), "goals", goals(record), by="scale"))
-
-
 def main(arguments=None) -> int:
     """Run the command line."""
     parser = command_line.parser(__doc__)
-    parser.add_argument("kinds", nargs="*", help="kinds of rows; default: all, and the page is written")
+    parser.add_argument("kinds", nargs="*", help="kinds of rows; default: all, and the record is written")
     parser.add_argument("--sizes", nargs="+", help="sizes of these kinds, instead of those of the table")
     parser.add_argument("--list", action="store_true", help="print kinds and sizes, render nothing")
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
@@ -544,7 +535,8 @@ def main(arguments=None) -> int:
         print(f"{name}: {' | '.join(HEAD)}")
         rows += rows_of(name, [parsed(kind, size) for size in asked.sizes or kind.sizes])
     if not asked.kinds:
-        write({"versions": versions(), "rows": rows})
+        record = {"versions": versions(), "rows": rows}
+        write_text(RECORD, json.dumps(record, indent=1) + "\n")
     return 0
 
 

@@ -1,16 +1,15 @@
-"""Try to break the renderer, and write what happened into a table.
+"""Try to break the renderer, and record what happened.
 
-    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress.*
+    python scripts/stress.py             # all cases, under twenty minutes; writes docs/reports/stress.json
     python scripts/stress.py NAME ...    # some of them, printed; with --write in the place of their rows
     python scripts/stress.py --list      # names of all
     python scripts/stress.py --same ../before/docs/reports/stress.json   # the same as that record?
 
-Each case runs in a process of its own, so that a crash or a hang is an outcome too. Written are the record,
-docs/reports/stress.json, and two parts of docs/reports/stress.md: counts and failures (`stress`), and a row
-per case (`cases`), without the tolerances and figures of the record. Exit status 1 if a case failed; one that
-can't be tried here (as this user, on this system) is named. ``--same`` writes nothing, and exits with 1 if
-words or figures of a case differ from those of a record: the check, beside scripts/versus.py, of a change
-that must keep all images.
+Each case runs in a process of its own, so that a crash or a hang is an outcome too. Exit status 1 if a case
+failed; one that can't be tried here (as this user, on this system) is named. `summary` (counts and failures)
+and `tables` (a row per case) of the record are in the site of `make docs`. ``--same`` writes nothing, and
+exits with 1 if words or figures of a case differ from those of a record: the check, beside scripts/versus.py,
+of a change that must keep all images.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ import repository
 from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import reference
-from mitsuba_bdpt.measure.tables import replace_part, table
+from mitsuba_bdpt.measure.tables import table
 
 from stress_cases import cases
 from stress_cases.case import Case, Outcome
@@ -39,7 +38,6 @@ from stress_cases.case import Case, Outcome
 import mitsuba as mi  # isort: skip
 
 RECORD = repository.ROOT / "docs" / "reports" / "stress.json"
-PAGE = repository.ROOT / "docs" / "reports" / "stress.md"
 
 # Seconds after which a case counts as hanging: ten times what the longest takes on two cores,
 # since others may use them as well.
@@ -130,16 +128,9 @@ def summary(record: list[dict]) -> str:
     return "\n".join([made_with(record) + "\n", text, *(line + "\n" for line in others)])
 
 
-def page(record: list[dict]) -> str:
-    """The page with the counts and tables of a record."""
-    text = replace_part(PAGE.read_text(), "stress", summary(record))
-    return replace_part(text, "cases", tables(record))
-
-
 def write(record: list[dict]) -> None:
-    """The record as data, and as counts and tables in the page."""
+    """Write the record."""
     write_text(RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
-    write_text(PAGE, page(record))
 
 
 def tried(case: Case) -> dict:
@@ -195,7 +186,7 @@ def main(arguments=None) -> int:
     parser = command_line.parser(__doc__)
     known = {case.name: case for case in cases()}
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="cases; default: all, and the page is written"
+        "names", nargs="*", metavar="NAME", help="cases; default: all, and the record is written"
     )
     text = "cases at a time; much of one is compiling kernels, on one core (default: %(default)s)"
     parser.add_argument("--jobs", type=number(int, 1), default=JOBS, help=text)

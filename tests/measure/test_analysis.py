@@ -617,13 +617,6 @@ def test_parts_of_the_readme_are_replaced():
         tables.replace_part(text, "z", "")
 
 
-@pytest.mark.parametrize("page", ["figures", "public"])
-def test_reports_fill_every_part_of_the_committed_pages(page):
-    """Rationale: another script's part on such a page stops the report. Expected: all parts are known."""
-    names = re.findall(r"<!-- report: (.*?) -->", (ROOT / f"docs/reports/{page}.md").read_text())
-    assert names and set(names) <= report.PARTS.keys()
-
-
 def test_a_report_is_written(results, tmp_path):
     """Expected: from the data of a folder the page, the plots, and the project's README's parts; a page of
     the user's own is not overwritten, one that a report has written is."""

@@ -69,7 +69,6 @@ def by_user(monkeypatch, command, *arguments):
             "scene='nowhere' is neither a scene file nor the name of one",
         ),
         ("compare_ptracer.py --only=no-such-case --page missing.md", "missing.md"),
-        ("endurance.py --show --record .", "Is a directory"),
         (
             "equal-time scenes/nowhere",
             "neither a scene file nor the name of one in",
@@ -119,9 +118,6 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
 @pytest.mark.parametrize(
     "command",
     [
-        "endurance.py --seconds nan",
-        "endurance.py --samples inf",
-        "endurance.py --render-samples 0",
         "fireflies.py x --seeds 0",
         "fireflies.py x --spp 0.5",
         "fireflies.py x --resolution 0",

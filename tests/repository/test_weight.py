@@ -9,23 +9,23 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7690,
+    "measure": 7687,
     "transport merging guided_emission": 6269,
-    "planning": 2155,
+    "planning": 2154,
     "emitters": 2680,
     "cli": 1812,
     "media": 1350,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
-    "run": 1237,
+    "run": 1236,
     "scene sampling": 777,
     "host": 1076,
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 6085, "tests": 44847}
-MOST_WORDS = 68538
+OUTSIDE = {"scripts": 5819, "tests": 44654}
+MOST_WORDS = 42910
 
 
 def _lines(files):

@@ -113,12 +113,9 @@ def said(figure: Callable[..., object], *given: object) -> str:
     return str(found)
 
 
-def replace_part(text: str, name: str, part: str, by: str = "report") -> str:
-    """Replace the text between the markers of ``name``; ``CommandError`` without them.
-
-    ``by``: the marker's first word, who fills it.
-    """
-    pattern = re.compile(rf"(<!-- {by}: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+def replace_part(text: str, name: str, part: str) -> str:
+    """Replace the text between the markers of ``name``; ``CommandError`` without them."""
+    pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
     if len(pattern.findall(text)) != 1:
-        raise CommandError(f"there must be one `<!-- {by}: {name} -->` with an `<!-- end -->`")
+        raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
     return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)
