@@ -51,7 +51,7 @@ MUTANTS = (
     Mutant(
         "path layers: a merge forgets the events of the photon's subpath",
         "merging/merging.py",
-        "path_layers.joined(of_camera, photon.layer)",
+        "path_layers.joined(of_camera, y.layer)",
         "of_camera",
         ("tests/transport/test_oracle.py::test_strategies_agree_on_path_layers[merging]",),
     ),
@@ -107,7 +107,7 @@ MUTANTS = (
     Mutant(
         "light groups: a merge's group is that of the camera's side",
         "merging/merging.py",
-        "kernel.light_group(photon.emitter,",
+        "kernel.light_group(y.emitter,",
         "kernel.light_group(mi.UInt32(0),",
         ("tests/images/test_light_groups.py::test_a_merge_knows_its_emitter[dielectric]",),
     ),
@@ -1210,9 +1210,9 @@ MUTANTS = (
     ),
     Mutant(
         "guided s = 0: s = 0 does not know of it",
-        "transport/photons/guided_hits.py",
-        "kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))",
-        "camera_side",
+        "transport/techniques.py",
+        "(0, h.combine(camera_side, guided)), sds.counts",
+        "(0, camera_side), sds.counts",
         ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
     ),
     Mutant(
@@ -1224,9 +1224,9 @@ MUTANTS = (
     ),
     Mutant(
         "guided s = 0: t = 0 does not know of it",
-        "transport/photons/guided_hits.py",
-        "kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other)",
-        "kernel.heuristic.scale(vertex.partial.d_vc, mi.Float(0))",
+        "transport/walk.py",
+        "guided = h.scale(vertex.partial.d_vc, vertex.advice.other)",
+        "guided = h.scale(vertex.partial.d_vc, mi.Float(0))",
         ("tests/images/test_guided_hits.py::test_a_wide_lens",),
     ),
     Mutant(
@@ -1246,8 +1246,8 @@ MUTANTS = (
     Mutant(
         "guided s = 0: connectible paths in place of the others",
         "transport/photons/guided_hits.py",
-        "return sides, active & ~connectible",
-        "return sides, active & connectible",
+        "return active & on_sds_path",
+        "return active & ~on_sds_path",
         ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
     ),
     Mutant(
@@ -1271,7 +1271,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: t = 1 goes on",
         "transport/techniques.py",
-        "active &= ~y.sds.meets_end(y.edges, f)",
+        "active &= ~connects_sds_path(y.edges + 1, (y.sds, f, 0))",
         "active &= mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1280,7 +1280,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: t = 0 goes on",
         "transport/techniques.py",
-        "active &= ~walk.sds.ends(walk.edges, newest)",
+        "active &= ~walk.sds.is_sds_path(walk.edges, newest)",
         "active &= mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1289,7 +1289,7 @@ MUTANTS = (
     Mutant(
         "near-specular guiding: inner connections go on",
         "transport/connections.py",
-        "active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))",
+        "active &= ~connects_sds_path(k, (y.sds, f_y, newest_y), (z.sds, f_z, newest_z))",
         "active &= mi.Bool(True)",
         (
             "tests/transport/test_oracle.py::test_kernel_guides_through_near_specular_events[balance-n1c1-True]",
@@ -1373,7 +1373,7 @@ MUTANTS = (
     Mutant(
         "guiding: a path is isolated again after an edge that is connectible",
         "transport/sds.py",
-        "isolated = isolated & (step.delta",
+        "isolated = self.isolated & (step.delta",
         "isolated = (step.delta",
         ("tests/images/test_guided_hits.py::test_glass_caustics_under_a_large_lamp[guided]",),
     ),
@@ -1429,8 +1429,8 @@ MUTANTS = (
     Mutant(
         "merging: merges without their coefficient in the sums of subpaths",
         "transport/walk.py",
-        "ratio = strategy.ratio(kernel, vertex.si.p)",
-        "ratio = strategy.ratio(kernel, vertex.si.p) / strategy.kappa",
+        "ratio = strategy.ratio(vertex.si.p)",
+        "ratio = strategy.ratio(vertex.si.p) / strategy.kappa",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-odd-True-1.0]",),
     ),
     Mutant(
@@ -1463,9 +1463,9 @@ MUTANTS = (
     ),
     Mutant(
         "merging: photons start with the density of their aim",
-        "merging/merging.py",
-        "return replace(e, pdf_second=e.pdf_second * aim), aim",
-        "return e, aim",
+        "transport/photons/aim.py",
+        "pdf_second=mixed * ratio)",
+        "pdf_second=mixed)",
         ("tests/images/test_near_specular_merging.py::test_images_are_those_without_merging[bumpy]",),
     ),
     Mutant(
@@ -1525,7 +1525,7 @@ MUTANTS = (
     Mutant(
         "merging: normals are not compared",
         "merging/merging.py",
-        "(beyond_rounding < _FLAT * r) & same_surface(photon.n, z.si.n)",
+        "(beyond_rounding < _FLAT * r) & (dr.dot(photon.n, z.si.n) > _SAME_SURFACE)",
         "(beyond_rounding < _FLAT * r)",
         ("tests/images/test_merging.py::test_which_photons_are_near",),
     ),

@@ -427,8 +427,8 @@ def traced(count=1 << 14):
     render = rendering.Render(scene, scene.sensors()[0], method.settings, 0, 4)
     kernel: Kernel = render.kernel
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
-    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1), render.aim)
-    of_pass, counts = passes.trace(kernel, of_pass, Points("sobol", mi.UInt32(1)), count)
+    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1))
+    of_pass, counts = passes.trace(kernel, of_pass, render.aim, Points("sobol", mi.UInt32(1)), count)
     found = of_pass.photons.found
     arrays = [np.array(column) for column in vars(found).values()]
     return arrays, np.array(of_pass.photons.starts), counts.numpy()
@@ -709,7 +709,9 @@ def test_density_of_aimed_directions():
     uniform = mi.warp.square_to_uniform_sphere(square)
     for p in (mi.Point3f(0, 0, 0), mi.Point3f(2, 0.5, 0.2)):
         # In place of the emitter's own density none: the other half.
-        density = 2 * two._mixed(p, uniform, mi.Float(0)).numpy() * 4 * np.pi
+        si, no = SimpleNamespace(p=p), mi.Bool(False)
+        e = SimpleNamespace(si=si, d=uniform, pdf_second=mi.Float(0), infinite=no, beam=no, delta=no)
+        density = 2 * two.density(e).numpy() * 4 * np.pi
         _, d = two._sample(p, square)
         for f in (lambda d: np.ones(count), *(lambda d, i=i: d.numpy()[i] for i in range(3))):
             over, sampled = density * f(uniform), f(d)

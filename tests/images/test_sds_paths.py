@@ -77,7 +77,7 @@ def test_all_photons_of_a_disc_are_found():
     n, most = 4096, 5
     radius = Footprints((0.0, 0.0, 0.3), 0.0, 0.1, 0.2).radius(4.0)
     found = random_photons(n)
-    of_pass = merging.Merging(radius, mi.Float(n), mi.Float(1), None)
+    of_pass = merging.Merging(radius, mi.Float(n), mi.Float(1))
     of_pass.photons = passes.sort(of_pass, found, n)
     rng = np.random.default_rng(2)
     p, edges = rng.uniform(-3, 3, (2, n)), rng.integers(1, 4, n)

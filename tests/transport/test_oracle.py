@@ -781,7 +781,7 @@ def traced_photons(world: World, k_, merges, shared, monkeypatch):
         patch.setattr(subpaths, "begin_lane", lambda *_: (k_.points.stream(), shared))
         patch.setattr(dr, "while_loop", python_loop(world.k - 1))
         world.scene.begin(from_light=True)
-        return passes.trace(k_, merges, k_.points, world.n)[0]
+        return passes.trace(k_, merges, Unaimed(), k_.points, world.n)[0]
 
 
 def record_merges(world: World, monkeypatch):
@@ -792,8 +792,8 @@ def record_merges(world: World, monkeypatch):
     is_merged, merged = kind.is_merged, kind.merged
     world.merged = {}
 
-    def recorded_mask(self, kernel_, z, walk, stream):
-        mask[0] = is_merged(self, kernel_, z, walk, stream)
+    def recorded_mask(self, kernel_, z, stream):
+        mask[0] = is_merged(self, kernel_, z, stream)
         return mask[0]
 
     def recorded_merge(self, kernel_, z, *more):
@@ -901,7 +901,7 @@ def test_kernel_with_merges(name, classes, lens, least, monkeypatch):
         centre, angle, low, high, count = (0.2, -0.1, 0.3), 1e-3, 2.5e-4, 2e-3, 10.0 ** (3 + k / 2)
         radius = Radius(mi.Point3f(*centre), *(mi.Float(x) for x in (0.0, angle, low, high)))
         with monkeypatch.context() as patch:
-            merges = merging.Merging(radius, mi.Float(count), mi.Float(share), Unaimed())
+            merges = merging.Merging(radius, mi.Float(count), mi.Float(share))
             weights = kernel_weights(world, kappa, name, patch, merges)
         distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
         eta = share * count * np.pi * np.clip(angle * distance, low, high) ** 2
@@ -959,7 +959,7 @@ def test_strategies_agree_on_path_layers(kind, monkeypatch):
         world.path_layers = True
         if kind != "alone":
             radius = Radius(mi.Point3f(0.0), *(mi.Float(x) for x in (0.0, 1e-3, 2.5e-4, 2e-3)))
-            merges = Merging(radius, mi.Float(1e4), mi.Float(0.3), Unaimed())
+            merges = Merging(radius, mi.Float(1e4), mi.Float(0.3))
         with monkeypatch.context() as patch:
             kernel_weights(world, COEFFICIENTS["odd"], "balance", patch, merges)
         expected, paths = layers_of(world.paths), world.paths

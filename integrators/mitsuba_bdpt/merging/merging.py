@@ -1,24 +1,13 @@
-"""Vertex merging (photon mapping) of paths that merges dominate.
+"""Vertex merging (photon mapping) of paths that merges dominate; consistent, not unbiased.
 
-Source: Georgiev 2012, see `mis`. Both subpaths are traced up to the same vertex, whose event is not delta,
-and a photon within a radius of the camera vertex counts as if it were there. Paths are merged if merges
-sample them better than all other strategies together, see `mis`: SDS paths, and paths through lobes so narrow
-that connections rarely succeed. The weights need no flags of delta events. The estimate is consistent, not
-unbiased.
-
-Photons and camera vertices of other paths would cost time for nothing. Two bounds from one side leave out
-most, without bias:
+Source: Georgiev 2012, see `mis`. A photon within a radius of the camera vertex counts as if it were there.
+Two bounds from one side leave out most photons and camera vertices of other paths, without bias
+(docs/method/sds_paths.md, "Bounds"):
 
 * A merge needs B times the connections of both of its own edges, each of which one side knows.
-* Where it has little beside all older alternatives of its side, ``d_vc`` times the density ``pdf_rev_w`` of
-  the reverse direction, it has little of the weight. That density is known with the other side alone; on a
-  diffuse surface it is the cosine over pi, and elsewhere, or if the path has further merges, the path may be
-  merged all the same. So photons, photon subpaths and camera vertices play Russian roulette, with the ratio
-  to that of a diffuse surface. Where one side plays, the estimate of a merge is then at most 1 / SLACK times
+* Photons, photon subpaths and camera vertices play Russian roulette with the ratio of the merge to the older
+  alternatives of their side at a diffuse surface. The estimate of a merge is then at most 1 / SLACK times
   that at a diffuse surface: its density, and with it its BSDF, is as small as the probability.
-
-Photons may be aimed, but weights take the emitter's own density of first directions: weights may be any
-function of the path, and S and V then differ by densities that every strategy knows.
 """
 
 from __future__ import annotations
@@ -37,10 +26,9 @@ from ..transport import bsdf, mis, path_layers, spectra
 from ..transport.alternatives import newest_connection
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import Kernel
-from ..transport.photons.aim import Aim
-from ..transport.photons.photon import Photon, same_surface
+from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
-from ..transport.sds import PhotonStrategy, State, begun
+from ..transport.sds import PhotonStrategy, State
 from ..transport.walk import Vertex
 from .radius import Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
@@ -55,54 +43,51 @@ SLACK = 0.2
 # Index of the series of hashed numbers, of a camera vertex, that play this roulette; merges use the first.
 _OF_QUERIES = 3
 
-# Most distance of a merged photon from the tangent plane of the camera vertex, over the radius.
-_FLAT = 0.25
+# Most distance of a merged photon from the tangent plane of the camera vertex, over the radius; least cosine
+# between the geometric normals of both, which excludes edges and thin walls.
+_FLAT, _SAME_SURFACE = 0.25, 0.8
 
 
 @dataclass
-class Merging(PhotonStrategy):
-    """Vertex merging in one pass.
+class Merging(PhotonStrategy, PhotonPolicy):
+    """Vertex merging in one pass; stores photons at all vertices where merges may count.
 
     ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
-    coefficient of merges in all weights, see `coefficient`; ``aim`` of the photons, an `Aim`; ``photons``:
-    `Photons`, None while they are traced; ``wavelengths``: `WavelengthSets` in spectral variants, where
-    photons merge with camera subpaths of the same set. Numbers are opaque ``Float``.
+    coefficient of merges in all weights, see `coefficient`; ``photons``: `Photons`, None while they are
+    traced; ``wavelengths``: `WavelengthSets` in spectral variants, where photons merge with camera subpaths
+    of the same set. Numbers are opaque ``Float``.
     """
 
     radius: Radius
     count: mi.Float
     kappa: mi.Float
-    aim: Aim
     photons: Any = None
     wavelengths: WavelengthSets | None = None
 
     counters = ("merges",)
     merges = True
+    only_specular = 0.0
 
     def eta(self, p: mi.Point3f) -> mi.Float:
         """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
         return self.count * dr.pi * dr.square(self.radius.at(p))
 
-    def weighed(self, p: mi.Point3f) -> mi.Float:
-        """`eta` with its coefficient, as in weights."""
-        return self.kappa * self.eta(p)
-
-    def weighed_in(self, radius: mi.Float) -> mi.Float:
-        """The same in a disc of this ``radius``."""
-        return self.kappa * self.count * dr.pi * dr.square(radius)
+    def ratio(self, p):
+        return dr.minimum(self.kappa * self.eta(p), mis.SATURATION)
 
     def begin_light(self, kernel, walk):
-        return begun(walk, None, kernel.heuristic.zero(), kernel.heuristic.zero())
+        zero = kernel.heuristic.zero()
+        return replace(walk, partial=replace(walk.partial, d_vm=zero, d_vm_newest=zero))
 
     begin_camera = begin_light
 
-    def ratio(self, kernel, p):
-        return kernel.heuristic.start(self.weighed(p))
+    def begin(self, kernel, e, walk):
+        return replace(walk, sds=State(survived=mi.Float(1)))
 
     def survival(self, state, partial, p):
         # Whichever is larger, since it may go on to where pixels are larger.
-        eta = dr.maximum(self.weighed(p), self.weighed_in(self.radius.median))
-        survived = dr.minimum(state.survived, _probability(partial.d_vc, eta))
+        median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, dr.maximum(self.ratio(p), median)))
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: Kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
@@ -111,30 +96,39 @@ class Merging(PhotonStrategy):
         ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
         """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
-        return possible & mis.exceeds(self.weighed(vertex.si.p), connection)
+        return possible & mis.exceeds(self.ratio(vertex.si.p), connection)
 
     def kept(self, kernel: Kernel, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
-        return dr.minimum(_probability(d_vc, self.weighed(vertex.si.p)) / survived, 1)
+        return dr.minimum(_probability(d_vc, self.ratio(vertex.si.p)) / survived, 1)
 
-    def is_merged(self, kernel, z, walk, stream):
+    def stored(self, kernel, y, walk: Any, stream):
+        keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
+        probability = self.kept(kernel, y, walk.sds.survived)
+        u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
+        return keep & (u < probability), probability
+
+    def is_merged(self, kernel, z, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
         asks = self.may_merge(kernel, z, _rival(kernel, z))
-        return self.photons.exist & asks & (sequential(word)[0] < self.kept(kernel, z))
+        return asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-        drawn = sample(kernel, self, z, stream, wavelength_set)
+        drawn, path_layer = sample(kernel, self, z, stream, wavelength_set), None
         y, f = drawn.photon, drawn.f
         light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
         camera = z.partial, _rival(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
-        weight = mis.weigh_merge(h, self.ratio(kernel, z.si.p), light, camera, connections)
+        weight = mis.weigh_merge(h, self.ratio(z.si.p), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
+        if kernel.path_layers:
+            of_camera = path_layers.evaluated(z.layer, f, adjoint=False)
+            path_layer = path_layers.joined(of_camera, y.layer)
         c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")
-        return _with_layers(kernel, c, z, drawn)
+        return replace(c, light_group=kernel.light_group(y.emitter, active), path_layer=path_layer)
 
     def visit(self, kernel, z, walk, stream, shared, add, state):
         total, counters = state
@@ -146,37 +140,12 @@ class Merging(PhotonStrategy):
         # A separate branch: few lanes are on such a path.
         total, lost, merges = dr.if_stmt(
             (z, total, counters.non_finite, counters.merges),
-            self.is_merged(kernel, z, walk, stream),
+            self.is_merged(kernel, z, stream),
             merged,
             lambda z, total, lost, merges: (total, lost, merges),
             label="merges",
         )
         return total, replace(counters, non_finite=lost, merges=merges)
-
-
-class MergedPhotons(PhotonPolicy):
-    """Stores all vertices where merges may count."""
-
-    only_specular = 0.0
-
-    def __init__(self, merging: Merging):
-        self.sds = self._merging = merging
-
-    def last_edge(self, kernel):
-        return kernel.last_merged
-
-    def emission(self, e, aim):
-        return replace(e, pdf_second=e.pdf_second * aim), aim  # weights do not know of the aim
-
-    def begin(self, kernel, e, walk):
-        return replace(walk, sds=State(survived=mi.Float(1)))
-
-    def stored(self, kernel, y, walk: Any, stream):
-        merging, connection = self._merging, newest_connection(kernel, y, adjoint=True)
-        keep = merging.may_merge(kernel, y, kernel.heuristic.present(connection))
-        probability = merging.kept(kernel, y, walk.sds.survived)
-        u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
-        return keep & (u < probability), probability
 
 
 def _rival(kernel: Kernel, z: Vertex) -> mis.PartialSum:
@@ -185,10 +154,7 @@ def _rival(kernel: Kernel, z: Vertex) -> mis.PartialSum:
 
 
 def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:
-    """Probability with which a ``merge`` of this partial sum is sampled beside older alternatives ``d_vc``.
-
-    ``d_vc`` before the edge to it.
-    """
+    """Probability of sampling a ``merge`` of this partial sum; ``d_vc`` before the edge to it."""
     if mis.is_absent(d_vc):
         return mi.Float(1)
     return dr.minimum(SLACK * dr.pi * merge / (mis.MERGE_DOMINATED * d_vc), 1)
@@ -207,14 +173,12 @@ def coefficient(samples: float, radius: float) -> float:
 class Photons:
     """The photons of a pass, ``found`` (a `Photon` of arrays), sorted by bucket.
 
-    ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last;
-    ``exist``: there is one (opaque).
+    ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last.
     """
 
     found: Photon
     cell: mi.UInt64
     starts: mi.UInt32
-    exist: mi.Bool
 
 
 def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
@@ -281,15 +245,6 @@ def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, waveleng
     return Sample(photon, f, value, active & ~spectra.is_zero(value), total / size_of(photon.flux))
 
 
-def _with_layers(kernel: Kernel, c: Contribution, z: Vertex, drawn: Sample) -> Contribution:
-    """The contribution ``c`` of ``drawn`` with its light group and path layer, if there are such layers."""
-    photon, path_layer = drawn.photon, None
-    if kernel.path_layers:
-        of_camera = path_layers.evaluated(z.layer, drawn.f, adjoint=False)
-        path_layer = path_layers.joined(of_camera, photon.layer)
-    return replace(c, light_group=kernel.light_group(photon.emitter, c.active), path_layer=path_layer)
-
-
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
     """Draw a photon of at most ``most`` edges in the disc at ``z`` by flux; its index, total flux."""
@@ -333,4 +288,4 @@ def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
     # Each position may lie off its surface by the rounding error of its hit.
     beyond_rounding = dr.maximum(height - 2 * z.anchor.offset, 0)
     within = dr.squared_norm(off) - dr.square(height) + dr.square(beyond_rounding) < dr.square(r)
-    return within & (beyond_rounding < _FLAT * r) & same_surface(photon.n, z.si.n)
+    return within & (beyond_rounding < _FLAT * r) & (dr.dot(photon.n, z.si.n) > _SAME_SURFACE)

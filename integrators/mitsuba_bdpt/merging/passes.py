@@ -15,7 +15,7 @@ from ..transport.inputs import Kernel
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
-from .merging import BUCKET_BITS, MergedPhotons, Merging, Photons, bucket_of, cell_at, coefficient, level_of
+from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
 from .radius import Footprints, after
 from .wavelength_sets import SETS, WavelengthSets
 
@@ -80,7 +80,9 @@ class Passes:
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
         radius = after(self._radius, done + samples)  # in pixels
-        count = photons_of_pass(samples * self._pixels, self._pixels, radius)
+        # Discs of meters have no size on the film.
+        pixels = self._pixels if self._footprints.measured else math.inf
+        count = photons_of_pass(samples * self._pixels, pixels, radius)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)
@@ -89,20 +91,22 @@ class Passes:
         # Photons beyond those of the samples would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
-        merging = Merging(self._footprints.radius(radius), met, kappa, self._aim, wavelengths=wavelengths)
-        return trace(kernel, merging, points, count)
+        merging = Merging(self._footprints.radius(radius), met, kappa, wavelengths=wavelengths)
+        return trace(kernel, merging, self._aim, points, count)
 
 
-def photons_of_pass(samples: int, pixels: int, radius: float) -> int:
+def photons_of_pass(samples: int, pixels: float, radius: float) -> int:
     """Number of photon subpaths of a pass; ``samples`` of the whole film, ``radius`` in pixels."""
-    most = max(int(_PER_DISC * pixels / (math.pi * radius**2)), 64)
-    return min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most)
+    most = max(_PER_DISC * pixels / (math.pi * radius**2), 64)
+    return int(min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most))
 
 
-def trace(kernel: Kernel, merging: Merging, points: Points, count: int) -> tuple[Merging, mi.UInt64]:
+def trace(
+    kernel: Kernel, merging: Merging, aim: Aim, points: Points, count: int
+) -> tuple[Merging, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
-    kernel = kernel.replaced(sds=merging)
-    traced = photon_pass.trace(kernel, MergedPhotons(merging), merging.aim, points, count)
+    kernel = kernel.replaced(sds=merging, last_light=kernel.last_merged)
+    traced = photon_pass.trace(kernel, merging, aim, points, count)
     return replace(merging, photons=sort(merging, traced.photons, traced.count)), traced.counters
 
 
@@ -120,7 +124,6 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     starts = dr.cumsum(counts)
-    exist = dr.opaque(mi.Bool, count > 0)
-    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts, exist)
+    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
     dr.eval(result)
     return result

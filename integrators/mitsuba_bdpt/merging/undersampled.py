@@ -1,8 +1,6 @@
-"""Which light a render of few samples hardly ever finds, in scenes with near-specular lobes.
+"""Light of which a render expects few samples, in scenes with near-specular lobes.
 
-Connections sample paths through such lobes, but rarely. Photons and camera subpaths follow delta and
-near-specular events, and are merged at a path's only other vertex; the partial sums of the weights then tell
-how many samples of the path a render expects.
+See docs/method/near_specular.md, "Undersampled light".
 """
 
 from __future__ import annotations
@@ -21,8 +19,7 @@ from ..transport.walk import Vertex
 from .merging import Merging, Sample
 from .unsampled import Unsampled
 
-# Expected samples per pixel below which light is undersampled: nine of ten pixels have none of it, the others
-# at least ten times too much.
+# Expected samples per pixel below which light is undersampled.
 FEWEST = 0.1
 
 # Bounds of kinds of light by expected samples per pixel: none, undersampled, few (which a pilot takes for
@@ -51,9 +48,6 @@ class Undersampled(Unsampled):
         """Empty sums for a render of ``samples`` per pixel."""
         return Undersampled(dr.opaque(mi.Float, samples), dr.zeros(mi.Float64, len(KINDS)))
 
-    def emission(self, e, aim):
-        return super().emission(replace(e, pdf_second=e.pdf_second * aim), aim)  # the render has no aim
-
     def begin(self, kernel, e, walk):
         return super().begin(kernel, e, walk) if kernel.plan.guided else walk
 
@@ -64,10 +58,7 @@ class Undersampled(Unsampled):
         return has_lobe(kernel, z)
 
     def missing(self, kernel, merging, z, found, position):
-        """Adds the merge to the sums.
-
-        Only where the vertex is not near-specular itself: the path is merged there alone.
-        """
+        """Adds the merge to the sums, at the path's only vertex that is not near-specular."""
         expected = self.expected(kernel, merging, z, found)
         active = found.active & ~is_narrow(found.f)
         kind = mi.UInt32(0)
@@ -80,10 +71,8 @@ class Undersampled(Unsampled):
     def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
         """Expected number of samples per pixel of the merged path and its neighbours.
 
-        A connection of an edge at ``z`` succeeds if the other subpath arrives in the footprint at ``z`` of
-        the lobe at the edge's other end. Footprints of all strategies, times their samples per camera sample,
-        add up in the recursion of the weights (`mis`); times the density of photons at ``z`` (one over area)
-        they are the expected number per camera sample.
+        Area A of the footprints of all strategies at ``z``, from the partial sums of both subpaths, times the
+        density of light subpaths there (1 / area).
         """
         h, photon, f = kernel.heuristic, found.photon, found.f
         newest = newest_connection(kernel, z, adjoint=False)
@@ -97,10 +86,9 @@ class Undersampled(Unsampled):
 class Guidable(Undersampled):
     """Which merges are on paths that photons can guide.
 
-    Camera subpaths pass diffuse vertices too, as long as no edge is connectible (see `sds`), and merge where
-    s = 0 can be guided. ``guidable``: by tile of the film, ``tiles`` per direction, sums of `GUIDABLE` over
-    camera samples; where fewer than ``rarest`` samples are expected in a pixel, s = 0 counts as not finding
-    the light.
+    Camera subpaths go on as long as no edge is connectible, and merge where s = 0 can be guided.
+    ``guidable``: sums of `GUIDABLE` over camera samples by tile of the film, ``tiles`` per direction; with
+    fewer than ``rarest`` expected samples in a pixel s = 0 does not find the light.
     """
 
     rarest: mi.Float
@@ -111,7 +99,9 @@ class Guidable(Undersampled):
     def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
         """Empty sums for a render of ``samples`` per pixel."""
         sums = dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE))
-        return Guidable(*vars(Undersampled.of(samples)).values(), dr.opaque(mi.Float, rarest), tiles, sums)
+        return Guidable(
+            **vars(Undersampled.of(samples)), rarest=dr.opaque(mi.Float, rarest), tiles=tiles, guidable=sums
+        )
 
     def begin(self, kernel, e, walk):
         return replace(walk, active=walk.active & ~e.delta)  # s = 0 samples no others

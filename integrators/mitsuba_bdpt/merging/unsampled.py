@@ -1,10 +1,8 @@
-"""Light that no strategy in use samples, found by subpaths that follow delta events only.
+"""Estimate of the light that no strategy in use samples: SDS paths from emitters that no ray can hit.
 
-An SDS path (no edge is connectible, see `sds`) from an emitter that no ray can hit is not sampled. Here
-camera subpaths merge with photons at a path's only non-delta vertex, which samples it in one way: the weight
-is 1. In scenes with near-specular lobes they follow these too, see `undersampled`. Not included: paths with
-several non-delta vertices, on surfaces or in media, of which no two are neighbours; with light_paths=0 also
-those with neighbours.
+Camera subpaths merge with photons at a path's only non-delta vertex: one strategy, whose weight is 1. Not
+included: paths with several non-delta vertices, on surfaces or in media, of which no two are neighbours; with
+light_paths=0 also those with neighbours.
 """
 
 from __future__ import annotations
@@ -31,8 +29,7 @@ from .passes import sort
 from .radius import Footprints
 from .wavelength_sets import SETS, WavelengthSets
 
-# Merging radius in distances between camera samples (of a set of wavelengths) on the film: discs overlap, and
-# remain small relative to the image.
+# Merging radius in distances between camera samples (of a set of wavelengths) on the film.
 RADIUS = 1.5
 
 # Merging radius in pixels of `Footprints` where these cannot be measured: 1/64 of the scene's diagonal.
@@ -75,7 +72,7 @@ class Unsampled(PhotonPolicy):
         return is_sds_vertex(kernel, y, adjoint=True), 1.0
 
     def begin_camera(self, kernel: Kernel, walk: Walk, side: Side) -> tuple[Walk, Side]:
-        """A camera subpath on its first edge."""
+        """The camera subpath ``walk`` on its first edge."""
         return walk, replace(side, connect=None, only_specular=self.only_specular)
 
     def is_merged(self, kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
@@ -87,13 +84,6 @@ class Unsampled(PhotonPolicy):
         return found.active
 
 
-@dataclass
-class _Unmerged(PhotonStrategy):
-    """No strategy: weights know of no merges. Subpaths have these sets of wavelengths."""
-
-    wavelengths: WavelengthSets | None
-
-
 def estimate(
     kernel: Kernel,
     batch: Batch,
@@ -103,10 +93,7 @@ def estimate(
     aim: Aim,
     policy: Unsampled,
 ) -> Estimate:
-    """Merge the camera subpaths of a pilot's ``batch`` with ``count`` photon subpaths, which ``aim`` begins.
-
-    ``policy``: where, and which merges count.
-    """
+    """Merge the camera subpaths of ``batch`` with ``count`` photon subpaths."""
     sets, wavelengths = 1, None
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
@@ -114,8 +101,10 @@ def estimate(
     of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
     discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
     met = dr.opaque(mi.Float, count / sets)
-    merging = Merging(discs, met, mi.Float(1), aim, wavelengths=wavelengths)
-    kernel = kernel.replaced(sds=_Unmerged(wavelengths))
+    merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths)
+    unmerged = PhotonStrategy()  # weights know of no merges
+    unmerged.wavelengths = wavelengths
+    kernel = kernel.replaced(sds=unmerged, last_light=kernel.max_depth)
     traced = photon_pass.trace(kernel, policy, aim, photon_points, count)
     merging.photons = sort(merging, traced.photons, traced.count)
     found = _merged(kernel.bound(points), merging, batch, policy)

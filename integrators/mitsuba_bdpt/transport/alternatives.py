@@ -67,7 +67,7 @@ def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Co
     if not kernel.sds.merges:
         return found, 0
     rival = newest_coefficient(kernel, vertex, adjoint, beside_merges=True)
-    ratio = kernel.sds.ratio(kernel, vertex.si.p)
+    ratio = kernel.sds.ratio(vertex.si.p)
     return found, mis.merges(h, partial, rival, pdf_rev_w, pdf_a, own, ratio)
 
 

@@ -24,7 +24,7 @@ from .contribution import (
 from .inputs import Kernel
 from .light_path import LightPath, StoredVertex, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
-from .sds import meets
+from .sds import connects_sds_path
 from .vacuum import ShadowRay
 from .walk import Vertex
 
@@ -57,7 +57,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     camera_side, merges_z = side_of(kernel, z, False, *at_z, own)
     if kernel.sds.near_specular:
         newest_y, newest_z = newest_coefficient(kernel, y, True), newest_coefficient(kernel, z, False)
-        active &= ~meets((y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
+        active &= ~connects_sds_path(k, (y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
     sides = own, light_side, camera_side
     weight, shares = h.weigh(*sides, merges=h.combine(merges_y, merges_z))
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)

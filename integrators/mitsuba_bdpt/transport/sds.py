@@ -1,19 +1,8 @@
-"""Hooks of the strategies that sample SDS paths: vertex merging, and photon-guided BSDF sampling.
+"""The kernel's further strategy for SDS paths: vertex merging, or photon-guided BSDF sampling.
 
-An edge is *connectible* if a strategy in use connects its ends: neither end is a delta event, and the
-strategy's class has a coefficient (next-event estimation for the edge to the emitter, t = 1 for the edge to
-the sensor, inner connections for the others). An *SDS path* (specular-diffuse-specular) has no connectible
-edge: emitter, glass, wall, glass, camera. Of the classes of `Plan` only s = 0 and t = 0 sample it. The kernel
-has at most one further strategy for such paths, `Kernel.sds`; a walk carries its `State`, and it is called at
-fixed points. Vertex merging also samples paths that are connectible, but too rarely; which these are is
-decided by densities, see `mis`, without a `State`.
-
-In such scenes photon-guided BSDF sampling takes for specular every event that is delta or near-specular from
-both sides (`is_specular`), a function of the path on which all strategies agree. Unlike delta events, these
-could be connected. On SDS paths from emitters that rays can hit, but those of delta events alone and those of
-one vertex, all strategies but s = 0 and s = 1, guided or not, are left out: they rarely sample them, and need
-not know the guide's density. Of a path with diffuse events the last diffuse vertex guides, else all vertices
-that are not delta, but the last one.
+An edge is *connectible* if a strategy in use connects its ends; an *SDS path* (specular-diffuse-specular) has
+no connectible edge. See docs/method/sds_paths.md, and docs/method/near_specular.md for the paths that photons
+guide through near-specular events, on which all strategies but s = 0 and s = 1 are left out.
 """
 
 from __future__ import annotations
@@ -60,9 +49,8 @@ class State:
         """The state after the sampled ``step`` at ``vertex``; ``coefficient`` as in `scattered`."""
         only_delta = None if self.only_delta is None else self.only_delta & step.delta
         if self.specular is None:
-            isolated, guided = self.isolated, self.guided
-            if isolated is not None:
-                isolated = isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
+            isolated = self.isolated & (step.delta | ~mis.is_connectible(vertex.partial, coefficient))
+            guided = self.guided
             # Without advice it is kept as well: guided subpaths end at events that are not delta.
             if guided is not None and vertex.advice is not None:
                 guided = dr.select(step.delta, guided, heuristic.start(vertex.advice.ratio(step)))
@@ -85,29 +73,23 @@ class State:
         """Mask: a strategy connects the edge to the next vertex, whose event is ``specular``."""
         return ~(self.specular | specular) & mis.is_used(coefficient)
 
-    def ends(self, edges: mi.UInt32, coefficient: mis.Coefficient) -> mi.Bool:
-        """Mask: a guided path if the next vertex, after ``edges`` edges, is its end.
+    def is_sds_path(self, edges: mi.UInt32, coefficient: mis.Coefficient) -> mi.Bool:
+        """Mask: a path that ends at the next vertex, after ``edges`` edges, is a guided SDS path.
 
         ``coefficient`` of the class that connects the last edge.
         """
         possible = self.isolated & ~self.only_delta & (edges >= FEWEST_EDGES)
         return possible & ~self.is_connectible(False, coefficient)
 
-    def meets_end(self, edges: mi.UInt32, f) -> mi.Bool:
-        """Mask: a guided path if the next vertex, with BSDF ``f``, is connected to the end.
 
-        The strategy is in use, so that the path is no other that is guided.
-        """
-        return self.isolated & is_specular(f) & (edges + 1 >= FEWEST_EDGES)
+def connects_sds_path(edges: mi.UInt32, *ends: tuple) -> mi.Bool:
+    """Mask: the connection of a path of ``edges`` edges, by a strategy in use, makes a guided SDS path.
 
-
-def meets(a: tuple, b: tuple) -> mi.Bool:
-    """Mask: a guided path if two subpaths are connected, by a strategy in use.
-
-    Of each its `State`, BSDF at the vertex, and coefficient of the connection of the last edge.
+    ``ends`` that scatter: `State`, BSDF, and coefficient of the connection of the edge to the vertex (any for
+    a single one, which must be specular).
     """
-    possible, specular = mi.Bool(True), mi.Bool(False)
-    for state, f, coefficient in (a, b):
+    possible, specular = edges >= FEWEST_EDGES, mi.Bool(False)
+    for state, f, coefficient in ends:
         event = is_specular(f)
         possible, specular = possible & state.scattered(event, coefficient).isolated, specular | event
     return possible & specular
@@ -140,24 +122,24 @@ class PhotonStrategy:
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
     subpaths use, or None; ``merges``: it merges vertices, and `ratio` and `survival` are defined;
-    ``near_specular``: near-specular events count as specular, and `counts` is defined.
+    ``near_specular``: near-specular events count as specular.
     """
 
     counters: tuple[str, ...] = ()
-    wavelengths = None
+    wavelengths: Any = None
     merges = False
     near_specular = False
 
-    def ratio(self, kernel, p: mi.Point3f) -> mi.Float:
+    def ratio(self, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.scattered_merges`."""
-        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
+        raise NotImplementedError
 
     def survival(self, state: State, partial: mis.Partial, p: mi.Point3f) -> tuple[mi.Float, State]:
         """Probability with which a photon subpath goes on, and its new ``state``.
 
         ``partial`` after the event at ``p``.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not merge vertices")
+        raise NotImplementedError
 
     def begin_light(self, kernel, walk):
         """The light subpath ``walk`` with its `State`, on its first edge."""
@@ -171,10 +153,6 @@ class PhotonStrategy:
         """The guide at ``vertex``; ``walk`` as before its arrival, ``step`` from there."""
         return None
 
-    def guided(self, kernel, vertex) -> mis.PartialSum:
-        """Partial sum of guided s = 0 at ``vertex`` of a light subpath, see `mis.scattered_guided`."""
-        raise NotImplementedError(f"{type(self).__name__} does not guide")
-
     def visit(self, kernel, z, walk, stream, shared, add, state):
         """Contributions at the camera vertex ``z``.
 
@@ -183,29 +161,16 @@ class PhotonStrategy:
         """
         return state
 
-    def hit(self, kernel, z, connectible: mi.Bool, densities, sides, active: mi.Bool):
-        """Alternatives of s = 0 at the emitter point ``z``.
-
-        ``densities`` of emission (`Emitters.hit_densities`); ``sides``: light and camera side. Returns new
-        sides and mask.
-        """
-        return sides, active
-
     def counts(self, active: mi.Bool, on_sds_path: mi.Bool) -> mi.Bool:
         """Mask: contributions of s = 0 and s = 1 that count."""
-        raise NotImplementedError(f"{type(self).__name__} does not guide through near-specular events")
+        return active
 
 
-def begun_near_specular(walk, light: bool, guided: mi.Float | None = None, **more):
+def begun_near_specular(walk, light: bool, guided: mi.Float | None = None):
     """``walk`` with the `State` of a subpath along which near-specular events count as specular."""
     no, possible = mi.Bool(False), mi.Bool(True)
     if light:  # s = 0 is its only alternative so far
         possible = mis.is_used(walk.partial.d_vc)
     diffuse = None if guided is None else no
-    state = State(isolated=possible, only_delta=possible, specular=no, diffuse=diffuse)
-    return begun(walk, replace(state, guided=guided, newest=guided), **more)
-
-
-def begun(walk, state: State | None, d_vm: mis.PartialSum = 0, d_vm_newest: mis.PartialSum = 0):
-    """``walk`` with ``state``; ``d_vm``, ``d_vm_newest``: its partial sums of merges, 0 if there are none."""
-    return replace(walk, sds=state, partial=replace(walk.partial, d_vm=d_vm, d_vm_newest=d_vm_newest))
+    state = State(possible, possible, guided, specular=no, diffuse=diffuse, newest=guided)
+    return replace(walk, sds=state)

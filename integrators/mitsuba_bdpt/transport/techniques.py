@@ -21,7 +21,7 @@ from . import bsdf, mis, path_layers, spectra
 from .alternatives import merges_before_end, side_of, where_lit
 from .contribution import Contribution, Counters, one, roulette
 from .inputs import Kernel
-from .sds import PhotonStrategy
+from .sds import PhotonStrategy, connects_sds_path
 from .vacuum import ShadowRay
 from .walk import Vertex
 
@@ -58,13 +58,14 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
     )
     sides = 0, camera_side
     if sds.near_specular:
-        on_sds_path = z.sds.ends(z.edges, mis.choose(directly, kernel.kappa.endpoints, direct))
+        on_sds_path = z.sds.is_sds_path(z.edges, mis.choose(directly, kernel.kappa.endpoints, direct))
         alone = h.scale(z.partial.d_vcm, newest)
         sides = _beside_guided(kernel, z.sds.guided, on_sds_path, sides, alone, kernel.kappa.hit)
         active = sds.counts(active, on_sds_path)
-    else:
-        connectible = mis.is_connectible(z.partial, newest)
-        sides, active = sds.hit(kernel, z, connectible, (pdf_first, pdf_second), sides, active)
+    elif z.sds is not None and z.sds.guided is not None:
+        on_sds_path = ~mis.is_connectible(z.partial, newest) & (z.sds.guided > 0)
+        guided = h.scale(dr.select(on_sds_path, z.sds.guided, 0), kernel.kappa.hit)
+        sides, active = (0, h.combine(camera_side, guided)), sds.counts(active, on_sds_path)
     merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
     merges = mis.choose(z.edges <= kernel.last_merged, merges, 0)
     weight, shares = h.weigh(kernel.kappa.hit, *sides, merges=merges)
@@ -128,7 +129,7 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -
     merges = mis.choose(k <= kernel.last_merged, merges, 0)
     ends = light_side, mis.choose(k <= kernel.reach, camera_side, 0)
     if sds.near_specular:
-        on_sds_path = z.sds.meets_end(z.edges, f) & ~e.delta
+        on_sds_path = connects_sds_path(k, (z.sds, f, 0)) & ~e.delta
         guided = None if z.sds.guided is None else z.sds.guided_before_last(h)
         ends = _beside_guided(kernel, guided, on_sds_path, ends, light_side, kernel.kappa.direct)
         active = sds.counts(active, on_sds_path)
@@ -230,7 +231,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
         camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     if kernel.sds.near_specular:
-        active &= ~y.sds.meets_end(y.edges, f)
+        active &= ~connects_sds_path(y.edges + 1, (y.sds, f, 0))
     weight, shares = h.weigh(*sides, merges=merges)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
@@ -278,7 +279,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     rival = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_count)
     merged = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
     if kernel.sds.near_specular:
-        active &= ~walk.sds.ends(walk.edges, newest)
+        active &= ~walk.sds.is_sds_path(walk.edges, newest)
     elif walk.sds is not None:
         merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
         # The last edge is not connected either.

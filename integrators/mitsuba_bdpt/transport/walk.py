@@ -368,12 +368,12 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     state, strategy, h = walk.sds, side.sds, kernel.heuristic
     if strategy.merges:
         rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
-        ratio = strategy.ratio(kernel, vertex.si.p)
+        ratio = strategy.ratio(vertex.si.p)
         return state, mis.scattered_merges(h, vertex.partial, step, ratio, rival)
     if state is None:
         return None, (0, 0)
     state = state.after(h, vertex, coefficient, step)
     if mis.is_absent(vertex.partial.d_vm):
         return state, (0, 0)
-    guided = strategy.guided(kernel, vertex)
+    guided = h.scale(vertex.partial.d_vc, vertex.advice.other)
     return state, (mis.scattered_guided(h, vertex.partial, step, guided, state.isolated), 0)

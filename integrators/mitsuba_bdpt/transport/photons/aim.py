@@ -1,10 +1,8 @@
 """First directions of photon subpaths: half of them are aimed at specular surfaces.
 
-Most SDS paths begin with delta events, but an emitter's own density samples few directions towards a small
-shape of glass. Half of the first directions are uniform in cones about bounding spheres of the shapes with
-delta lobes (over all directions from within one); the density is that of the mixture. Light from infinity is
-not aimed: its emission disks cover details (`emitters.disks`). Uniform environments emit no photons: s = 0
-samples their light well. Light subpaths are not aimed, and weights do not know of the aim.
+They are uniform in cones about bounding spheres of the shapes with specular lobes (over all directions from
+within one). Light from infinity is not aimed: its emission disks cover details (`emitters.disks`). Uniform
+environments emit no photons: s = 0 samples their light well.
 """
 
 from __future__ import annotations
@@ -56,7 +54,7 @@ class Aim:
     def emission(self, emitters: Emitters, u_point, u_direction, shared) -> tuple[Emission, mi.Float]:
         """Sample emissions of photons; also the emitter's own density over the mixture's.
 
-        ``pdf_second`` of the emissions is the mixture's.
+        ``pdf_second`` of the emissions is the emitter's own: weights do not know of the aim.
         """
         number = None
         if self.spheres:
@@ -70,28 +68,24 @@ class Aim:
             e = _towards(emitters, e, d, aimed)
         mixed = self.density(e, number)
         ratio = dr.select(mixed == 0, 0, e.pdf_second / mixed)
-        return replace(e, weight=e.weight * ratio, pdf_second=mixed), ratio
+        return replace(e, weight=e.weight * ratio, pdf_second=mixed * ratio), ratio
 
     def density(self, e: Emission, number: mi.UInt32 | None = None) -> mi.Float:
         """Density of emitting a photon as ``e``, in the measure of its ``pdf_second``.
 
         ``number``: the sphere for which it was sampled, whose cone contains it in spite of rounding.
         """
-        mixed = dr.select(_aimable(e), self._mixed(e.si.p, e.d, e.pdf_second, number), e.pdf_second)
-        return dr.select(e.infinite & ~e.delta, 0, mixed) if self.no_sky else mixed
-
-    def _mixed(self, p, d, pdf_second, number=None):
-        if not self.spheres:
-            return pdf_second
-        aimed = mi.Float(0)
+        mixed, aimed = e.pdf_second, mi.Float(0)
         for i, sphere in enumerate(self.spheres):
-            axis, width = sphere.cone(p)
+            axis, width = sphere.cone(e.si.p)
             # 1 - cos of the angle between unit vectors, precise also where it is small.
-            inside = (width == 2) | (dr.squared_norm(d - axis) <= 2 * width)
+            inside = (width == 2) | (dr.squared_norm(e.d - axis) <= 2 * width)
             if number is not None:
                 inside |= number == i
             aimed += dr.select(inside, dr.inv_two_pi / width, 0)
-        return (pdf_second + aimed / len(self.spheres)) / 2
+        if self.spheres:
+            mixed = dr.select(_aimable(e), (mixed + aimed / len(self.spheres)) / 2, mixed)
+        return dr.select(e.infinite & ~e.delta, 0, mixed) if self.no_sky else mixed
 
     def _sample(self, p, u: mi.Point2f) -> tuple[mi.UInt32, mi.Vector3f]:
         """Sample a direction in one of the cones from ``p``; index of the sphere, direction."""
@@ -126,13 +120,7 @@ def _towards(emitters: Emitters, e: Emission, d, active: mi.Bool) -> Emission:
     density = e.pdf_first * pdf_second
     black = (density == 0) | ~emitters.traces(e.index, active)
     weight = dr.select(black, 0, radiance * (to.cos / density))
-    return replace(
-        e,
-        d=dr.select(active, d, e.d),
-        cos=dr.select(active, to.cos, e.cos),
-        pdf_second=dr.select(active, pdf_second, e.pdf_second),
-        weight=dr.select(active, weight, e.weight),
-    )
+    return dr.select(active, replace(to, pdf_second=pdf_second, weight=weight), e)
 
 
 def _specular_boxes(scene: mi.Scene, near_specular: Sequence[mi.BSDF]) -> list:

@@ -1,21 +1,10 @@
 """Photon-guided BSDF sampling: samples SDS paths by hitting an emitter (s = 0).
 
-Only s = 0 and t = 0 sample an SDS path from an emitter with area, and s = 0 only if a sampled direction
-happens to lead to the emitter by delta events. At the path's diffuse vertex z, the last whose event is not
-delta, a second direction is sampled from the density p_g of a `photon_guide.Guide` and followed through delta
-events only. All densities but those of the direction cancel::
-
-    guided s = 0 over s = 0 = p_g / p_bsdf
-
-The weights of both contain that ratio, and so does that of t = 0, which evaluates p_g at the same vertex: the
-first of the light subpath that is not delta.
-
-In scenes with near-specular lobes guided subpaths follow near-specular events too, and sample s = 1 as well:
-their lobes may be wider than the emitter is. Paths without a diffuse vertex are guided at each one whose
-event is not delta, see `sds`. The other strategies, t = 0 included, leave these paths out.
-
-Estimates times weights are f over a sum of densities, the same for all techniques of a path (with the balance
-heuristic). So guided subpaths carry the throughput and the weight of s = 0 by the BSDF.
+From a diffuse vertex a second direction is sampled from the density p_g of a `photon_guide.Guide` and
+followed through specular events only. All densities but those of the direction cancel: guided s = 0 over
+s = 0 is p_g / p_bsdf. Estimates times weights are f over a sum of densities, the same for all techniques of a
+path (with the balance heuristic), so that guided subpaths have the throughput and the weight of s = 0 by the
+BSDF. See docs/method/sds_paths.md and docs/method/near_specular.md.
 """
 
 from __future__ import annotations
@@ -34,7 +23,7 @@ from ..alternatives import is_sds_vertex, newest_coefficient
 from ..contribution import one
 from ..inputs import Kernel
 from ..near_specular import GUIDED
-from ..sds import Advice, PhotonStrategy, State, begun, begun_near_specular, is_specular
+from ..sds import Advice, PhotonStrategy, State, begun_near_specular, is_specular
 from ..walk import Side, Vertex, Walk, not_finite, random_walk
 from . import photon_guide
 
@@ -53,13 +42,13 @@ class Guiding(PhotonStrategy):
     def begin_light(self, kernel, walk):
         if self.near_specular:
             return begun_near_specular(walk, light=True)
-        state = State(isolated=mi.Bool(True), only_delta=mi.Bool(True))
-        return begun(walk, state, kernel.heuristic.zero())
+        partial = replace(walk.partial, d_vm=kernel.heuristic.zero())
+        return replace(walk, sds=State(mi.Bool(True), only_delta=mi.Bool(True)), partial=partial)
 
     def begin_camera(self, kernel, walk):
         if self.near_specular:
             return begun_near_specular(walk, light=False, guided=mi.Float(0))
-        return begun(walk, State(isolated=mi.Bool(True), guided=mi.Float(0)))
+        return replace(walk, sds=State(mi.Bool(True), guided=mi.Float(0)))
 
     def advise(self, kernel, adjoint, vertex, walk, step) -> Advice | None:
         """At a light vertex ``other`` is that of the direction that the subpath came from."""
@@ -85,10 +74,6 @@ class Guiding(PhotonStrategy):
         """Density of ``d`` by the guide, times the number of guided samples."""
         return kernel.plan.guided * photon_guide.density(self.guide, p, found, d)
 
-    def guided(self, kernel, vertex):
-        """By the density of the direction that the light subpath came from."""
-        return kernel.heuristic.scale(vertex.partial.d_vc, vertex.advice.other)
-
     def visit(self, kernel, z, walk, stream, shared, add, state):
         """Trace guided subpaths from ``z`` where the guide is active."""
         total, counters = state
@@ -101,16 +86,9 @@ class Guiding(PhotonStrategy):
         )
         return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
 
-    def counts(self, active, on_sds_path):
-        return active
-
-    def hit(self, kernel, z, connectible, densities, sides, active):
-        light_side, camera_side = sides
-        return (light_side, kernel.heuristic.combine(camera_side, _other(kernel, z, connectible))), active
-
 
 class _Guided(PhotonStrategy):
-    """The same at the end of a guided subpath, which counts on SDS paths alone."""
+    """The strategy of guided subpaths, which count on SDS paths alone."""
 
     def __init__(self, guiding: Guiding):
         self.guiding, self.near_specular = guiding, guiding.near_specular
@@ -123,10 +101,6 @@ class _Guided(PhotonStrategy):
 
     def counts(self, active, on_sds_path):
         return active & on_sds_path
-
-    def hit(self, kernel, z, connectible, densities, sides, active):
-        sides, active = self.guiding.hit(kernel, z, connectible, densities, sides, active)
-        return sides, active & ~connectible
 
 
 class Unguided(Guiding):
@@ -158,20 +132,6 @@ class Unguided(Guiding):
     def counts(self, active, on_sds_path):
         return active & ~on_sds_path
 
-    def hit(self, kernel, z, connectible, densities, sides, active):
-        return sides, active & (connectible | (z.sds.guided == 0))
-
-
-def _other(kernel: Kernel, z: Vertex, connectible: mi.Bool) -> mis.PartialSum:
-    """Ratio of the other density of the path to its own: s = 0 by the guide and by the BSDF."""
-    return kernel.heuristic.scale(dr.select(connectible, 0, z.sds.guided), kernel.kappa.hit)
-
-
-def _numbers(stream: Stream, event: mi.UInt32, number: mi.UInt32) -> Stream:
-    """Random numbers of guided subpath ``number`` at the vertex of ``event``."""
-    seed = sobol.mix(stream.seed ^ sobol.mix(_SEED + event) ^ number)
-    return Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED))
-
 
 @dr.syntax
 def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, shared, add, state):
@@ -181,7 +141,9 @@ def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, sha
         label="guided subpaths of a vertex",
         exclude=[kernel, guiding, z, stream, shared, add],
     ):
-        state = _follow_one(kernel, guiding, z, _numbers(stream, z.event, number), shared, add, state)
+        seed = sobol.mix(stream.seed ^ sobol.mix(_SEED + z.event) ^ number)
+        numbers = Stream(stream.digits, seed, sobol.mix(stream.key ^ _SEED))
+        state = _follow_one(kernel, guiding, z, numbers, shared, add, state)
         number += 1
     return state
 
@@ -191,10 +153,10 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     connects = near_specular and kernel.plan.direct
 
     def visit(vertex, state, walk):
-        total, lost, *rays = state
+        total, lost, traced = state
         if connects:
             c = techniques.next_event(kernel, vertex, numbers, guided)
-            (total, lost), rays = add(c, total, lost), [rays[0] + c.counted.shadow_s1]
+            (total, lost), traced = add(c, total, lost), traced + c.counted.shadow_s1
         total, lost = dr.if_stmt(
             (vertex, total, lost),
             techniques.sees_emitter(kernel, vertex) & (vertex.edges > first),
@@ -202,7 +164,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
             lambda v, total, lost: (total, lost),
             label="guided s = 0",
         )
-        return total, lost, *rays
+        return total, lost, traced
 
     total, lost, aimed, traced = state
     walk = _begun(kernel, guiding, z, numbers, shared)
@@ -218,9 +180,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         only_specular=GUIDED if near_specular else math.inf,
     )
     begun = walk.active
-    state = (total, lost, traced) if connects else (total, lost)
-    (total, lost, *rays), walk = random_walk(kernel, side, walk, visit, state)
-    traced = rays[0] if connects else traced
+    (total, lost, traced), walk = random_walk(kernel, side, walk, visit, (total, lost, traced))
     traced += dr.select(begun, walk.edges - first, 0)
     return total, lost + one(walk.broken), aimed + one(begun), traced
 
@@ -249,11 +209,11 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
     walk = Walk.begin(kernel, pi, ray, p, throughput, partial, active)
-    state = State(guided=ratio)
+    state = State(mi.Bool(True), guided=ratio)
     if guiding.near_specular:
         older = dr.select(specular, z.sds.guided_before_last(h), 0)
-        state = State(isolated=mi.Bool(True), only_delta=mi.Bool(False), specular=specular)
-        state = replace(state, diffuse=~specular, guided=older, newest=ratio)
+        state = replace(state, only_delta=mi.Bool(False), guided=older, newest=ratio)
+        state = replace(state, specular=specular, diffuse=~specular)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
     if kernel.path_layers:
         walk = replace(walk, layer=path_layers.evaluated(z.layer, f, adjoint=False))

@@ -1,4 +1,4 @@
-"""The record of a photon, and whether two points lie on one surface."""
+"""The record of a photon."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ from typing import Any, get_type_hints
 
 import drjit as dr
 import mitsuba as mi
-
-# Least cosine between geometric normals of two points of one surface: excludes edges and thin walls.
-SAME_SURFACE = 0.8
 
 
 @dataclass
@@ -61,8 +58,3 @@ class Photon:
     def _present(self) -> dict[str, Any]:
         """Its fields by name; Dr.Jit scatters no None."""
         return {name: values for name, values in vars(self).items() if values is not None}
-
-
-def same_surface(a: mi.Normal3f, b: mi.Normal3f):
-    """Mask: points with geometric normals ``a`` and ``b`` count as on one surface."""
-    return dr.dot(a, b) > SAME_SURFACE

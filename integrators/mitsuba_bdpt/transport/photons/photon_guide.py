@@ -1,10 +1,8 @@
 """The density of directions that photons define, for photon-guided BSDF sampling.
 
-After H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. The photons are the first
-non-delta vertices of light subpaths, sorted along a Morton (Z-order) curve. A query takes a window of photons
-about the point's place on the curve, dense near it and sparse farther off, so that some are near the point
-however few photons there are. Each photon of the window has a lobe about its direction; the density is the
-mean of the lobes. Photons are independent of the samples that use the density, so that guiding is unbiased.
+After H. W. Jensen, "Importance Driven Path Tracing Using the Photon Map", 1995. Photons are sorted along a
+Morton (Z-order) curve. A query takes a window of photons about the point's place on the curve, dense near it
+and sparse farther off; the density is the mean of their lobes (docs/method/sds_paths.md, "The density").
 """
 
 from __future__ import annotations
@@ -24,9 +22,9 @@ WINDOW = (*(-far for far in reversed(_FAR)), *range(-_NEAR, _NEAR), *_FAR)
 # Bits of each coordinate of a place on the curve, and of a subpath's index: 64 together.
 _BITS, _LANE_BITS = 15, 19
 
-# Lobe width (tangent of the half angle that contains half of its directions) over the photon's slope times
-# its distance from the point; least width; width from which on a photon has no lobe.
-_WIDTH, _LEAST, _MOST = 1.0, 1e-3, 0.5
+# Least lobe width (tangent of the half angle that contains half of its directions); width from which on a
+# photon has no lobe.
+_LEAST, _MOST = 1e-3, 0.5
 
 
 @dataclass
@@ -82,7 +80,7 @@ def _slopes(guide: Guide) -> mi.Float:
     first, second, third = mi.Float(dr.inf), mi.Float(dr.inf), mi.Float(dr.inf)
     k = mi.UInt32(0)
     while dr.hint(k < len(WINDOW), label="slopes of photons", exclude=[guide, index, own]):
-        other = photon(guide, index, k)
+        other = guide.photons.at(_number(guide, index, k))
         distance = dr.norm(other.p - own.p)
         slope = dr.select(distance > 0, dr.norm(other.d - own.d) / distance, dr.inf)
         first, slope = dr.minimum(first, slope), dr.maximum(first, slope)
@@ -130,22 +128,17 @@ def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
     return low
 
 
-def number(guide: Guide, found: mi.UInt32, k: mi.UInt32, active) -> mi.UInt32:
+def _number(guide: Guide, found: mi.UInt32, k: mi.UInt32) -> mi.UInt32:
     """Index of the ``k``-th photon of the window about index ``found``."""
-    index = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k, active)
+    index = mi.Int32(found) + dr.gather(mi.Int32, guide.offsets, k)
     return mi.UInt32(dr.clip(index, 0, mi.Int32(guide.count) - 1))
-
-
-def photon(guide: Guide, found: mi.UInt32, k: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
-    """The ``k``-th photon of the window about index ``found``."""
-    return guide.photons.at(number(guide, found, k, active), active)
 
 
 def _lobe(guide: Guide, p: mi.Point3f, found: mi.UInt32, k: mi.UInt32) -> tuple[mi.Vector3f, mi.Float]:
     """Axis of the ``k``-th photon's lobe at ``p``, and width^2 / 2 (0 without a lobe)."""
-    index = number(guide, found, k, True)
+    index = _number(guide, found, k)
     photon = guide.photons.at(index)
-    width = _WIDTH * dr.norm(photon.p - p) * dr.gather(mi.Float, guide.slope, index)
+    width = dr.norm(photon.p - p) * dr.gather(mi.Float, guide.slope, index)
     return photon.d, dr.square(dr.select(width < _MOST, dr.maximum(width, _LEAST), 0)) / 2
 
 

@@ -15,10 +15,9 @@ from ..alternatives import is_sds_vertex, newest_connection
 from ..contribution import Counters, one
 from ..inputs import Kernel
 from ..near_specular import GUIDED
-from ..sds import PhotonStrategy
+from ..sds import PhotonStrategy, begun_near_specular
 from ..walk import Vertex, Walk, random_walk
 from .aim import Aim
-from .guided_hits import Unguided
 from .photon import Photon
 from .photon_guide import Guide
 
@@ -38,15 +37,10 @@ def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
 class PhotonPolicy:
     """Which photon subpaths are followed, and which of their vertices are stored.
 
-    ``sds``: the strategy of their weights; ``only_specular``: see `Side`.
+    ``only_specular``: see `Side`.
     """
 
-    sds = PhotonStrategy()
     only_specular: float = math.inf
-
-    def last_edge(self, kernel: Kernel) -> mi.UInt32:
-        """Most edges of a subpath."""
-        return kernel.max_depth
 
     def emission(self, e: Emission, aim: mi.Float) -> tuple[Emission, mi.Float]:
         """The emission with which a subpath begins, and `Photon.aim`, given what `Aim` sampled."""
@@ -58,15 +52,17 @@ class PhotonPolicy:
 
     def stored(self, kernel: Kernel, y: Vertex, walk: Walk, stream: Stream) -> tuple:
         """Mask: ``y`` is stored; the probability of that. ``walk`` as before its arrival."""
-        raise NotImplementedError(f"{type(self).__name__} stores no vertices")
+        raise NotImplementedError
 
 
 class GuidePhotons(PhotonPolicy):
     """Stores the first vertex of a non-specular event, if s = 0 can sample the path through it."""
 
     def __init__(self, near_specular: bool):
-        if near_specular:
-            self.sds, self.only_specular = Unguided(near_specular=True), GUIDED
+        self.only_specular = GUIDED if near_specular else math.inf
+
+    def begin(self, kernel, e, walk):
+        return begun_near_specular(walk, light=True) if kernel.near_specular else walk
 
     def stored(self, kernel, y, walk, stream):
         keep = is_sds_vertex(kernel, y, adjoint=True)
@@ -87,17 +83,15 @@ class Traced:
 
 
 def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
-    """Trace ``count`` photon subpaths; returns their guide and counters.
-
-    The guide is None without photons. ``aim`` samples first directions.
-    """
+    """Trace ``count`` photon subpaths; returns their guide (None without photons) and counters."""
+    kernel = kernel.replaced(sds=PhotonStrategy(), last_light=kernel.max_depth)
     traced = trace(kernel, GuidePhotons(kernel.near_specular), aim, points, count)
     return Guide.of(traced.photons, traced.count) if traced.count else None, traced.counters
 
 
 def trace(kernel: Kernel, policy: PhotonPolicy, aim: Aim, points: Points, count: int) -> Traced:
-    """Trace ``count`` photon subpaths; ``kernel.sds`` is the strategy that uses them."""
-    kernel = kernel.bound(points).replaced(last_light=policy.last_edge(kernel))
+    """Trace ``count`` photon subpaths of up to ``kernel.last_light`` edges; ``kernel.sds`` in weights."""
+    kernel = kernel.bound(points)
     capacity = max(int(count * _CAPACITY), 1)
     while True:
         traced = _traced(kernel, policy, aim, count, Photon.zeros(capacity, kernel.path_layers))
@@ -114,7 +108,7 @@ def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Pho
     u_point = kernel.points.draw_2d("light", stream, Purpose.EMISSION_POINT)
     u_direction = kernel.points.draw_2d("light", stream, Purpose.EMISSION_DIRECTION)
     e, aimed = policy.emission(*aim.emission(kernel.emitters, u_point, u_direction, shared))
-    walk, side = subpaths.light_subpath(kernel, e, stream, shared, policy.sds)
+    walk, side = subpaths.light_subpath(kernel, e, stream, shared, kernel.sds)
     begun = policy.begin(kernel, e, walk)
     side = replace(side, connect=None, only_specular=policy.only_specular)
     present = kernel.heuristic.present
