@@ -251,18 +251,6 @@ def test_a_lens_and_a_point_lamp():
     st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
 
 
-def test_paths_longer_than_stored():
-    """Rationale: t = 0 makes no path of more than ``stored_vertices`` edges, merging does. Expected: with 1
-    the same tiles as without merging and limits.
-    """
-    scene = under_glass(ball(), kind="thinlens")
-    scene["sensor"] |= {"aperture_radius": 0.8}
-    scene = mi.load_dict(scene)
-    a = images(scene, 256, 8, merging=True, merging_radius=0.5, skip="none", stored_vertices=1)
-    b = images(scene, 256, 8, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
-
-
 def test_power_heuristic():
     """Expected: the same tiles as with the balance heuristic without merging."""
     a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic="power")
@@ -345,17 +333,6 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
 
 
 # -- what merging leaves alone ----------------------------------------------------------------------------
-
-
-def test_other_paths_are_what_they_were():
-    """Rationale: paths that some strategy joins weigh what they weighed. Expected: without glass the image is
-    that of the same seed without merging, to the rounding of sums; a mirror out of sight is there, so that
-    photons are looked for.
-    """
-    mirror = {"type": "sphere", "center": [0, 0, 9], "radius": 0.1, "bsdf": {"type": "conductor"}}
-    scene = mi.load_dict(under_glass(ball(), plate=matte(0.3), mirror=mirror))
-    a, b = (images(scene, 16, 1, merging=merges) for merges in (True, False))
-    np.testing.assert_allclose(a, b, **ROUNDING)
 
 
 def test_nothing_leaks_through_a_thin_wall():
