@@ -1,25 +1,23 @@
 """Proxy vertices: approximate the size of an inner connection without its BSDFs.
 
 A lane that stores the vertices of several light subpaths draws one of them for each camera vertex
-(`connections`). Evaluating both BSDFs of every candidate would cost the gain, so candidates are weighed by an
-approximation of the weighted contribution (eqs. 37, 40, 41),
+(`connections`) by an approximation of the weighted contribution (eqs. 37, 40, 41),
 
     f_z f_y cos_z cos_y / d^2 / (kappa + others_y p_z cos_y / d^2 + others_z p_y cos_z / d^2),
 
 with diffuse BSDFs as bright as the true one towards the normal, and for glossy BSDFs a lobe about the mirror
-direction, as wide as its density there implies (GGX: B. Walter et al. 2007, eq. 33). The estimate divides the
-drawn contribution by its probability and is unbiased for any approximation.
+direction, as wide as its density there implies (GGX: B. Walter et al. 2007, eq. 33).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
-from . import bsdf, scattering, spectra
+from . import scattering, spectra
 
 # Factor of an approximation on a side to which the BSDF does not scatter: shading normals and bumps may.
 WRONG_SIDE = 0.0002
@@ -95,7 +93,8 @@ class ProxyVertex:
         density, diffuse_pdf, lobe = partial.d_vc * vertex.cos, mi.Float(1), None
         if alone:
             up = mi.Vector3f(0, 0, dr.sign(si.wi.z))
-            size = _brightness(vertex, scattering.evaluate(kernel, vertex, up, active, reverse=False)) * dr.pi
+            f = scattering.evaluate(kernel, vertex, up, active, reverse=False)
+            size = _brightness(vertex, f.value) * dr.pi
         if kernel.traits.glossy:
             size, diffuse_pdf, peak, pdf, width2 = dr.if_stmt(
                 (size,),
@@ -103,14 +102,12 @@ class ProxyVertex:
                 lambda size: _fitted(kernel, vertex, active),
                 lambda size: (size, mi.Float(1), mi.Float(0), mi.Float(0), mi.Float(2)),
             )
-            shading = mi.Vector3f(si.sh_frame.n)
-            lobe = Lobe(wi, shading, diffuse_pdf, peak, pdf, width2, density * pdf)
+            lobe = Lobe(wi, mi.Vector3f(si.sh_frame.n), diffuse_pdf, peak, pdf, width2, density * pdf)
         size = dr.maximum(size, _LEAST_SIZE if alone else 0)
         behind = dr.select(mi.has_flag(flags, mi.BSDFFlags.Transmission), 1, mi.Float(WRONG_SIDE))
         others = partial.d_vcm * coefficient + density * (diffuse_pdf * dr.inv_pi)
-        return ProxyVertex(
-            mi.Point3f(si.p), Diffuse(dr.mulsign(n, dr.dot(n, wi)), size, behind, others), lobe
-        )
+        diffuse = Diffuse(dr.mulsign(n, dr.dot(n, wi)), size, behind, others)
+        return ProxyVertex(mi.Point3f(si.p), diffuse, lobe)
 
     def towards(self, d: mi.Vector3f) -> tuple:
         """For direction ``d``: brightness times cosine, density, ``others``, and cosine."""
@@ -119,12 +116,7 @@ class ProxyVertex:
         part = cos * dr.inv_pi
         found = part * self.diffuse.size, part, self.diffuse.others
         if (lobe := self.lobe) is not None:
-            found = dr.if_stmt(
-                found,
-                lobe.width2 <= 1,
-                lambda *diffuse: lobe.added(d, cos, *diffuse),
-                lambda *diffuse: diffuse,
-            )
+            found = dr.if_stmt(found, lobe.width2 <= 1, partial(lobe.added, d, cos), lambda *diffuse: diffuse)
         bright, pdf_w, others = found
         bright *= dr.select(signed > 0, 1, self.diffuse.behind)
         return bright, pdf_w, others, mi.Float(cos)
@@ -160,21 +152,16 @@ def _fitted(kernel, vertex, active: mi.Bool) -> tuple:
     pdf_w = dr.maximum(mirror.pdf_fwd_w, _LEAST_PDF)
     width2 = dr.clip(1 / (4 * dr.pi * pdf_w * dr.maximum(dr.abs(wi.z), _LEAST_Z)), _NARROW, 1)
     shape = _shape(dr.square(1 + dr.abs(wi.z)) / dr.squared_norm(wi + up), width2)
-    diffuse = replace(f, value=dr.maximum(_intensity(f) - _intensity(mirror) * shape, 0))
+    towards_normal, towards_mirror = (mi.unpolarized_spectrum(e.value) for e in (f, mirror))
     return (
-        _brightness(vertex, diffuse) * dr.pi,
+        _brightness(vertex, dr.maximum(towards_normal - towards_mirror * shape, 0)) * dr.pi,
         dr.maximum(f.pdf_fwd_w - mirror.pdf_fwd_w * shape, 0) * dr.pi,
-        _brightness(vertex, mirror),
+        _brightness(vertex, mirror.value),
         mi.Float(mirror.pdf_fwd_w),
         width2,
     )
 
 
-def _intensity(f: bsdf.Evaluation) -> mi.UnpolarizedSpectrum:
-    """Value for unpolarized light."""
-    return mi.unpolarized_spectrum(f.value)
-
-
-def _brightness(vertex, f: bsdf.Evaluation):
-    """Size of unpolarized light that reaches ``vertex`` and is scattered by ``f``."""
-    return spectra.brightest(mi.unpolarized_spectrum(vertex.throughput) * _intensity(f))
+def _brightness(vertex, value: mi.Spectrum):
+    """Size of unpolarized light that reaches ``vertex`` and is scattered with the BSDF ``value``."""
+    return spectra.brightest(mi.unpolarized_spectrum(vertex.throughput) * mi.unpolarized_spectrum(value))
