@@ -991,8 +991,8 @@ MUTANTS = (
     Mutant(
         "media: thinned vertices stand for themselves only",
         "transport/light_path.py",
-        "y.throughput_over_cos / probability",
-        "y.throughput_over_cos",
+        "throughput, keep = throughput / probability, keep & kept",
+        "keep &= kept",
         ("tests/images/test_media.py::test_thinned_light_subpaths",),
     ),
     Mutant(
@@ -1457,8 +1457,8 @@ MUTANTS = (
     Mutant(
         "merging: stored vertices lose the newest merge",
         "transport/light_path.py",
-        "**vars(y.partial),",
-        "**vars(replace(y.partial, d_vm_newest=mi.Float(0))),",
+        "**vars(vertex.partial),",
+        "**vars(replace(vertex.partial, d_vm_newest=mi.Float(0))),",
         ("tests/images/test_near_specular_merging.py::test_stored_vertices_keep_their_merges",),
     ),
     Mutant(

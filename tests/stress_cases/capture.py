@@ -29,7 +29,6 @@ from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer
-from mitsuba_bdpt.transport.light_path import StoredVertex
 
 from instruments.endpoints import Camera, disks_of, dot, lamps_of, length2
 from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
@@ -277,7 +276,7 @@ class Capture(Observer):
 
     def _inner(self, s, t):
         y, z = self.walked["light"].vertices[s - 2], self.walked["camera"].vertices[t - 2]
-        c = connections.inner(self.kernel, z, StoredVertex.of(y))
+        c = connections.inner(self.kernel, z, y)
         c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
         ray = rays.segment(z.anchor, y.anchor, z.si)
         c.active &= ~rays.occluded(self.scene, ray, c.active)

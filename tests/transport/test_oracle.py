@@ -735,11 +735,7 @@ def kernel_weights(
         (connections.inner, lambda z, y: (edges(y) + 1, edges(y) + edges(z) + 1)),
     ):
         monkeypatch.setattr(sys.modules[function.__module__], function.__name__, record(function, edges_of))
-    monkeypatch.setattr(
-        light_path,
-        "store_light_vertex",
-        lambda kernel_, y, path: stored.append(light_path.StoredVertex.of(y)),
-    )
+    monkeypatch.setattr(light_path, "store_light_vertex", lambda kernel_, y, path: stored.append(y))
     monkeypatch.setattr(connections, "connect_all", connect_all)
     monkeypatch.setattr(techniques, "sees_emitter", lambda kernel_, z: z.active)
     monkeypatch.setattr(dr, "if_stmt", lambda state, mask, then, other, **_: then(*state))

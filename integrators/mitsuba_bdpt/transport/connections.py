@@ -22,14 +22,14 @@ from .contribution import (
     size_of,
 )
 from .inputs import Kernel
-from .light_path import LightPath, StoredVertex, read_light_vertex, read_proxy
+from .light_path import LightPath, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
 from .sds import connects_sds_path
 from .vacuum import ShadowRay
-from .walk import Vertex
+from .walk import PathVertex, Vertex
 
 
-def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
+def inner(kernel: Kernel, z: Vertex, y: PathVertex) -> Contribution:
     """s, t >= 2: connect two vertices, before visibility (eqs. 40, 41).
 
     ``active`` where the contribution is nonzero. Throughputs contain the edges to the vertices; that of ``y``
@@ -47,7 +47,7 @@ def inner(kernel: Kernel, z: Vertex, y: StoredVertex) -> Contribution:
     cos_z, cos_y = z.cosine(d), y.cosine(d)
     f_z = scattering.evaluate(kernel, z, wo_z, active)
     f_y = scattering.evaluate(kernel, y, wo_y, active, cos_y)
-    value = (z.throughput * f_z.value) * (f_y.value * y.throughput_over_cos) * inverse
+    value = (z.throughput * f_z.value) * (f_y.value * (y.throughput / y.cos)) * inverse
     active &= ~spectra.is_zero(value)
 
     own = kernel.kappa.inner
@@ -236,7 +236,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     return _Drawn(value, size_of(value), end, left, counted, c.layers)
 
 
-def _as_drawn(kernel: Kernel, z: Vertex, y: StoredVertex, c: Contribution) -> Contribution:
+def _as_drawn(kernel: Kernel, z: Vertex, y: PathVertex, c: Contribution) -> Contribution:
     """The connection ``c`` as drawn: in media with an approximate transmittance."""
     return replace(c, value=c.value * kernel.space.guessed(z, y.si.p - z.si.p))
 
@@ -246,7 +246,7 @@ def _seen(kernel: Kernel, z: Vertex, c: Contribution, ray: mi.Ray3f, own, stream
     return kernel.space.seen(kernel, replace(c, shadow_ray=ShadowRay(ray, stream, z, ray.d, number, own)))
 
 
-def _shadow_ray(kernel: Kernel, z: Vertex, y: StoredVertex) -> tuple[mi.Ray3f, rays.Own | None]:
+def _shadow_ray(kernel: Kernel, z: Vertex, y: PathVertex) -> tuple[mi.Ray3f, rays.Own | None]:
     """Shadow ray from ``z`` to the light vertex ``y``, see `rays.shadow_ray`."""
     met = rounding.met(y.si.shape, y.si.instance)
     return rays.shadow_ray(kernel.shape_errors, z.anchor, y.anchor, met, z.si)

@@ -15,57 +15,7 @@ from .contribution import one
 from .inputs import KEPT, Kernel
 from .proxy_vertices import Diffuse, Lobe, ProxyVertex
 from .sds import State
-from .walk import Vertex, volume_cosine
-
-# Entries of local memory that only draws by approximation read.
-PROXY = "proxy", "lobe"
-
-
-@dataclass
-class StoredVertex:
-    """A light vertex y_{s-1}, s >= 2, for inner connections.
-
-    ``throughput_over_cos``: f cos / pdf of all events before this vertex, including the edge to it, over the
-    geometric cosine of incidence |n.wi|, the constant part of the adjoint factor |n.wo| / |n.wi| (in volumes
-    both are 1); ``partial``: partial sums in the area measure; ``edges`` up to it, s - 1; ``anchor``: starts
-    rays; ``medium``: index of its medium, 0 on surfaces, None in scenes without media; ``light_group``: see
-    `Contribution`; ``layer``: see `Vertex`, None where connections do not need it; ``sds``: see `Vertex`.
-    """
-
-    si: mi.SurfaceInteraction3f
-    bsdf: mi.BSDFPtr
-    anchor: rays.Anchor
-    throughput_over_cos: mi.Spectrum
-    partial: mis.Partial
-    edges: mi.UInt32
-    medium: mi.UInt32 | None = None
-    light_group: mi.UInt32 | None = None
-    layer: mi.UInt32 | None = None
-    sds: Any = None  # a `State`
-
-    @property
-    def volume(self) -> mi.Bool:
-        """Mask: in a medium."""
-        return mi.Bool(False) if self.medium is None else self.medium != 0
-
-    def cosine(self, d: mi.Vector3f) -> mi.Float:
-        """Absolute geometric cosine of ``d``, 1 in volumes."""
-        return volume_cosine(self.si, d, self.volume)
-
-    @staticmethod
-    def of(vertex: Vertex) -> StoredVertex:
-        """The stored form of a ``vertex`` of a light subpath."""
-        return StoredVertex(
-            si=vertex.si,
-            bsdf=vertex.bsdf,
-            anchor=vertex.anchor,
-            throughput_over_cos=mi.Spectrum(vertex.throughput / vertex.cos),
-            partial=vertex.partial,
-            edges=vertex.edges,
-            medium=None if vertex.edge is None else dr.select(vertex.volume, vertex.edge.medium, 0),
-            layer=vertex.layer,
-            sds=vertex.sds,
-        )
+from .walk import PathVertex, Vertex
 
 
 @dataclass
@@ -106,11 +56,12 @@ class Thinning:
 
 @dataclass
 class LightPath:
-    """The `StoredVertex` objects of a lane's light subpath in local memory.
+    """Vertices y_{s-1}, s >= 2, of a lane's light subpath in local memory.
 
-    ``entries``: fields that do not follow from others, by name: of anchors offset and curvature
-    (``rounding``), of ``sds`` bits; with several light subpaths also proxies. ``count``: of stored vertices;
-    ``light_group`` (see `Contribution`) of the newest subpath; ``thinning``: in scenes with media.
+    ``entries``: what does not follow from others, by name: of throughputs f cos / pdf over |n.wi|, the
+    constant part of the adjoint factor |n.wo| / |n.wi|; of anchors offset and curvature (``rounding``); of
+    ``sds`` bits; ``medium``: 0 on surfaces; with several light subpaths also proxies. ``count``: of stored
+    vertices; ``light_group`` (see `Contribution`) of the newest subpath; ``thinning``: in scenes with media.
     """
 
     entries: dict[str, dr.Local]
@@ -155,21 +106,24 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
 def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     """Store a light vertex if inner connections can use it."""
     keep = vertex.hit & (vertex.edges + 2 <= kernel.reach) & vertex.connectible()
-    y, slot = StoredVertex.of(vertex), path.count
-    if path.thinning is not None:
-        y, slot, keep = _thinned(path, y, keep)
+    throughput, slot = mi.Spectrum(vertex.throughput / vertex.cos), path.count
+    if (thinning := path.thinning) is not None:
+        slot, kept, probability = thinning.place(thinning.tried)
+        path.thinning = replace(thinning, tried=thinning.tried + dr.select(keep, mi.UInt32(1), 0))
+        throughput, keep = throughput / probability, keep & kept
     entries = {
-        "si": y.si,
-        **vars(y.partial),
-        "rounding": mi.Vector2f(y.anchor.offset, y.anchor.curvature),
-        "edges": y.edges,
-        "medium": y.medium,
+        "si": vertex.si,
+        **vars(vertex.partial),
+        "rounding": mi.Vector2f(vertex.anchor.offset, vertex.anchor.curvature),
+        "edges": vertex.edges,
         "light_group": path.light_group,
-        "layer": y.layer,
-        **{f"stokes_{i}": value for i, value in enumerate(polarization.stokes(y.throughput_over_cos))},
+        "layer": vertex.layer,
+        **{f"stokes_{i}": value for i, value in enumerate(polarization.stokes(throughput))},
     }
+    if kernel.has_media:
+        entries["medium"] = dr.select(vertex.volume, vertex.medium, 0)
     if kernel.sds.near_specular:
-        entries["flags"] = one(y.sds.isolated) + 2 * one(y.sds.specular)
+        entries["flags"] = one(vertex.sds.isolated) + 2 * one(vertex.sds.specular)
     if path.guesses:
         newest = newest_coefficient(kernel, vertex, adjoint=True)
         proxy = ProxyVertex.of(kernel, vertex, newest, keep, alone=True)
@@ -179,29 +133,23 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     path.count = path.count + dr.select(keep, mi.UInt32(1), mi.UInt32(0))
 
 
-def _thinned(path: LightPath, y: StoredVertex, keep):
-    """``y`` reweighted, its slot, and whether it is kept; counts it as tried."""
-    thinning = path.thinning
-    place, kept, probability = thinning.place(thinning.tried)
-    path.thinning = replace(thinning, tried=thinning.tried + dr.select(keep, mi.UInt32(1), 0))
-    return replace(y, throughput_over_cos=y.throughput_over_cos / probability), place, keep & kept
-
-
 def read_light_vertex(
     kernel: Kernel, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
-) -> StoredVertex:
+) -> PathVertex:
     """Stored vertex ``slot``; zeros where not ``active``, since slots may be unset."""
-    e = {name: path.entries[name].read(slot, active) for name in path.entries if name not in PROXY}
-    si, rounding, flags = e["si"], e["rounding"], e.get("flags")
+    e = {name: local.read(slot, active) for name, local in path.entries.items()}
+    si, rounding, medium, flags = e["si"], e["rounding"], e.get("medium"), e.get("flags")
     curvature = rounding.y if kernel.shape_errors.any else mi.Float(0)
-    return StoredVertex(
+    return PathVertex(
         si=si,
         bsdf=si.bsdf(),
+        cos=mi.Float(1),
         anchor=rays.Anchor(si.p, si.n, rounding.x, curvature),
-        throughput_over_cos=polarization.of_stokes([e[name] for name in e if name.startswith("stokes")]),
+        throughput=polarization.of_stokes([e[name] for name in e if name.startswith("stokes")]),
         partial=mis.Partial(**{name: e[name] for name in e if name.startswith("d_")}),
         edges=e["edges"],
-        medium=e.get("medium"),
+        volume=mi.Bool(False) if medium is None else medium != 0,
+        medium=medium,
         light_group=e.get("light_group", path.light_group),
         layer=e.get("layer"),
         sds=flags if flags is None else State(isolated=(flags & 1) != 0, specular=(flags & 2) != 0),

@@ -97,15 +97,14 @@ class Walk:
         return counters + Counters(segments=rays, collisions=collisions)
 
 
-@dataclass
-class Vertex:
-    """A vertex that a walk has reached.
+@dataclass(kw_only=True)
+class PathVertex:
+    """A vertex that an inner connection may use, reached by a walk or stored.
 
-    ``partial``: in the area measure (camera subpaths that left the scene: solid angle); ``cos``: absolute
-    geometric cosine of the edge to it; ``anchor``: starts rays; ``hit``: false in the environment;
-    ``endpoint`` of its connection and the BSDF ``f`` towards it (a `bsdf.Evaluation`), where
-    ``endpoint_active``, see `Side`; ``event``: index of its random numbers; ``volume``, ``edge``: see
-    `vacuum.Arrival`; ``layer`` and ``sds``: those of `Walk` on arrival.
+    ``cos``: absolute geometric cosine of the edge to it (1 in a ``volume``); ``anchor``: starts rays;
+    ``partial``: in the area measure (camera subpaths that left the scene: solid angle); ``medium``: index of
+    that of the edge, None without media; ``light_group``: see `Contribution`; ``layer`` and ``sds``: those of
+    `Walk` on arrival.
     """
 
     si: mi.SurfaceInteraction3f
@@ -115,25 +114,11 @@ class Vertex:
     throughput: mi.Spectrum
     partial: mis.Partial
     edges: mi.UInt32
-    previous: mi.Point3f
-    seen: mi.Bool
-    hit: mi.Bool
-    active: mi.Bool
-    event: mi.UInt32
     volume: mi.Bool
-    edge: Any = None
-    # Set with a `Side.connect`.
-    endpoint: Any = None  # a `Direct`, or a `CameraConnection`
-    endpoint_active: Any = None
-    f: Any = None  # a `bsdf.Evaluation`
-    advice: Any = None  # an `sds.Advice`, with guiding
+    medium: mi.UInt32 | None = None
+    light_group: mi.UInt32 | None = None
     layer: mi.UInt32 | None = None
     sds: Any = None  # an `sds.State`
-
-    @property
-    def medium(self) -> mi.UInt32:
-        """Index of the medium of its incident edge."""
-        return self.edge.medium
 
     def cosine(self, d: mi.Vector3f) -> mi.Float:
         """Absolute geometric cosine of ``d``, 1 in volumes."""
@@ -142,6 +127,28 @@ class Vertex:
     def connectible(self):
         """Mask: its distribution of directions is not purely delta."""
         return bsdf.connectible(self.bsdf) | self.volume
+
+
+@dataclass(kw_only=True)
+class Vertex(PathVertex):
+    """A vertex that a walk has reached.
+
+    ``hit``: false in the environment; ``endpoint`` of its connection and the BSDF ``f`` towards it (a
+    `bsdf.Evaluation`), where ``endpoint_active``, see `Side`; ``event``: index of its random numbers;
+    ``edge``: see `vacuum.Arrival`.
+    """
+
+    previous: mi.Point3f
+    seen: mi.Bool
+    hit: mi.Bool
+    active: mi.Bool
+    event: mi.UInt32
+    edge: Any = None
+    # Set with a `Side.connect`.
+    endpoint: Any = None  # a `Direct`, or a `CameraConnection`
+    endpoint_active: Any = None
+    f: Any = None  # a `bsdf.Evaluation`
+    advice: Any = None  # an `sds.Advice`, with guiding
 
 
 def volume_cosine(si, d: mi.Vector3f, volume: mi.Bool) -> mi.Float:
@@ -257,6 +264,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         event=walk.event,
         volume=volume,
         edge=edge,
+        medium=None if edge is None else edge.medium,
         layer=walk.layer,
         sds=walk.sds,
     )
