@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7687,
-    "transport merging guided_emission": 6099,
+    "transport merging guided_emission": 6042,
     "planning": 2154,
     "emitters": 2680,
     "cli": 1812,
