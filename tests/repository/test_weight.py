@@ -25,7 +25,7 @@ MOST = {
     "": 1554,  # top files
 }
 OUTSIDE = {"scripts": 5819, "tests": 44654}
-MOST_WORDS = 42910
+MOST_WORDS = 38560
 
 
 def _lines(files):

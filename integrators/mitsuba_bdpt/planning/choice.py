@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..guided_emission import Learnt
 
 # Costs in units of a ray of a camera subpath (closest hit or shadow ray, including shading). Fitted; see
-# experiments, "Costs".
+# experiments, "Choice of strategies".
 COSTS = {
     "light": 1.25,  # a ray of a light subpath
     "inner": 0.9,  # inner connections, per sample
