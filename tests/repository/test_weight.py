@@ -24,8 +24,8 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 5819, "tests": 44654}
-MOST_WORDS = 38560
+OUTSIDE = {"scripts": 5819, "tests": 44631}
+MOST_WORDS = 34680
 
 
 def _lines(files):
