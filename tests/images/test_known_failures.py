@@ -1,7 +1,8 @@
 """Bugs that other bidirectional path tracers had in public, each as a test that fails on the bug.
 
-The thread where each was reported stands first. Where two images are compared, the statistic is Welch's t-test
-of tile means over seeds with Sidak's correction (`agree`); where the answer is known, the t-test against it. Seeds are fixed and differ between the two sides.
+The thread where each was reported stands first. Where two images are compared, the statistic is Welch's
+t-test of tile means over seeds with Sidak's correction (`agree`); where the answer is known, the t-test
+against it. Seeds are fixed and differ between the two sides.
 """
 
 import os
