@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 5819, "tests": 44631}
+OUTSIDE = {"scripts": 5819, "tests": 44627}
 MOST_WORDS = 34680
 
 
