@@ -58,8 +58,8 @@ MUTANTS = (
     Mutant(
         "path layers: near-specular events of a connection are rough",
         "transport/path_layers.py",
-        "return _after(layer, is_narrow(f), adjoint)",
-        "return _after(layer, mi.Bool(False), adjoint)",
+        "else _after(layer, is_narrow(f), adjoint)",
+        "else _after(layer, mi.Bool(False), adjoint)",
         ("tests/transport/test_oracle.py::test_strategies_agree_on_path_layers[alone]",),
     ),
     Mutant(
@@ -72,7 +72,7 @@ MUTANTS = (
     Mutant(
         "path layers: a splat by a specular event first has no layer",
         "transport/techniques.py",
-        "path_layers.joined(mi.UInt32(path_layers.EMISSION), of_light)",
+        "path_layers.joined(path_layers.EMISSION, of_light)",
         "of_light",
         ("tests/transport/test_oracle.py::test_strategies_agree_on_path_layers[alone]",),
     ),
@@ -429,8 +429,8 @@ MUTANTS = (
     Mutant(
         "weights: the newest alternative is forgotten",
         "transport/mis.py",
-        "    # A delta event cannot be made by a connection at this vertex (eqs. 53, 54);",
-        "    older = heuristic.scale(partial.d_vc, step.pdf_rev_w)\n    #",
+        "older = alternatives(heuristic, partial, coefficient, step.pdf_rev_w)",
+        "older = alternatives(heuristic, partial, 0, step.pdf_rev_w)",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[odd-balance]",),
     ),
     Mutant(
@@ -717,7 +717,7 @@ MUTANTS = (
     Mutant(
         "weights: no density from the other side",
         "transport/mis.py",
-        "    return heuristic.scale(total, pdf_a)\n",
+        "    return h.scale(total, pdf_a)\n",
         "    return total\n",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[n1c1-balance]",),
     ),
@@ -1366,8 +1366,8 @@ MUTANTS = (
     Mutant(
         "guiding: delta events leave d_vm as it is",
         "transport/mis.py",
-        "heuristic.scale(partial.d_vm, step.cos_out),",
-        "partial.d_vm,",
+        "_folded(heuristic, step, partial.d_vm, total)",
+        "_folded(heuristic, step, partial.d_vm / step.cos_out, total)",
         ("tests/transport/test_oracle.py::test_sums_of_guiding_pass_delta_events",),
     ),
     Mutant(
@@ -1422,8 +1422,8 @@ MUTANTS = (
     Mutant(
         "merging: delta events forget the newest merge",
         "transport/mis.py",
-        "h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)",
-        "h.scale(partial.d_vm, step.cos_out)",
+        "h.combine(partial.d_vm, partial.d_vm_newest)",
+        "partial.d_vm",
         ("tests/transport/test_oracle.py::test_recursion_with_merges[n1c1-balance-0.0]",),
     ),
     Mutant(

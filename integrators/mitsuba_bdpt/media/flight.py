@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..geometry import polarization, rays
 from ..sampling.points import Purpose
-from ..transport.vacuum import Arrival
 from . import tracking
 from .media import OTHER_LOBES, Media, coefficients, depth_of, interaction, of_depth
 
@@ -103,7 +102,7 @@ def begin(space: Space, kernel: Kernel, side: str, stream: Stream, ray: mi.Ray3f
     )
 
 
-def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> Arrival:
+def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> tuple:
     """Follow the edge of a ``walk`` to its end, a surface or a collision."""
     active = walk.active
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
@@ -125,7 +124,7 @@ def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> Arrival:
     point.sh_frame, point.wi = mi.Frame3f(-ray.d), mi.Vector3f(0, 0, 1)
     si, edge = dr.select(landing.collided, point, si), landing.edge
     edge = replace(edge, maxt=edge.maxt - landing.t)
-    return Arrival(si, ray, landing.collided, landing.throughput, edge)
+    return si, ray, landing.collided, landing.throughput, edge
 
 
 def depart(

@@ -115,7 +115,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
-        drawn, path_layer = sample(kernel, self, z, stream, wavelength_set), None
+        drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
         light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
         camera = z.partial, _rival(kernel, z), f.pdf_rev_w
@@ -124,9 +124,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
         weight = mis.weigh_merge(h, self.ratio(z.si.p), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
-        if kernel.path_layers:
-            of_camera = path_layers.evaluated(z.layer, f, adjoint=False)
-            path_layer = path_layers.joined(of_camera, y.layer)
+        of_camera = path_layers.evaluated(z.layer, f, adjoint=False)
+        path_layer = path_layers.joined(of_camera, y.layer)
         c = Contribution(value, weight, y.edges + 1, z.edges, active, None, "merge")
         return replace(c, light_group=kernel.light_group(y.emitter, active), path_layer=path_layer)
 

@@ -61,10 +61,9 @@ def inner(kernel: Kernel, z: Vertex, y: PathVertex) -> Contribution:
     sides = own, light_side, camera_side
     weight, shares = h.weigh(*sides, merges=h.combine(merges_y, merges_z))
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
-    if kernel.path_layers:
-        of_camera = path_layers.evaluated(z.layer, f_z, adjoint=False)
-        c.path_layer = path_layers.joined(of_camera, path_layers.evaluated(y.layer, f_y, adjoint=True))
-    return replace(c, light_group=y.light_group)
+    of_camera = path_layers.evaluated(z.layer, f_z, adjoint=False)
+    of_light = path_layers.evaluated(y.layer, f_y, adjoint=True)
+    return replace(c, light_group=y.light_group, path_layer=path_layers.joined(of_camera, of_light))
 
 
 @dr.syntax

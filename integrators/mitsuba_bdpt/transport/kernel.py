@@ -4,74 +4,31 @@ A lane traces one light subpath into its local memory, then its S camera subpath
 different pixels (see `batch`), and evaluates all strategies of each pair. No vertex lies in global memory:
 except in pilots, only the film grows with the image size, and nothing with the number of samples.
 
-Work of a lane. Vertices: y_0 on the emitter, z_0 on the sensor; a path of s light and t camera vertices has
-k = s + t - 1 edges. Equations of Georgiev 2012, see `mis`; kappa as below::
+A lane, with y_0 on the emitter and z_0 on the sensor::
 
-    time, wavelengths <- drawn for all subpaths of the lane                 subpaths.begin_lane
-
-    # The light subpath, or M of them one after the other                   _light_subpath, _light_subpaths
-    y_0, direction, throughput <- an emitter, with pdf_first * pdf_second   subpaths.emission
-    (1,1): splat y_0 seen by the sensor                                     techniques.connect_endpoints
-    the first edge <- a ray; it ends here if the throughput is 0 or not     subpaths.light_subpath
-        finite
-    d_vcm <- 1 / densities of y_0 and direction (eq. 31)
-    d_vc <- kappa of s = 0 * cos / the same; 0 if y_0 cannot be hit (eq. 32)
-    for y in y_1, y_2, ... up to where the subpath misses or ends:          walk.random_walk
-        if y is a hit: d_vcm, d_vc <- in the area measure (eqs. 31, 32,     walk._vertex
-            34, 35); at y_1 with next-event estimation's density of y_0
-            in d_vcm
-        a point of the sensor; direction of the next edge and BSDF towards  walk._interact
-            that point <- one virtual call
-        t = 0: splat the edge to y if it crosses the sensor                 techniques.hit_sensor
-        t = 1: splat y seen by the sensor (eqs. 46, 47)                     techniques.splat
-        store y, if on a surface whose BSDF is not delta, for inner         light_path
-            connections, unless no camera subpath could reach it in time
-        d_vcm, d_vc (eqs. 34, 35, 53, 54), throughput <- the event at y     walk._scatter
-        roulette of the subpath; the next edge <- a ray
-
-    # Its camera subpaths
-    for M S pixels (fewer in the last lanes; one without light subpaths):   _camera_paths, _camera_subpath
-        z_0, direction, throughput <- the sensor, at a point of the pixel   subpaths._camera_sample
-        the first edge <- a ray                                             subpaths._camera_walk
-        d_vcm <- 1 / density of the direction (of z_0, if all are parallel) subpaths._first_partial
-        d_vc <- kappa of t = 0 * cos / densities of z_0 and direction;
-            0 without area
-        total <- 0
-        for z in z_1, z_2, ... up to where the subpath misses or ends:      walk.random_walk
-            if z is a hit: d_vcm, d_vc <- in the area measure               walk._vertex
-            a point of an emitter; direction of the next edge and BSDF      walk._interact
-                towards that point <- one virtual call
-            where vertices are merged: total += z merged with a photon      merging.merging
-            s = 0:  total += emission of z towards the vertex before        techniques.hit_emitter
-                        (eqs. 42, 43)
-            s = 1:  total += z lit by the point (eqs. 44, 45)               techniques.next_event
-            s >= 2: total += z connected with stored y (eqs. 40, 41):
-                        each of them,                                       connections.connect_all
-                        or one, drawn by what it would add unshadowed       connections.connect_one
-                (of several light subpaths by an approximation of that)
-            d_vcm, d_vc, throughput <- the event at z                       walk._scatter
-            roulette of the subpath; the next edge <- a ray
-        add the total to the film                                           sink.end
-
-In scenes with media y and z may lie in one as well; null surfaces are passed and are no edges::
-
-    the medium of the first edge <- boundaries around the emitter; the      media.light_media
-        one that the sensor declares
-    an edge ends where a flight collides, or at a surface that is not       media.flight
-        null; throughput <- times the albedo
-    d_vcm <- over T~ of the edge, on arrival                                walk._vertex, mis.to_area
-    BSDF -> phase function, cosine -> 1, in a volume                        scattering, media.phase
-    a shadow ray -> transmittance T of the value and T~ of the weight       media.space, media.transmittance
-    store y -> of a long subpath 64 reweighted vertices                     light_path.Thinning
+    time, wavelengths                                                      subpaths.begin_lane
+    # the light subpath, or M of them                                      _light_subpath, _light_subpaths
+    y_0 and the first edge                                                 subpaths.emission, light_subpath
+    (1,1)                                                                  techniques.connect_endpoints
+    for y in y_1, y_2, ...                                                 walk.random_walk
+        partial sums in the area measure                                   walk._vertex
+        BSDF: the next direction, and towards a point of the sensor        walk._interact
+        t = 0, t = 1                                                       techniques.hit_sensor, splat
+        store y for inner connections                                      light_path
+        partial sums and throughput after the event, roulette, next edge   walk._scatter
+    # its camera subpaths, M S of them                                     _camera_paths, _camera_subpath
+    z_0 and the first edge                                                 subpaths.camera_subpath
+    for z in z_1, z_2, ...                                                 walk.random_walk, as above
+        photons: merges, or guided subpaths                                PhotonStrategy.visit
+        s = 0, s = 1                                                       techniques.hit_emitter, next_event
+        s >= 2: all stored y, or one drawn by its unshadowed contribution  connections
+    add the sum to the film                                                sink.end
 
 Each strategy i of a path adds w_i f / (n_i p_i), with n_i its number of samples per camera sample: the light
-subpaths per camera subpath for t <= 1, else 1. Weights: `mis`, docs/method/method.md. kappa_i contains n_i as
-1 / S for t <= 1, and the plan's coefficient of the class (`inputs._coefficients`). Where S does not divide
+subpaths per camera subpath for t <= 1, else 1. Weights: `mis`, docs/method/method.md. Where S does not divide
 the batch's pixels, only the estimate's n_i is exact: weights need only sum to 1. Classes that the plan leaves
-out have kappa = 0 and are not recorded. docs/development/architecture.md says where roulette is played and
-non-finite values are dropped.
-
-A pilot has several light subpaths per camera sample, most without one; its estimates are those of one each.
+out have kappa = 0 and are not recorded. A pilot has several light subpaths per camera sample, most without
+one; its estimates are those of one each.
 """
 
 from __future__ import annotations
@@ -198,9 +155,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
     """
     plan = kernel.plan
     e = subpaths.emission(kernel, stream, shared)
-    emitted = None
-    if kernel.cells is not None:
-        emitted = kernel.cells.at(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
+    emitted = kernel.cells and kernel.cells.at(e.index, e.si.p, e.d, e.cos, mi.Bool(True))
     counters, light_group = Counters(), kernel.light_group(e.index, mi.Bool(True))
     if light_group is not None:
         path = replace(path, light_group=light_group)

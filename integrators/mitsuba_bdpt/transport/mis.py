@@ -9,16 +9,9 @@ the weight of any strategy follows:
 * ``d_vc``: all older alternatives. It is multiplied by that density and by the reverse density (solid angle)
   of the vertex before the last.
 
-With vertex merging (see `merging`) a third number, ``d_vm``, stands for merges at older vertices, and is used
-like ``d_vc``. It is the report's (eqs. 38, 39) times eta, so that all strategies share one scale. ``d_vc``
-does not contain eta: paths that are not merged keep their weights. Paths are merged where merges dominate:
-with V the sum of kappa p of merges, and S that of all other strategies, where V >= B S (`MERGE_DOMINATED`).
-On SDS paths (see `sds`) of delta emitters S is 0 without t = 0. A merge counts in V if it also has B times
-the kappa p of the connection of either edge at its vertex, since bounds from one side are then exact at that
-vertex; a fourth number, ``d_vm_newest``, is the newest merge, whose later edge is not known yet. There t = 1
-has its number of samples for kappa (`Coefficients.splat_count`): a small coefficient says that other
-strategies are better, not that merges, which blur, are. All conditions depend on the path alone, so that all
-strategies agree on them.
+With vertex merging two further numbers, ``d_vm`` and ``d_vm_newest``, stand for the merges at older vertices
+and the newest (eqs. 38, 39, times eta); a path is merged where V, the sum of kappa p of its merges, is at
+least B times S, that of all other strategies. See docs/method/sds_paths.md.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
@@ -88,11 +81,6 @@ def is_absent(x: PartialSum) -> bool:
 def choose(mask: mi.Bool, a: PartialSum, b: PartialSum) -> PartialSum:
     """``dr.select`` of two coefficients or partial sums; 0 if neither class is in use."""
     return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
-
-
-def times(coefficient: Coefficient, pdf: mi.Float) -> PartialSum:
-    """Product of a coefficient and a density (any measure) in a partial sum."""
-    return 0 if is_absent(coefficient) else coefficient * pdf
 
 
 class Heuristic:
@@ -218,22 +206,19 @@ def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, st
     ``coefficient`` of the newest alternative's class; ``step`` with ``pdf_fwd_w`` and ``pdf_rev_w`` (solid
     angle), ``cos_out`` (geometric) and the mask ``delta``.
     """
-    older = heuristic.combine(
-        heuristic.scale(partial.d_vcm, coefficient),
-        heuristic.scale(partial.d_vc, step.pdf_rev_w),
-    )
+    older = alternatives(heuristic, partial, coefficient, step.pdf_rev_w)
+    newest = dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w)))
+    return Partial(newest, _folded(heuristic, step, partial.d_vc, older))
+
+
+def _folded(heuristic: Heuristic, step: Step, before: PartialSum, older: PartialSum):
+    """A partial sum after an event: ``older`` alternatives; ``before`` the event if that is delta."""
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its probabilities from either
     # side are equal for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides of
     # a refraction, (eta_l/eta_c)^2 cos_l/cos_c: all strategies leave it out, so that weights sum to 1. They
     # are the balance heuristic's for reflections and where these ratios multiply to 1.
-    kept = 0
-    if not is_absent(older):
-        kept = dr.select(
-            step.delta,
-            heuristic.scale(partial.d_vc, step.cos_out),
-            heuristic.scale(older, step.cos_out / step.pdf_fwd_w),
-        )
-    return Partial(dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w))), kept)
+    passed = heuristic.scale(before, step.cos_out)
+    return choose(step.delta, passed, heuristic.scale(older, step.cos_out / step.pdf_fwd_w))
 
 
 def scattered_guided(
@@ -245,12 +230,7 @@ def scattered_guided(
     strategy in use.
     """
     total = heuristic.combine(heuristic.scale(partial.d_vm, step.pdf_rev_w), guided)
-    kept = dr.select(
-        step.delta,
-        heuristic.scale(partial.d_vm, step.cos_out),
-        heuristic.scale(total, step.cos_out / step.pdf_fwd_w),
-    )
-    return dr.select(isolated, kept, 0)
+    return dr.select(isolated, _folded(heuristic, step, partial.d_vm, total), 0)
 
 
 def is_merge_dominated(merges: PartialSum, others: PartialSum):
@@ -280,11 +260,10 @@ def scattered_merges(h: Heuristic, partial: Partial, step: Step, ratio: mi.Float
     the class that connects the edge to the vertex. Next to a delta event no edge is connected: the newest
     merge counts.
     """
-    connection, factor = h.scale(partial.d_vcm, rival), step.cos_out / step.pdf_fwd_w
-    older = h.scale(older_merges(h, partial, connection, step.pdf_rev_w), factor)
-    newest = h.scale(dr.select(exceeds(ratio, connection), ratio, 0), factor)
-    through = h.scale(h.combine(partial.d_vm, partial.d_vm_newest), step.cos_out)
-    return dr.select(step.delta, through, older), dr.select(step.delta, 0, newest)
+    connection, before = h.scale(partial.d_vcm, rival), h.combine(partial.d_vm, partial.d_vm_newest)
+    older = older_merges(h, partial, connection, step.pdf_rev_w)
+    newest = dr.select(exceeds(ratio, connection), ratio, 0)
+    return _folded(h, step, before, older), _folded(h, step, 0, newest)
 
 
 def merges(
@@ -308,19 +287,16 @@ def merges(
 
 
 def alternatives(
-    heuristic: Heuristic, partial: Partial, coefficient: Coefficient, pdf_rev_w: mi.Float, pdf_a: mi.Float
+    h: Heuristic, partial: Partial, coefficient: Coefficient, pdf_rev_w: mi.Float, pdf_a: mi.Float | float = 1
 ) -> PartialSum:
-    """Combined ratios of all strategies that shorten this subpath (eqs. 40-41, 44-47).
+    """Combined ratios of all strategies that shorten this subpath (eqs. 40-47).
 
     ``coefficient`` of the newest alternative's class; ``pdf_rev_w``: solid-angle density of sampling the
     vertex before the last from the last; ``pdf_a``: density of sampling the last vertex from the other side,
     in the measure of ``d_vcm`` (area; solid angle at infinity).
     """
-    total = heuristic.combine(
-        heuristic.scale(partial.d_vcm, coefficient),
-        heuristic.scale(partial.d_vc, pdf_rev_w),
-    )
-    return heuristic.scale(total, pdf_a)
+    total = h.combine(h.scale(partial.d_vcm, coefficient), h.scale(partial.d_vc, pdf_rev_w))
+    return h.scale(total, pdf_a)
 
 
 def weigh_merge(

@@ -13,7 +13,7 @@ Specular events between the camera and the first rough one do not matter.
 
 Each subpath carries a number, the layer of its events. On a camera subpath it is that of the path that ends
 if the next vertex is on an emitter. On a light subpath it is that of the path that ends on the sensor, but
-`_SPECULAR` after specular events alone.
+`_SPECULAR` after specular events alone. Without path layers it is None.
 """
 
 from __future__ import annotations
@@ -32,18 +32,22 @@ EMISSION, DIRECT, INDIRECT, CAUSTIC = range(len(NAMES))
 _SPECULAR = len(NAMES)
 
 
-def sampled(layer: mi.UInt32, step: Step, adjoint: bool) -> mi.UInt32:
+def sampled(layer: mi.UInt32 | None, step: Step, adjoint: bool) -> mi.UInt32 | None:
     """Number of a subpath after the sampled ``step`` at a vertex; ``layer``: before."""
+    if layer is None:
+        return None
     return dr.select(step.null, layer, _after(layer, step.delta | is_narrow(step), adjoint))
 
 
-def evaluated(layer: mi.UInt32, f: Evaluation, adjoint: bool) -> mi.UInt32:
+def evaluated(layer: mi.UInt32 | None, f: Evaluation, adjoint: bool) -> mi.UInt32 | None:
     """The same after an event whose directions were given, with evaluation ``f``."""
-    return _after(layer, is_narrow(f), adjoint)
+    return None if layer is None else _after(layer, is_narrow(f), adjoint)
 
 
-def joined(of_camera: mi.UInt32, of_light: mi.UInt32) -> mi.UInt32:
+def joined(of_camera: mi.UInt32 | int | None, of_light: mi.UInt32 | None) -> mi.UInt32 | None:
     """Layer of the path of a camera and a light subpath with these numbers, each after its last event."""
+    if of_light is None:
+        return None
     seen = dr.select(of_camera == EMISSION, of_light, INDIRECT)
     specular = dr.select(of_camera == DIRECT, CAUSTIC, of_camera)
     found = dr.select(of_light == _SPECULAR, specular, seen)

@@ -36,18 +36,14 @@ class CameraSample:
 
 def begin_lane(kernel: Kernel, index: mi.UInt64) -> tuple[Stream, Shared]:
     """Random numbers of the light subpath ``index``, and time and wavelengths of its lane's subpaths."""
-    stream = kernel.points.stream("light", index)
-    return stream, _shared(kernel, stream, index)
-
-
-def _shared(kernel: Kernel, stream: Stream, index: mi.UInt64) -> Shared:
     sensor, points = kernel.camera.sensor, kernel.points
+    stream = points.stream("light", index)
     time = mi.Float(sensor.shutter_open())
     if sensor.shutter_open_time() > 0:
         u = points.draw_1d("light", stream, Purpose.TIME)
         time += u * sensor.shutter_open_time()
     if not mi.is_spectral:
-        return Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
+        return stream, Shared(time, mi.Color0f(), mi.UnpolarizedSpectrum(1), mi.Float(0.5))
     number = None
     if kernel.sds.wavelengths is None:
         u = points.draw_1d("light", stream, Purpose.WAVELENGTH)
@@ -55,7 +51,7 @@ def _shared(kernel: Kernel, stream: Stream, index: mi.UInt64) -> Shared:
         number = kernel.sds.wavelengths.number(index)
         u = kernel.sds.wavelengths.u(number)
     wavelengths, weight = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), u)
-    return Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
+    return stream, Shared(time, wavelengths, mi.unpolarized_spectrum(weight), u, number)
 
 
 # -- the light subpath -------------------------------------------------------------------------

@@ -44,19 +44,15 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
     # Area measure; for the environment solid angle and disk area, see `Emitters.hit_densities`.
     pdf_connect, pdf_first, pdf_second = emitters.hit_densities(z.si, z.previous, active)
     directly = z.edges == 1
-    endpoints = mis.times(kernel.kappa.endpoints, pdf_first)
+    endpoints = h.scale(kernel.kappa.endpoints, pdf_first)
     if kernel.camera.parallel:  # (1,1) would need exactly this direction
         endpoints = mis.choose(z.hit, endpoints, 0)
     direct = where_lit(kernel, z.edge and z.edge.lit)
-    newest = mis.choose(directly, endpoints, mis.times(direct, pdf_connect))
+    newest = mis.choose(directly, endpoints, h.scale(direct, pdf_connect))
     older = dr.select(z.edges <= kernel.reach, pdf_first * pdf_second, 0)
     if kernel.plan.arrival:  # no light subpath comes straight from infinity past all shapes
         older = dr.select(z.hit | ~directly | emitters.covers(z.previous, z.si.wi), older, 0)
-    camera_side = h.combine(
-        h.scale(z.partial.d_vcm, newest),
-        h.scale(z.partial.d_vc, older),
-    )
-    sides = 0, camera_side
+    sides = 0, mis.alternatives(h, z.partial, newest, older)
     if sds.near_specular:
         on_sds_path = z.sds.is_sds_path(z.edges, mis.choose(directly, kernel.kappa.endpoints, direct))
         alone = h.scale(z.partial.d_vcm, newest)
@@ -65,15 +61,14 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
     elif z.sds is not None and z.sds.guided is not None:
         on_sds_path = ~mis.is_connectible(z.partial, newest) & (z.sds.guided > 0)
         guided = h.scale(dr.select(on_sds_path, z.sds.guided, 0), kernel.kappa.hit)
-        sides, active = (0, h.combine(camera_side, guided)), sds.counts(active, on_sds_path)
+        sides, active = (0, h.combine(sides[1], guided)), sds.counts(active, on_sds_path)
     merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
     merges = mis.choose(z.edges <= kernel.last_merged, merges, 0)
     weight, shares = h.weigh(kernel.kappa.hit, *sides, merges=merges)
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
-    emission = None if kernel.cells is None else kernel.cells.of_hit(z.si, z.previous, active)
-    c = Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", emission=emission)
-    c.path_layer = z.layer
+    c = Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", path_layer=z.layer)
+    c.emission = kernel.cells and kernel.cells.of_hit(z.si, z.previous, active)
     if kernel.light_groups is not None:
         c.light_group = kernel.light_group(emitters.index_of_hit(z.si, active), active)
     return c
@@ -139,19 +134,15 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
     ray = dr.select(e.infinite, to_infinity, to_point)
-    counted = Counters(shadow_s1=one(active))
-    emission = None
-    if kernel.cells is not None:
-        cos = dr.abs(dr.dot(e.anchor.n, e.d))
-        emission = kernel.cells.at(e.index, z.si.p, -e.d, cos, active)
-    ends = mi.UInt32(1), k
-    c = Contribution(value, weight, *ends, active, shares, "direct", None, counted, sides, emission)
-    c.shadow_ray = ShadowRay(ray, stream, z, e.d, own=own)
-    if kernel.light_groups is not None:
-        c.light_group = kernel.light_group(e.index, active)
-    if kernel.path_layers:
-        c.path_layer = path_layers.evaluated(z.layer, f, adjoint=False)
-    return c
+    counted, cos = Counters(shadow_s1=one(active)), dr.abs(dr.dot(e.anchor.n, e.d))
+    c = Contribution(value, weight, mi.UInt32(1), k, active, shares, "direct", None, counted, sides)
+    return replace(
+        c,
+        emission=kernel.cells and kernel.cells.at(e.index, z.si.p, -e.d, cos, active),
+        light_group=kernel.light_group(e.index, active),
+        path_layer=path_layers.evaluated(z.layer, f, adjoint=False),
+        shadow_ray=ShadowRay(ray, stream, z, e.d, own=own),
+    )
 
 
 def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
@@ -193,10 +184,8 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     counted = Counters(shadow_t1=one(active))
     ends = mi.UInt32(1), mi.UInt32(1)
     c = Contribution(value, weight, *ends, active, shares, "light", connection.position, counted, sides)
-    c = replace(c, towards=connection.d, shadow_ray=ShadowRay(ray, stream))
-    if kernel.path_layers:
-        c.path_layer = mi.UInt32(path_layers.EMISSION)
-    return c
+    layer = mi.UInt32(path_layers.EMISSION) if kernel.path_layers else None
+    return replace(c, towards=connection.d, path_layer=layer, shadow_ray=ShadowRay(ray, stream))
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
@@ -241,10 +230,8 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     ray = rays.segment(y.anchor, connection.anchor, y.si)
     c = replace(c, value=value / survival, active=active, counted=counted, sides=sides, towards=connection.d)
     c.shadow_ray = ShadowRay(ray, stream, y, connection.d, hidden=kernel.plan.hide_emitters)
-    if kernel.path_layers:
-        of_light = path_layers.evaluated(y.layer, f, adjoint=True)
-        c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), of_light)
-    return c
+    of_light = path_layers.evaluated(y.layer, f, adjoint=True)
+    return replace(c, path_layer=path_layers.joined(path_layers.EMISSION, of_light))
 
 
 def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
@@ -290,9 +277,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
         active &= ~straight | kernel.space.clear(z.surroundings, kernel.sensor_medium, straight)
     ends = walk.edges + 1, mi.UInt32(0)
     c = Contribution(value, weight, *ends, active, shares, "light", z.position, towards=walk.d)
-    if walk.layer is not None:
-        c.path_layer = path_layers.joined(mi.UInt32(path_layers.EMISSION), walk.layer)
-    return c
+    return replace(c, path_layer=path_layers.joined(path_layers.EMISSION, walk.layer))
 
 
 def _sensor_points(kernel: Kernel, stream, edges=0):

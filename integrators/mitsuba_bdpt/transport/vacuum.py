@@ -13,21 +13,6 @@ from ..sampling.points import Stream
 
 
 @dataclass
-class Arrival:
-    """End of an edge: at the surface ``si``, or in a ``volume``, at a point ``si`` without normal and shape.
-
-    ``ray``: its last segment; ``edge``: its state at the end (a `media.flight.Edge`), None without media.
-    Without media the mask ``volume`` is a literal, and Dr.Jit leaves out what only media need.
-    """
-
-    si: mi.SurfaceInteraction3f
-    ray: mi.Ray3f
-    volume: mi.Bool
-    throughput: mi.Spectrum
-    edge: Any = None
-
-
-@dataclass
 class ShadowRay:
     """The shadow ray of connection ``number`` of ``vertex`` in direction ``d``, and its end.
 
@@ -57,11 +42,16 @@ class Vacuum:
     phase: ClassVar[Any] = None
     counters: ClassVar[tuple[str, ...]] = ()
 
-    def arrive(self, kernel, side, walk, /) -> Arrival:
-        """Follow the edge of a ``walk`` to its end."""
+    def arrive(self, kernel, side, walk, /) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Bool, Any, Any]:
+        """Follow the edge of a ``walk`` to its end, a surface or a point without normal in a volume.
+
+        Returns the interaction, the last segment's ray, the mask of volumes (without media a literal, so that
+        Dr.Jit leaves out what only media need), the throughput, and the state of the edge (a
+        `media.flight.Edge`), None without media.
+        """
         ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
         si = kernel.hits.at(walk.pi, ray, walk.active)
-        return Arrival(si, ray, mi.Bool(False), walk.throughput)
+        return si, ray, mi.Bool(False), walk.throughput, None
 
     def begin(self, kernel, side: str, stream: Stream, ray: mi.Ray3f, emission=None, /) -> Any:
         """The first edge of a subpath along ``ray``, from its ``emission`` or the sensor."""

@@ -135,7 +135,7 @@ class Vertex(PathVertex):
 
     ``hit``: false in the environment; ``endpoint`` of its connection and the BSDF ``f`` towards it (a
     `bsdf.Evaluation`), where ``endpoint_active``, see `Side`; ``event``: index of its random numbers;
-    ``edge``: see `vacuum.Arrival`.
+    ``edge``: see `Vacuum.arrive`.
     """
 
     previous: mi.Point3f
@@ -220,8 +220,7 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
 def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
-    arrival = kernel.space.arrive(kernel, side, walk)
-    si, volume, throughput, edge = arrival.si, arrival.volume, arrival.throughput, arrival.edge
+    si, ray, volume, throughput, edge = kernel.space.arrive(kernel, side, walk)
     hit = walk.active & (si.is_valid() | volume)
     tr = None if edge is None else edge.weight_transmittance()
     cos = volume_cosine(si, walk.d, volume)
@@ -248,7 +247,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         choose(hit, in_area.d_vm, partial.d_vm),
         choose(hit, in_area.d_vm_newest, partial.d_vm_newest),
     )
-    on_surface = rays.surface_anchor(si, arrival.ray, kernel.shape_errors)
+    on_surface = rays.surface_anchor(si, ray, kernel.shape_errors)
     return Vertex(
         si=si,
         bsdf=si.bsdf(),
@@ -332,9 +331,6 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first
     throughput, goes_on = _roulette(kernel, side, walk, throughput, survive, useful)
     active &= goes_on
 
-    layer = walk.layer
-    if kernel.path_layers:
-        layer = path_layers.sampled(layer, step, side.adjoint)
     ray = rays.spawn(vertex.anchor, si.to_world(step.wo), side.shared)
     edge, ray = kernel.space.depart(kernel, side, vertex, passes, ray)
     return Walk(
@@ -351,7 +347,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first
         active=active,
         edge=edge,
         sds=sds,
-        layer=layer,
+        layer=path_layers.sampled(walk.layer, step, side.adjoint),
     )
 
 

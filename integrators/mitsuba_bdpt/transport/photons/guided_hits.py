@@ -215,6 +215,4 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
         state = replace(state, only_delta=mi.Bool(False), guided=older, newest=ratio)
         state = replace(state, specular=specular, diffuse=~specular)
     walk = replace(walk, edges=z.edges + 1, seen=mi.Bool(True), broken=broken, sds=state)
-    if kernel.path_layers:
-        walk = replace(walk, layer=path_layers.evaluated(z.layer, f, adjoint=False))
-    return walk
+    return replace(walk, layer=path_layers.evaluated(z.layer, f, adjoint=False))
