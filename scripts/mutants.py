@@ -1401,7 +1401,7 @@ MUTANTS = (
     Mutant(
         "merging: only merges know which they are",
         "transport/mis.py",
-        "dr.select(is_merge_dominated(merges, others), merges, 0)",
+        "dr.select(exceeds(merges, others), merges, 0)",
         "merges",
         ("tests/transport/test_oracle.py::test_recursion_with_merges[n1c1-balance-1.0]",),
     ),

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .. import components
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.plan import JOINED, EmissionTables, Plan
+from ..transport.plan import JOINED, Plan
 from .budget import CHEAP_SAMPLES, EVEN
 from .possible import unsampled_paths
+
+if TYPE_CHECKING:
+    from ..guided_emission import EmissionTables
 
 
 @dataclass(frozen=True)

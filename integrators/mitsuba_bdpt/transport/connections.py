@@ -16,7 +16,6 @@ from .contribution import (
     Contribution,
     Counters,
     drop_non_finite,
-    layers,
     one,
     roulette,
     size_of,
@@ -189,7 +188,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         lost += c.counted.non_finite
         slot += 1
     # One light subpath: all vertices are of one emitter.
-    own = layers(path.light_group, path_layer)
+    own = tuple(layer for layer in (path.light_group, path_layer) if layer is not None)
     counted = Counters(evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
     return _Drawn(value, total, end, u, counted, own, kept)
 

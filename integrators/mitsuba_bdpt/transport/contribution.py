@@ -136,16 +136,11 @@ class Contribution:
     @property
     def layers(self) -> tuple[mi.UInt32, ...]:
         """Its layer in each partition of the image, in the order of the film."""
-        return layers(self.light_group, self.path_layer)
+        return tuple(index for index in (self.light_group, self.path_layer) if index is not None)
 
     def weighted(self) -> mi.Spectrum:
         """The weighted contribution to the image."""
         return dr.select(self.active, self.value * self.weight, 0)
-
-
-def layers(*layer: mi.UInt32 | None) -> tuple[mi.UInt32, ...]:
-    """The layers of a contribution in the partitions of the image that are in use."""
-    return tuple(index for index in layer if index is not None)
 
 
 def seen(kernel: Kernel, c: Contribution) -> Contribution:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -96,7 +97,7 @@ class Kernel:
     observer: Observer
 
     def __init__(self, prepared, plan: Plan, settings: Settings, heuristic: mis.Heuristic):
-        u32, f32 = _opaque(mi.UInt32), _opaque(mi.Float)
+        u32 = partial(dr.opaque, mi.UInt32)
         self.scene, self.camera = prepared.scene, prepared.camera
         tables = plan.emission
         self.emitters = prepared.emitters if tables is None else tables.guided(prepared.emitters)
@@ -126,7 +127,7 @@ class Kernel:
         self.last_merged = self.reach if plan.light else self.max_depth
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))
-        self.inverse_threshold = f32(dr.inf)
+        self.inverse_threshold = dr.opaque(mi.Float, dr.inf)
         self.sds = PhotonStrategy()  # of a pass
         # Whether photons guide through near-specular events too.
         self.near_specular = bool(prepared.near_specular)
@@ -197,7 +198,3 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
         splat_count=entry("light", count, plan.splat),
     )
-
-
-def _opaque(kind):
-    return lambda value: dr.opaque(kind, value)

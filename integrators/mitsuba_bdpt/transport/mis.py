@@ -139,7 +139,7 @@ class Heuristic:
             light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
         if not is_absent(merges):
             others = self.combine(self.combine(light_side, camera_side), coefficient)
-            camera_side = self.combine(camera_side, dr.select(is_merge_dominated(merges, others), merges, 0))
+            camera_side = self.combine(camera_side, dr.select(exceeds(merges, others), merges, 0))
         return self._weigh(coefficient, light_side, camera_side)
 
     def _weigh(
@@ -233,14 +233,9 @@ def scattered_guided(
     return dr.select(isolated, _folded(heuristic, step, partial.d_vm, total), 0)
 
 
-def is_merge_dominated(merges: PartialSum, others: PartialSum):
-    """Mask: these sums V and S of ``merges`` and ``others`` are those of a merged path."""
+def exceeds(merges: PartialSum, others: PartialSum):
+    """Mask: V counts beside S, or a merge beside the connection of an edge at its vertex, in one scale."""
     return merges >= MERGE_DOMINATED * others
-
-
-def exceeds(merge: PartialSum, connection: PartialSum):
-    """Mask: a ``merge`` counts beside the ``connection`` of an edge at its vertex, both in one scale."""
-    return merge >= MERGE_DOMINATED * connection
 
 
 def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev_w: mi.Float) -> PartialSum:
@@ -313,7 +308,7 @@ def weigh_merge(
         v = h.combine(v, older_merges(h, partial, connection, pdf_rev_w))
     possible = exceeds(ratio, light[1]) & exceeds(ratio, camera[1])
     others = h.present(h.combine(connections, older))
-    possible &= is_merge_dominated(v, others)
+    possible &= exceeds(v, others)
     # v contains the merge itself.
     weight = ratio / h.combine(v, others)
     return dr.select(possible, dr.square(weight) if h.name == "power" else weight, 0)

@@ -18,6 +18,8 @@ if the next vertex is on an emitter. On a light subpath it is that of the path t
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -44,7 +46,7 @@ def evaluated(layer: mi.UInt32 | None, f: Evaluation, adjoint: bool) -> mi.UInt3
     return None if layer is None else _after(layer, is_narrow(f), adjoint)
 
 
-def joined(of_camera: mi.UInt32 | int | None, of_light: mi.UInt32 | None) -> mi.UInt32 | None:
+def joined(of_camera: Any, of_light: mi.UInt32 | None) -> mi.UInt32 | None:
     """Layer of the path of a camera and a light subpath with these numbers, each after its last event."""
     if of_light is None:
         return None

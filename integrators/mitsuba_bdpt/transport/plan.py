@@ -3,26 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
-from ..emitters.emitters import Emitters
+if TYPE_CHECKING:
+    from ..guided_emission import EmissionTables
 
 # Numbers of light subpaths with which a camera subpath can be connected.
 JOINED = (1, 4)
 
 # Guided samples per vertex where s = 0 is guided.
 GUIDED = 4
-
-
-class EmissionTables(Protocol):
-    """Tables that guide emission, see `guided_emission`; ``left``: predicted share of squared errors."""
-
-    @property
-    def left(self) -> float: ...
-
-    def guided(self, emitters: Emitters) -> Emitters: ...
-
-    def record(self) -> dict[str, Any]: ...
 
 
 @dataclass(frozen=True)

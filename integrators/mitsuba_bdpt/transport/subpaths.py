@@ -86,8 +86,7 @@ def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tup
     partial = mis.Partial(h.start(inverse_pdf), h.present(hit))
     edge = kernel.space.begin(kernel, "light", stream, ray, e)
     walk = Walk.begin(kernel, pi, ray, e.si.p, mi.Spectrum(e.weight), partial, active, edge)
-    walk = replace(walk, broken=broken)
-    return sds.begin_light(kernel, walk), Side(
+    return sds.begin_light(kernel, replace(walk, broken=broken)), Side(
         "light",
         stream,
         shared,
@@ -105,29 +104,7 @@ def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tup
 def camera_subpath(
     kernel: Kernel, place: Places, shared, slot, active, alpha=False
 ) -> tuple[CameraSample, Walk, Side]:
-    """A camera subpath on its first edge; it starts with a `_camera_sample`."""
-    sample = _camera_sample(kernel, place, shared, slot, active)
-    active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
-    walk = _camera_walk(kernel, sample, active)
-
-    def choose_emitter(z):
-        return techniques.choose_emitter(kernel, z, sample.stream)
-
-    side = Side(
-        "camera",
-        sample.stream,
-        shared,
-        False,
-        kernel.max_depth,
-        kernel.sds,
-        alpha=alpha,
-        connect=choose_emitter if kernel.plan.direct else None,
-    )
-    return sample, walk, side
-
-
-def _camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> CameraSample:
-    """Sample z_0 and the first direction."""
+    """Sample z_0 and the first direction; returns the sample, and its camera subpath on the first edge."""
     points = kernel.points
     stream = points.stream("camera", place.index(slot))
     u_film = points.draw_2d("camera", stream, Purpose.FILM)
@@ -135,7 +112,20 @@ def _camera_sample(kernel: Kernel, place: Places, shared, slot, active) -> Camer
     if kernel.camera.needs_aperture_sample:
         u_lens = points.draw_2d("camera", stream, Purpose.APERTURE)
     start = kernel.camera.start(place.pixel(slot), u_film, u_lens, shared)
-    return CameraSample(start, stream, u_lens, active, place.strip(slot))
+    sample = CameraSample(start, stream, u_lens, active, place.strip(slot))
+    active = active & (kernel.max_depth >= 1)  # `&=` would also change the sample's
+    walk = _camera_walk(kernel, sample, active)
+    side = Side(
+        "camera",
+        stream,
+        shared,
+        False,
+        kernel.max_depth,
+        kernel.sds,
+        alpha=alpha,
+        connect=(lambda z: techniques.choose_emitter(kernel, z, stream)) if kernel.plan.direct else None,
+    )
+    return sample, walk, side
 
 
 def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
