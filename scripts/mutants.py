@@ -1211,8 +1211,8 @@ MUTANTS = (
     Mutant(
         "guided s = 0: s = 0 does not know of it",
         "transport/techniques.py",
-        "(0, h.combine(camera_side, guided)), sds.counts",
-        "(0, camera_side), sds.counts",
+        "(0, h.combine(sides[1], guided)), sds.counts",
+        "sides, sds.counts",
         ("tests/images/test_guided_hits.py::test_large_lamps_look_as_without[diffuse-1]",),
     ),
     Mutant(
