@@ -904,7 +904,7 @@ def test_commands_of_the_readme_are_understood():
     root = SCRIPT.parents[1]
     found = re.findall(r"^    python -m mitsuba_bdpt (.*)", (root / "README.md").read_text(), re.MULTILINE)
     scenes = [build_parser().parse_args(shlex.split(line, comments=True)).scene for line in found]
-    assert len(scenes) >= 6 and all((root / path).is_file() for path in scenes)
+    assert len(scenes) >= 5 and all((root / path).is_file() for path in scenes)
 
 
 def test_script_is_the_command(scene):

@@ -14,7 +14,7 @@ MOST = {
     "planning": 2157,
     "emitters": 2680,
     "cli": 1812,
-    "media": 1350,
+    "media": 1349,
     "geometry": 1659,
     "image": 1508,
     "files": 1226,
@@ -25,7 +25,7 @@ MOST = {
     "": 1554,  # top files
 }
 OUTSIDE = {"scripts": 5819, "tests": 44627}
-MOST_WORDS = 34680
+MOST_WORDS = 34161
 
 
 def _lines(files):
