@@ -170,8 +170,8 @@ MUTANTS = (
     Mutant(
         "light groups: inner connections have none",
         "image/sink.py",
-        "_plus(total, found, layers)",
-        "_plus(total, found, [layer & 0 for layer in layers])",
+        "c.layers), c.counted",
+        "[layer & 0 for layer in c.layers]), c.counted",
         ("tests/images/test_light_groups.py::test_a_layer_is_the_image_of_its_emitters_alone[one]",),
     ),
     Mutant(

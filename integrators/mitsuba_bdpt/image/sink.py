@@ -51,8 +51,8 @@ class Image:
                 return self.add(kernel, seen, total, start, lane.shared)
 
             return connections.connect_all(kernel, z, lane.path, stream, total, add)
-        found, counted, layers = connections.connect_one(kernel, z, lane.path, stream)
-        return self._plus(total, found, layers), counted
+        c = connections.connect_one(kernel, z, lane.path, stream)
+        return self._plus(total, c.weighted(), c.layers), c.counted
 
     def _plus(self, total, value: mi.Spectrum, layers, active: mi.Bool | bool = True):
         """Return ``total`` with ``value`` added; ``layers``: see `Contribution`."""

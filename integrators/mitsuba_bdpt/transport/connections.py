@@ -69,8 +69,8 @@ def inner(kernel: Kernel, z: Vertex, y: PathVertex) -> Contribution:
 def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, total, add):
     """Connect ``z`` with every stored light vertex, with a shadow ray each.
 
-    ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility
-    (`_seen`), and returns the new ``total``. Returns ``total`` and `Counters`.
+    ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility, and returns
+    the new ``total``. Returns ``total`` and `Counters`.
     """
     candidates = candidate_count(kernel, z, path)
     slot, nonzero = mi.UInt32(0), mi.UInt32(0)
@@ -88,44 +88,34 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     return total, counters + Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero)
 
 
-def connect_one(
-    kernel: Kernel, z: Vertex, path: LightPath, stream: Stream
-) -> tuple[mi.Spectrum, Counters, tuple[mi.UInt32, ...]]:
+def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> Contribution:
     """Connect ``z`` with one light vertex, drawn by weighted unshadowed contribution.
 
-    Estimates the sum over all vertices. Returns the weighted contribution, `Counters`, and its
-    `Contribution.layers`.
+    Estimates the sum over all vertices; its weight is part of the value.
     """
-    candidates = candidate_count(kernel, z, path)
     u = kernel.points.draw_1d("camera", stream, Purpose.CONNECTION, z.event)
-    if path.guesses:
-        drawn = _draw_by_guess(kernel, z, path, candidates, u, stream)
-    else:
-        drawn = _draw(kernel, z, path, candidates, u)
+    drawn = _draw_by_guess(kernel, z, path, u, stream) if path.guesses else _draw(kernel, z, path, u)
     # In this order: total / size is infinite for tiny drawn values.
     value = (drawn.value / size_of(drawn.value)) * drawn.total
     if kernel.plan.joined > 1:  # each light subpath is a separate estimate
         value = value / kernel.plan.joined
-    active = drawn.total > 0
-    active, survival, rouletted = roulette(kernel, value, drawn.u, active)
-    counted = drawn.counted + rouletted + Counters(shadow_inner=one(active))
-    end, own = drawn.end, None
+    active, survival, rouletted = roulette(kernel, value, drawn.u, drawn.total > 0)
+    end, own, sides, estimate = drawn.end, None, None, value / survival
     if kernel.shape_errors.small:
         y = read_light_vertex(kernel, path, drawn.end)
         (ray, own), end = _shadow_ray(kernel, z, y), y.si.p
     else:
         ray = rays.segment_to(z.anchor, end, z.si)
     kernel.observer.drawn(end)
-    estimate, sides = value / survival, None
     if drawn.unweighted is not None:
         unweighted, light_side, camera_side, size = drawn.unweighted
         estimate = unweighted * (drawn.total / size / survival)
         sides = kernel.kappa.inner, light_side, camera_side
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=sides)
+    c.light_group, c.path_layer = drawn.light_group, drawn.path_layer
+    c.counted = drawn.counted + rouletted + Counters(shadow_inner=one(active))
     c = _seen(kernel, z, c, ray, own, stream, 1)
-    if sides is not None:  # only now with its weight
-        c = drop_non_finite(c)
-    return c.weighted(), counted + c.counted, drawn.layers
+    return c if sides is None else drop_non_finite(c)  # only now with its weight
 
 
 # Probability of a uniform draw, so that connections of approximate size 0 are drawn too.
@@ -140,9 +130,8 @@ class _Drawn:
     """A drawn inner connection.
 
     Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
-    `ShapeErrors.small`), rescaled random number ``u``, `Counters`; ``layers``: see `Contribution`. In scenes
-    with media, where the weight is known after the shadow ray, ``unweighted``: value, light and camera side,
-    size in the draw.
+    `ShapeErrors.small`), rescaled random number ``u``, `Counters`, layers. In scenes with media, where the
+    weight is known after the shadow ray, ``unweighted``: value, light and camera side, size in the draw.
     """
 
     value: mi.Spectrum
@@ -150,22 +139,19 @@ class _Drawn:
     end: mi.Point3f | mi.UInt32
     u: mi.Float
     counted: Counters
-    layers: tuple[mi.UInt32, ...]
+    light_group: mi.UInt32 | None
+    path_layer: mi.UInt32 | None
     unweighted: tuple | None = None
 
 
 @dr.syntax
-def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
-    """Draw one of the inner connections of ``z`` in proportion to its size.
-
-    Weighted reservoir sampling with one random number.
-    """
-    small = kernel.shape_errors.small
+def _draw(kernel: Kernel, z: Vertex, path: LightPath, u) -> _Drawn:
+    """Draw one of the inner connections of ``z`` in proportion to its size."""
+    candidates, small = candidate_count(kernel, z, path), kernel.shape_errors.small
     slot, value, total = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0)
     end = mi.UInt32(0) if small else mi.Point3f(z.si.p)
     nonzero, lost = mi.UInt32(0), mi.UInt32(0)
-    kept = None
-    path_layer = None
+    kept = path_layer = None
     if kernel.path_layers:  # as wide as the lanes, see `Walk.begin`
         path_layer = dr.full(mi.UInt32, path_layers.INDIRECT, dr.width(candidates))
     if kernel.has_media:
@@ -187,19 +173,19 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, candidates, u) -> _Drawn:
         nonzero += one(c.active)
         lost += c.counted.non_finite
         slot += 1
-    # One light subpath: all vertices are of one emitter.
-    own = tuple(layer for layer in (path.light_group, path_layer) if layer is not None)
     counted = Counters(evaluated=candidates, zero=candidates - nonzero, non_finite=lost)
-    return _Drawn(value, total, end, u, counted, own, kept)
+    # One light subpath: all vertices are of one emitter.
+    return _Drawn(value, total, end, u, counted, path.light_group, path_layer, kept)
 
 
 @dr.syntax
-def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, stream: Stream) -> _Drawn:
-    """Like `_draw`, from several light subpaths, by approximate size.
+def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, u, stream: Stream) -> _Drawn:
+    """Like `_draw`, from several light subpaths, by approximate size (`proxy_vertices.guess`).
 
-    Sizes: `proxy_vertices.guess`. Evaluates only the BSDFs of the drawn connection. Draws uniformly with
-    probability `EVENLY`, and where all approximations are 0. ``total`` is the size of the estimate.
+    Evaluates only the BSDFs of the drawn connection. Draws uniformly with probability `EVENLY`, and where all
+    approximations are 0. ``total`` is the size of the estimate.
     """
+    candidates = candidate_count(kernel, z, path)
     some = candidates > 0
     newest = newest_coefficient(kernel, z, adjoint=False)
     at_z = ProxyVertex.of(kernel, z, newest, some, alone=False)
@@ -231,7 +217,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, candidates, u, st
     value = dr.select(some & c.active, c.weighted() / probability, 0)
     end = rays.end_point(z.anchor, y.anchor)
     counted = c.counted + Counters(evaluated=one(some), zero=one(some & ~c.active))
-    return _Drawn(value, size_of(value), end, left, counted, c.layers)
+    return _Drawn(value, size_of(value), end, left, counted, c.light_group, c.path_layer)
 
 
 def _as_drawn(kernel: Kernel, z: Vertex, y: PathVertex, c: Contribution) -> Contribution:
@@ -251,10 +237,9 @@ def _shadow_ray(kernel: Kernel, z: Vertex, y: PathVertex) -> tuple[mi.Ray3f, ray
 
 
 def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
-    """Number of light vertices to connect with ``z``.
+    """Number of light vertices to connect with ``z``; slot i holds y_{i+1} or a later one.
 
-    Slot i holds y_{i+1} or a later one; paths have at most `Kernel.reach` edges. With media (null events
-    are no edges), or slots of several light subpaths, several vertices may have the same number.
+    With media (null events are no edges), or several light subpaths, slots may hold vertices of one number.
     """
     possible = z.hit & z.connectible() & (z.edges + 2 <= kernel.reach)
     if kernel.has_media or path.guesses:
