@@ -387,12 +387,11 @@ class Recorder(Observer):
             for c in found:
                 total = self.add(traced, c, total, start, lane.shared)
             return total, counted
-        of_drawn = connections.connect_one(traced, z, lane.path, stream)
-        value = of_drawn.weighted()
+        one = connections.connect_one(traced, z, lane.path, stream)
         drawn = np.argmin([self._distances(c, self._drawn) for c in found], axis=0) if found else None
         for i, c in enumerate(found):
-            self._note(c, dr.select(mi.Bool(drawn == i), value, 0))
-        return total + value, of_drawn.counted
+            self._note(c, dr.select(mi.Bool(drawn == i), one.weighted(), 0))
+        return total + one.weighted(), one.counted
 
     def _distances(self, c, end):
         """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
