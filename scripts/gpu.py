@@ -2,7 +2,6 @@
 
     python scripts/gpu.py --output docs/reports/cuda.json            # all scenes of the benchmark
     python scripts/gpu.py --output docs/reports/cuda.json --report   # the page of the file that is there
-    python scripts/gpu.py --ablation --output docs/reports/cuda_ablation.json   # where time goes: ablation.py
 
 Every scene has a process of its own, twelve at a time. First they render all methods once, side by side,
 which compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed.
@@ -25,10 +24,8 @@ import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
-import ablation
 import numpy as np
 import repository
-from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
 from mitsuba_bdpt.measure.results import relative_errors
@@ -183,31 +180,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", default="", help="name of the GPU, for the file")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.json")
     parser.add_argument("--report", action="store_true", help="print the table of the file")
-    group = parser.add_argument_group("where the time of a sample goes")
-    group.add_argument("--ablation", action="store_true", help="one thing changed at a time")
-    group.add_argument("--profile", action="store_true", help="some of its renders, for a profiler; no file")
-    group.add_argument(
-        "--size", type=number(int, 1), default=1024, metavar="N", help="pixels in a row (1024)"
-    )
-    group.add_argument(
-        "--spp", type=number(int, 0), default=0, help="samples per pixel of long renders; 0: chosen"
-    )
-    group.add_argument("--seconds", type=number(float, 0), default=600, metavar="S", help="in all (600)")
-    group.add_argument("--beside", type=number(int, 1), default=12, metavar="N", help="processes (12)")
     return parser
 
 
 def main(arguments=None) -> None:
     """Measure, or write the page."""
     options = build_parser().parse_args(arguments)
-    if options.profile:
-        ablation.profile(options)
-        return
-    if options.ablation:
-        if not options.report:
-            ablation.measure(options)
-        print(ablation.page(json.loads(options.output.read_text())))
-        return
     if not options.report:
         found = {"variant": options.variant, "device": options.device, "spp": SPP, "rows": [], "failed": {}}
         for names in batched(options.scenes or repository.benchmark_scenes(), BESIDE):

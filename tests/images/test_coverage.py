@@ -13,7 +13,6 @@ Roulette is off (paths of up to 3 edges).
 import re
 from pathlib import Path
 
-import compare_ptracer
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -506,19 +505,6 @@ def test_lens_sees_a_point():
         precise(whole, 0.02, name)
         found.append(st.compare_known(whole, known, name))
     assert_agree(found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", compare_ptracer.CASES, ids=lambda case: case.name.split(":")[0])
-def test_what_the_light_tracer_of_mitsuba_gets_wrong(case):
-    """Rationale: docs/user/coverage.md says where `ptracer` is wrong, in numbers.
-
-    Expected: `bdpt` is within 2 % of the right number, `ptracer` is not (where the number is an error:
-    0.05).
-    """
-    row = compare_ptracer.run(case)
-    assert not row.off(row.ours), row
-    assert row.off(row.theirs), row
 
 
 # -- the page ---------------------------------------------------------------------------------

@@ -68,7 +68,6 @@ def by_user(monkeypatch, command, *arguments):
             "compare bdpt path --scenes nowhere",
             "scene='nowhere' is neither a scene file nor the name of one",
         ),
-        ("compare_ptracer.py --only=no-such-case --page missing.md", "missing.md"),
         (
             "equal-time scenes/nowhere",
             "neither a scene file nor the name of one in",
