@@ -24,8 +24,8 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 5819, "tests": 44627}
-MOST_WORDS = 34161
+OUTSIDE = {"scripts": 4746, "tests": 44528}
+MOST_WORDS = 33475
 
 
 def _lines(files):
