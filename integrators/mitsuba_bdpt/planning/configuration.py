@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from .. import components
 from ..scene.prepared import PreparedScene
@@ -16,9 +16,6 @@ from ..settings import Settings
 from ..transport.plan import JOINED, Plan
 from .budget import CHEAP_SAMPLES, EVEN
 from .possible import unsampled_paths
-
-if TYPE_CHECKING:
-    from ..guided_emission import EmissionTables
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class Configuration:
     kappa_light: float
     kappa_direct: float
     guided: int = field(default=0, kw_only=True)
-    emission: EmissionTables | None = field(default=None, kw_only=True)
+    emission: Any = field(default=None, kw_only=True)  # `guided_emission.EmissionTables`
     joined: int = field(default=1, kw_only=True)
 
     @property

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ..guided_emission import EmissionTables
+from typing import Any
 
 # Numbers of light subpaths with which a camera subpath can be connected.
 JOINED = (1, 4)
@@ -45,7 +42,7 @@ class Plan:
     merging: bool = False
     guided: int = 0
     guidable: bool = False
-    emission: EmissionTables | None = None
+    emission: Any = None  # `guided_emission.EmissionTables`
     teachable: bool = False
     joined: int = 1
 
