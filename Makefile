@@ -128,6 +128,8 @@ benchmark: $(INSTALLED)
 	$(VENV)/bin/python scripts/floor.py --record results/benchmark/probes.json
 	$(VENV)/bin/python scripts/report.py results/benchmark
 	cp $(addprefix results/benchmark/,rows.parquet probes.json *.png) docs/reports/benchmark
+	$(VENV)/bin/mitsuba-bdpt figure docs/reports/benchmark --plot efficiency --integrators "path multijitter" volpathmis \
+		-o docs/images/efficiency.png
 
 # What is fixed per render, per object and per pass, over `path`: docs/reports/scale.json.
 scale: $(INSTALLED)
