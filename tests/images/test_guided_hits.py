@@ -1,6 +1,5 @@
 """Guided s = 0: unbiased whatever the photons say; less noisy where a small lamp is behind glass; when."""
 
-import json
 import math
 from dataclasses import replace
 from functools import cache
@@ -17,21 +16,21 @@ from mitsuba_bdpt.planning.choice import Alternatives
 from mitsuba_bdpt.planning.configuration import CANDIDATES
 from mitsuba_bdpt.planning.moments import FINE, GROUPS, GuidableLight, Moments
 from mitsuba_bdpt.planning.planner import Planner
-from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
 from mitsuba_bdpt.transport.photons.photon_guide import Guide
 from mitsuba_bdpt.transport.plan import GUIDED
 from sds_scenes import (
+    ASIDE,
     CASES,
-    CHANGES,
+    assert_no_difference,
+    assert_same_images,
     ball,
-    bumpy,
     glass,
+    guided,
     images,
     matte,
-    mirror,
     point,
     transform,
     under_glass,
@@ -41,27 +40,11 @@ from snapshots import ROUNDING
 import drjit as dr  # isort: skip
 
 SCENES = Path(__file__).parents[2] / "scenes"
-LENS = {"aperture_radius": 0.8}
-
-# Of a lamp that the plate does not mirror into the camera.
-ASIDE = [5.0, 0.0, 4.5]
+ALWAYS, NOT_GUIDED = {"guiding": "always"}, {"guiding": "emission"}
 
 
-def guided(samples):
-    """The decision for all strategies, with so many guided samples."""
-    way = {"light_paths": 1.0, "connections": "one", "guided": samples}
-    more = {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 1.0, "mean": 0.0}
-    return json.dumps([way | more])
-
-
-def scene_of(case, light):
-    more = {
-        name: value(glass() if name == "plate" else matte()) if value is bumpy else value
-        for name, value in CASES[case].items()
-    }
-    if "mirror" in more:
-        more["mirror"] = mirror()
-    return mi.load_dict(under_glass(light, **more))
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
 
 
 # -- the guide ----------------------------------------------------------------------------------------
@@ -133,12 +116,8 @@ def test_large_lamps_look_as_without(case, samples):
     """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what is guided. Expected: the same tiles
     as without, by Welch's test.
     """
-    scene = scene_of(case, ball())
-    if case == "lens":
-        scene = mi.load_dict(under_glass(ball(), kind="thinlens"))
-    a = images(scene, 128, 8, decisions=guided(samples))
-    b = images(scene, 128, 8, first=100, guiding="emission")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    scene = mi.load_dict(under_glass(ball(), **CASES[case]))
+    assert_same_images(scene, {"decisions": guided(samples)}, NOT_GUIDED, spp=128)
 
 
 def test_a_wide_lens():
@@ -146,11 +125,8 @@ def test_a_wide_lens():
     tiles as without.
     """
     scene = under_glass(ball(), kind="thinlens")
-    scene["sensor"] |= LENS
-    scene = mi.load_dict(scene)
-    a = images(scene, 256, 8, guiding="always", skip="none")
-    b = images(scene, 256, 8, first=100, guiding="emission", skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    scene["sensor"] |= {"aperture_radius": 0.8}
+    assert_same_images(mi.load_dict(scene), ALWAYS, NOT_GUIDED, spp=256, skip="none")
 
 
 @pytest.mark.parametrize(
@@ -170,10 +146,7 @@ def test_parameters(parameters):
     """Expected: the same tiles as without guiding, by the balance heuristic and all strategies. (No pixel
     shows the lamp itself.)
     """
-    scene = mi.load_dict(under_glass(ball()))
-    a = images(scene, 128, 8, guiding="always", **parameters)
-    b = images(scene, 128, 8, first=100, guiding="emission")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    assert_same_images(mi.load_dict(under_glass(ball())), ALWAYS | parameters, NOT_GUIDED, spp=128)
 
 
 @cache
@@ -183,21 +156,8 @@ def unchanged():
 
 @pytest.mark.parametrize("change", ["crop window", "border", "features", "instance"])
 def test_what_makes_no_difference(change):
-    """Expected: the same tiles as without guiding and the change (in the pixels that both have); the instance
-    is of the plate.
-    """
-    more = CHANGES[change]
-    changed = under_glass(ball())
-    changed["sensor"]["film"] |= more.get("film", {})
-    if change == "instance":
-        plate = changed.pop("plate")
-        changed["group"] = {"type": "shapegroup", "plate": plate}
-        changed["plates"] = {"type": "instance", "group": {"type": "ref", "id": "group"}}
-    a = images(changed, 128, 8, first=100, decisions=guided(4), **more.get("bdpt", {}))
-    b = unchanged()
-    if change == "crop window":
-        b = b[:, 6:10, 4:12]
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=2)
+    """Expected: the same tiles as without guiding and the change (in the pixels that both have)."""
+    assert_no_difference(change, ball(), unchanged(), spp=128, decisions=guided(4))
 
 
 @pytest.mark.parametrize("how", ["guided", "merging"])
@@ -210,12 +170,8 @@ def test_glass_caustics_under_a_large_lamp(how):
     scale = lamp.find("transform/scale")
     scale.set("value", str(8 * float(scale.get("value"))))
     scene = mi.load_string(ElementTree.tostring(tree.getroot(), "unicode"), resolution=32)
-    parameters = {"guided": {"decisions": guided(4)}, "merging": {"merging": True, "merging_radius": 0.25}}[
-        how
-    ]
-    a = images(scene, 64, 8, max_depth=8, **parameters)
-    b = images(scene, 64, 8, first=100, max_depth=8, guiding="emission")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    parameters = {"decisions": guided(4)} if how == "guided" else {"merging": True, "merging_radius": 0.25}
+    assert_same_images(scene, parameters, NOT_GUIDED, spp=64, max_depth=8)
 
 
 def test_a_lamp_below_the_plate():
@@ -223,9 +179,7 @@ def test_a_lamp_below_the_plate():
     joins; photons come back from the plate. Expected: the same tiles as without.
     """
     scene = mi.load_dict(under_glass(ball(0.1) | {"center": [0.5, 0.0, 0.2]}))
-    a = images(scene, 128, 8, decisions=guided(4))
-    b = images(scene, 128, 8, first=100, guiding="emission")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    assert_same_images(scene, {"decisions": guided(4)}, NOT_GUIDED, spp=128)
 
 
 def test_small_lamps_without_fireflies():
@@ -265,7 +219,7 @@ def test_the_pilot_guides_where_it_pays(monkeypatch):
     guides whatever it costs, and nothing says the contrary.
     """
     scene = caustic()
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6})
+    method = bdpt()
     image = np.array(mi.render(scene, integrator=method, spp=16))
     found = method.statistics
     assert found["decisions"][0]["guided"] == GUIDED and found["unbiased"]
@@ -274,11 +228,11 @@ def test_the_pilot_guides_where_it_pays(monkeypatch):
     assert "used: guided s=0" in text
     again = internals.bdpt(max_depth=6, decisions=found["decisions"])
     np.testing.assert_allclose(np.array(mi.render(scene, integrator=again, spp=16)), image, **ROUNDING)
-    never = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "emission", "merging": False})
+    never = bdpt(guiding="emission", merging=False)
     assert "skipped (by hand): guided s=0: guiding=emission" in never.explain(scene, spp=16)
     assert "guided s=0" not in method.explain(mi.load_dict(mi.cornell_box()), spp=16)
     monkeypatch.setitem(choice.COSTS, "guided", 1e9)
-    always = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "always"})
+    always = bdpt(guiding="always")
     assert always.decide(scene, spp=16)[0]["guided"] == GUIDED
     assert "guided s=0" not in {skipped["class"] for skipped in always.statistics["skipped"]}
 
@@ -321,8 +275,7 @@ def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
     16, and 10 to 14).
     """
     scene = mi.load_dict(under_glass(ball(0.3)))
-    method = mi.load_dict({"type": "bdpt", "max_depth": 8})
-    render = Render(scene, scene.sensors()[0], method.settings, 1, 64)
+    render = Render(scene, scene.sensors()[0], bdpt(max_depth=8).settings, 1, 64)
 
     def parts(guidable, light):
         plan, seed = replace(render.plan, guidable=guidable), mi.UInt32(1)
@@ -424,12 +377,12 @@ def test_pilots_of_any_seed_decide_alike(described, most, monkeypatch):
         scene = mi.load_dict(described())
     else:
         scene = mi.load_file(str(SCENES / f"{described}.xml"), resolution=64)
-    settings = mi.load_dict({"type": "bdpt", "max_depth": 12}).settings
+    settings = bdpt(max_depth=12).settings
     guided = 0
     for spp in (16, 64):
         for seed in range(5):
             monkeypatch.setattr(Planner, "pilot_seed", seed)
-            render = rendering.Render(scene, scene.sensors()[0], settings, 0, spp)
+            render = Render(scene, scene.sensors()[0], settings, 0, spp)
             guided += render.planner.run_pilot()[0].candidate.guided > 0
     assert guided == 10 if most == 10 else guided <= most
 
@@ -442,7 +395,7 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
     """
     described = under_glass(light())
     described["sensor"]["film"] |= {"width": 64, "height": 64}
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    method = bdpt(merging=True)
     for cost, used in ((choice.COSTS["guided"], True), (1e9, needed)):
         monkeypatch.setitem(choice.COSTS, "guided", cost)
         scene = mi.load_dict(described)  # anew: what a pilot has chosen is remembered
@@ -458,18 +411,7 @@ def test_light_that_is_hit_too_rarely_is_merged():
     the image was black. Expected: a tiny lamp is merged, and guided where the user excludes merging."""
     described = under_glass(ball(0.001))
     described["sensor"]["film"] |= {"width": 64, "height": 64}
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    method = bdpt(merging=True)
     image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))
     assert image.any() and method.statistics["merging"]["merges"]
-    unbiased = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": False})
-    assert unbiased.decide(mi.load_dict(described), spp=16)[0]["guided"]
-
-
-def test_no_photon_of_the_guide_is_dropped(monkeypatch):
-    """Expected: with memory for one photon at first the same image, to the rounding of sums."""
-    scene = mi.load_dict(under_glass(ball(0.1)))
-    monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass.FEWEST_PHOTONS", 1 << 8)
-    a = images(scene, 16, 1, guiding="always")
-    monkeypatch.setattr("mitsuba_bdpt.transport.photons.photon_pass._CAPACITY", 0.0)
-    b = images(scene, 16, 1, guiding="always")
-    np.testing.assert_allclose(a, b, **ROUNDING)
+    assert bdpt(merging=False).decide(mi.load_dict(described), spp=16)[0]["guided"]

@@ -21,7 +21,6 @@ from mitsuba_bdpt.planning import possible
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import mis
-from mitsuba_bdpt.transport.inputs import Kernel
 from mitsuba_bdpt.transport.photons import aim, photon_pass
 from mitsuba_bdpt.transport.photons.photon import Photon
 from sds_scenes import (
@@ -35,13 +34,15 @@ from sds_scenes import (
     LAMP,
     SIZE,
     THICKNESS,
+    assert_no_difference,
+    assert_same_images,
     ball,
-    bumpy,
     glass,
     images,
     matte,
-    mirror,
     point,
+    rendered,
+    spark,
     strategy_images,
     transform,
     under_glass,
@@ -55,6 +56,12 @@ import drjit as dr  # isort: skip
 
 # What is left of the blur at a quarter of a pixel, relative; it is 3e-3 at two pixels and falls as r^2.
 BLUR = 1e-3
+
+MERGED = {"merging": True, "merging_radius": 0.25}
+
+
+def bdpt(**parameters):
+    return mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
 
 
 def sun():
@@ -117,7 +124,7 @@ def test_floor_under_glass(light):
     irradiance = (under_a_point if light == "point" else under_the_sun)(at)
     expected = (ALBEDO / np.pi * irradiance * transmitted(cos)).reshape(4, 32, 4, 32).mean((1, 3)).ravel()
     scene = mi.load_dict(under_glass(point() if light == "point" else sun()))
-    found = images(scene, 512, 20, merging=True, merging_radius=0.25)
+    found = images(scene, 512, 20, **MERGED)
     st.check_known(st.tiles(found), expected, relative=0.2, rounding=BLUR)
     st.check_known(found.mean((1, 2)), expected.mean(), relative=0.02, rounding=BLUR)
     if light == "point":
@@ -171,33 +178,18 @@ def test_far_from_the_origin(monkeypatch):
     assert far / near == pytest.approx(1, abs=0.03)
 
 
-# -- against s = 0 -------------------------------------------------------------------------------------
+# -- against guided s = 0 ------------------------------------------------------------------------------
+
+GUIDED = {"merging": False, "guiding": "always"}
 
 
-def lit_by_a_ball(case):
-    more = {
-        name: value(glass() if name == "plate" else matte()) if value is bumpy else value
-        for name, value in CASES[case].items()
-    }
-    if "mirror" in more:
-        more["mirror"] = mirror()
-    return mi.load_dict(under_glass(ball(), **more))
-
-
-@cache
-def without_merging(case):
-    """Tiles of a scene lit by a ball, without merging."""
-    return st.tiles(images(lit_by_a_ball(case), 256, 8, first=100))
-
-
-@pytest.mark.parametrize("parameters", [{}, {"skip": "none"}], ids=["default", "all"])
-@pytest.mark.parametrize("case", CASES)
-def test_large_lamps_look_as_without(case, parameters):
-    """Rationale: of a large lamp s = 0 (and with a lens t = 0) finds what merging finds. Expected: the same
-    tiles, by Welch's test, in discs of a quarter of a pixel.
+@pytest.mark.parametrize("case, heuristic", [*((case, "balance") for case in CASES), ("diffuse", "power")])
+def test_small_lamps_look_as_guided(case, heuristic):
+    """Rationale: of a small lamp guided s = 0 (and with a lens t = 0) finds what merging finds. Expected: the
+    same tiles, by Welch's test, in discs of a quarter of a pixel, with all strategies.
     """
-    a = images(lit_by_a_ball(case), 256, 8, merging=True, merging_radius=0.25, **parameters)
-    st.assert_agree(st.compare_images(st.tiles(a), without_merging(case)), at_least=16)
+    scene = mi.load_dict(under_glass(spark(), **CASES[case]))
+    assert_same_images(scene, MERGED | {"heuristic": heuristic}, GUIDED, spp=256, skip="none")
 
 
 def test_spectral():
@@ -209,18 +201,12 @@ def test_spectral():
     lamp = ball(0.05) | {"emitter": {"type": "area", "radiance": {"type": "rgb", "value": [1000, 600, 200]}}}
     floor = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.6, 0.4]}}
     scene = mi.load_dict(under_glass(lamp, floor))
-    expected = coloured(scene, 256, 8, 100, guiding="always", merging=False)
+    settings = {"max_depth": 6, "rr_depth": 100}
+    expected = rendered(internals.bdpt(**settings, **GUIDED), scene, 256, 8, 100)
     for first, spp, more in ((0, 256, {}), (200, 64, {"spp_per_pass": 4})):
-        found = coloured(scene, spp, 8, first, merging=True, merging_radius=0.25, **more)
+        found = rendered(internals.bdpt(**settings, **MERGED, **more), scene, spp, 8, first)
         family = [st.compare_images(st.tiles(found[..., i]), st.tiles(expected[..., i])) for i in range(3)]
         st.assert_agree(st.Comparisons.join(family), at_least=40)
-
-
-def coloured(scene, spp, seeds, first, **parameters):
-    """(seeds, height, width, 3)."""
-    method = internals.bdpt(**{"max_depth": 6, "rr_depth": 100, **parameters})
-    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
-    return np.array([np.array(image, dtype=np.float64) for image in found])
 
 
 def test_wavelengths_lie_evenly():
@@ -245,16 +231,8 @@ def test_a_lens_and_a_point_lamp():
     """
     scene = under_glass(point(), kind="thinlens")
     scene["sensor"] |= {"aperture_radius": 0.8}
-    scene = mi.load_dict(scene)
-    a = images(scene, 512, 8, merging=True, merging_radius=0.5, skip="none")
-    b = images(scene, 512, 8, first=100, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
-
-
-def test_power_heuristic():
-    """Expected: the same tiles as with the balance heuristic without merging."""
-    a = images(lit_by_a_ball("diffuse"), 256, 8, merging=True, merging_radius=0.25, heuristic="power")
-    st.assert_agree(st.compare_images(st.tiles(a), without_merging("diffuse")), at_least=16)
+    merged = {"merging": True, "merging_radius": 0.5}
+    assert_same_images(mi.load_dict(scene), merged, {}, 4, size=8, spp=512, skip="none")
 
 
 def test_what_is_not_connected_is_merged():
@@ -263,11 +241,7 @@ def test_what_is_not_connected_is_merged():
     """
     scene = under_glass(point())
     scene["sensor"] = views.camera(origin=(0, 0.1, 0.35), target=(0.5, 0, 0), fov=90, size=SIZE)
-    scene = mi.load_dict(scene)
-    a = images(scene, 256, 8, max_depth=4, merging=True, merging_radius=0.25, light_paths=0)
-    b = images(scene, 256, 8, first=100, max_depth=4)
-    assert b.mean() > 0.01
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    assert_same_images(mi.load_dict(scene), MERGED | {"light_paths": 0}, {}, spp=256, max_depth=4)
 
 
 # -- what is smaller than a disc --------------------------------------------------------------------------
@@ -341,7 +315,7 @@ def test_nothing_leaks_through_a_thin_wall():
     below = transform().translate([0, 0, -0.5]).scale([4, 4, 0.1])
     scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
     scene["floor"]["bsdf"] = {"type": "twosided", "bsdf": matte()}
-    assert not images(scene, 64, 2, merging=True, merging_radius=2.0).any()
+    assert not images(scene, 64, 2, merges=False, merging=True, merging_radius=2.0).any()
 
 
 @cache
@@ -351,25 +325,8 @@ def under_glass_and_a_point():
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_makes_no_difference(change):
-    """Expected: the same tiles of the floor as without the change (in the window of pixels that both have);
-    the instance is of the plate.
-    """
-    more = CHANGES[change]
-    changed = under_glass(point())
-    changed["sensor"]["film"] |= more.get("film", {})
-    if change == "instance":
-        plate = changed.pop("plate")
-        changed["group"] = {
-            "type": "shapegroup",
-            "plate": plate | {"to_world": transform().scale([4, 4, 0.1])},
-        }
-        to_world = transform().translate([0, 0, 0.5])
-        changed["again"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    a = under_glass_and_a_point()
-    b = images(changed, 256, 8, first=100, merging=True, **more.get("bdpt", {}))
-    if change == "crop window":
-        a = a[:, 6:10, 4:12]
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=2)
+    """Expected: the same tiles of the floor as without the change (in the pixels that both have)."""
+    assert_no_difference(change, point(), under_glass_and_a_point(), spp=256, merging=True)
 
 
 def test_sensors_without_pixels():
@@ -385,11 +342,11 @@ def test_sensors_without_pixels():
     to_world = transform().translate([0.5, 0, 0.2]).rotate([1, 0, 0], 180).scale(0.2)
     scene["paper"] = {"type": "rectangle", "to_world": to_world, "bsdf": matte(), "sensor": meter}
     scene = mi.load_dict(scene)
-    a = images(scene, 1 << 14, 8, max_depth=4, merging=True, light_paths=0)
-    b = images(scene, 1 << 14, 8, first=100, max_depth=4)
-    merging = mi.load_dict({"type": "bdpt", "max_depth": 4, "merging": True, "light_paths": 0})
-    merging.render(scene, spp=1 << 14)
+    merging = internals.bdpt(max_depth=4, merging=True, light_paths=0)
+    a = rendered(merging, scene, 1 << 14, 8)[..., 0]
     assert merging.statistics["passes"] == 4 * [1 << 12]
+    assert merging.statistics["merging"]["photons"] > 1000
+    b = images(scene, 1 << 14, 8, first=100, max_depth=4)
     assert b.mean() > 0.01
     st.assert_agree(st.compare_images(a.reshape(8, 1), b.reshape(8, 1)))
 
@@ -399,31 +356,29 @@ def test_sensors_without_pixels():
 
 def traced(count=1 << 14):
     """The photons of one pass, as arrays of NumPy."""
-    scene = mi.load_dict(under_glass(ball()))
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
-    render = rendering.Render(scene, scene.sensors()[0], method.settings, 0, 4)
-    kernel: Kernel = render.kernel
+    scene = mi.load_dict(under_glass(point()))
+    render = rendering.Render(scene, scene.sensors()[0], bdpt(merging=True).settings, 0, 4)
     radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
     of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1))
-    of_pass, counts = passes.trace(kernel, of_pass, render.aim, Points("sobol", mi.UInt32(1)), count)
-    found = of_pass.photons.found
-    arrays = [np.array(column) for column in vars(found).values()]
-    return arrays, np.array(of_pass.photons.starts), counts.numpy()
+    of_pass, counts = passes.trace(render.kernel, of_pass, render.aim, Points("sobol", mi.UInt32(1)), count)
+    columns = *vars(of_pass.photons.found).values(), of_pass.photons.starts, counts
+    return [np.array(column) for column in columns]
 
 
-def test_photons_are_in_the_same_order_on_any_number_of_threads():
+def test_photons_are_in_the_same_order_on_any_number_of_threads(monkeypatch):
     """Rationale: photons are kept in the order in which threads find them, and sums of a draw depend on
-    their order. Expected: after sorting they are the same to the bit with one thread and with several.
+    their order; there may be more than there was memory for. Expected: after sorting they and their counts
+    are the same to the bit with one thread, with several, and with room for a few (they are traced again).
     """
-    first, starts, _ = traced()
+    first = traced()
+    starts = first[-2]
     assert len(first[4]) > 1000 and starts[-1] == len(first[4]) and (np.diff(starts.astype(int)) >= 0).all()
     before = dr.thread_count()
     try:
-        for threads in (1, 4):
+        for threads, capacity in ((1, 0.5), (4, 0.5), (4, 1e-3)):
             dr.set_thread_count(threads)
-            again, others, _ = traced()
-            np.testing.assert_array_equal(starts, others)
-            for a, b in zip(first, again, strict=True):
+            monkeypatch.setattr(photon_pass, "_CAPACITY", capacity)
+            for a, b in zip(first, traced(), strict=True):
                 np.testing.assert_array_equal(a, b)
     finally:
         dr.set_thread_count(before)
@@ -463,18 +418,6 @@ def test_discs_hold_few_photons():
     assert passes.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
 
 
-def test_no_photon_is_dropped(monkeypatch):
-    """Rationale: there may be more photons than there was memory for. Expected: with room for a few the same
-    photons and counts, which are traced again.
-    """
-    first, _, counts = traced()
-    monkeypatch.setattr(photon_pass, "_CAPACITY", 1e-3)
-    again, _, others = traced()
-    np.testing.assert_array_equal(counts, others)
-    for a, b in zip(first, again, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 # -- renders -----------------------------------------------------------------------------------------------
 
 
@@ -486,29 +429,24 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     """Rationale: radius and photons of a pass follow from the passes done (of the replicate). Expected: the
     image of a render that went on is that of the one that never stopped, and so is what it leaves out.
     """
-
-    def bdpt():
-        given = {"type": "bdpt", "max_depth": 6, "merging": True, "spp_per_pass": 8}
-        return mi.load_dict(given | parameters)
-
-    scene = mi.load_dict(under_glass(point()))
-    whole, again = bdpt(), bdpt()
+    scene, parameters = mi.load_dict(under_glass(point())), {"merging": True, "spp_per_pass": 8} | parameters
+    whole, again = bdpt(**parameters), bdpt(**parameters)
     expected = np.array(whole.render(scene, seed=3, spp=64))
-    start = stopped(bdpt(), scene, 3, seed=3, spp=64)
+    start = stopped(bdpt(**parameters), scene, 3, seed=3, spp=64)
     found = np.array(again.render(scene, seed=3, spp=64, start=start))
     np.testing.assert_allclose(found, expected, **ROUNDING)
     assert again.statistics["skipped"] == whole.statistics["skipped"]
-    assert expected.any() == (parameters != LEFT_OUT)
+    assert expected.any() == (parameters["merging"] is True)
 
 
 @pytest.mark.parametrize("layers", ["", "variance"])
 def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
     """Rationale: an average of renders, or of replicates, has the bias of the radii of each. Expected: the
     radius shrinks from pass to pass over the replicates of a render, and over the parts of an average."""
-    done, bdpt = [], mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 1, "layers": layers})
+    done, method = [], bdpt(spp_per_pass=1, layers=layers)
     monkeypatch.setattr(passes, "after", lambda radius, samples: done.append(samples) or radius)
-    for bdpt.part in range(3):
-        bdpt.render(mi.load_dict(under_glass(point())), spp=18)
+    for method.part in range(3):
+        method.render(mi.load_dict(under_glass(point())), spp=18)
     assert done == [*range(1, 55)]
 
 
@@ -518,14 +456,13 @@ def test_joined_renders_are_their_mean():
     that they are not unbiased.
     """
     scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
-
-    def bdpt():
-        return mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True, "spp_per_pass": 8})
-
-    snapshots = [stopped(bdpt(), scene, None, seed=seed, spp=spp).image_only() for seed, spp in parts]
-    whole = bdpt()
+    whole, *methods = (bdpt(merging=True, spp_per_pass=8) for _ in range(3))
+    snapshots = [
+        stopped(method, scene, None, seed=seed, spp=spp).image_only()
+        for method, (seed, spp) in zip(methods, parts, strict=True)
+    ]
     image = np.array(whole.assemble(snapshots[0].joined(snapshots[1]), scene))
-    expected = sum(spp / 48 * np.array(bdpt().render(scene, seed=seed, spp=spp)) for seed, spp in parts)
+    expected = sum(spp / 48 * np.array(methods[0].render(scene, seed=seed, spp=spp)) for seed, spp in parts)
     np.testing.assert_allclose(image, expected, **ROUNDING)
     assert np.isfinite(image).all() and image.any()
     found = whole.statistics
@@ -537,11 +474,12 @@ def test_merging_where_light_is_missing(spp):
     """Expected: without a parameter the image of ``merging=true`` where light is missing, with a pilot and
     without one, and its reason; where next to none is missing, that of ``merging=false``."""
     hidden, seen = (mi.load_dict(under_glass(lamp)) for lamp in (point(), ball()))
-    default = mi.load_dict({"type": "bdpt", "max_depth": 6})
+    default = bdpt()
     for scene, merged in ((hidden, True), (seen, False)):
-        found = np.array(default.render(scene, spp=spp, seed=3))
-        given = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": merged})
-        np.testing.assert_allclose(found, np.array(given.render(scene, spp=spp, seed=3)), **ROUNDING)
+        found, expected = (
+            method.render(scene, spp=spp, seed=3) for method in (default, bdpt(merging=merged))
+        )
+        np.testing.assert_allclose(np.array(found), np.array(expected), **ROUNDING)
         assert default.statistics["unbiased"] != merged
     default.render(hidden, spp=spp)
     why = default.statistics["merging"]["why"]
@@ -552,7 +490,7 @@ def test_merging_where_light_is_missing(spp):
 def test_what_a_render_says():
     """Expected: `explain` and the statistics say that the render is not unbiased, and nothing is lost."""
     scene = mi.load_dict(under_glass(point()))
-    plain, merged = (mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": m}) for m in (False, "true"))
+    plain, merged = bdpt(merging=False), bdpt(merging="true")
     assert "not sampled: delta emitter" in plain.explain(scene)
     text = merged.explain(scene)
     assert "not sampled" not in text and "consistent, not unbiased" in text
@@ -572,7 +510,7 @@ def test_no_light_is_called_lost_that_merging_finds(kind):
     """
     scene = mi.load_dict(under_glass(point(), kind=kind))
     more = {"light_paths": 0} if kind == "thinlens" else {}  # without light subpaths no t = 0
-    method = mi.load_dict({"type": "bdpt", "merging": True, **more})
+    method = bdpt(merging=True, max_depth=-1, **more)
     mi.render(scene, integrator=method, spp=4)
     assert method.statistics["unsampled_light"] == {}
 
@@ -616,12 +554,9 @@ def test_an_even_sky():
     """
     sky = {"type": "constant", "radiance": 0.2}
     scene = mi.load_dict(under_glass(sky))
-    a, b = (images(scene, 16, 1, merging=merges) for merges in (True, False))
+    a, b = (images(scene, 16, 1, merges=False, merging=merging) for merging in (True, False))
     np.testing.assert_allclose(a, b, **ROUNDING)
-    scene = mi.load_dict(under_glass(ball(), sky=sky))
-    a = images(scene, 256, 8, merging=True, merging_radius=0.25)
-    b = images(scene, 256, 8, first=100)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    assert_same_images(mi.load_dict(under_glass(spark(), sky=sky)), MERGED, GUIDED, spp=256)
 
 
 def small_glass(lamp, **sensor):
@@ -641,10 +576,10 @@ def test_photons_are_aimed(monkeypatch):
     without (of a tenth of the brightest or more: elsewhere too few photons are not aimed for a test); the
     part of the variance that is merging's is a fifth at most.
     """
-    scene = mi.load_dict(small_glass(point()))
-    a = layers_of_merges(scene)
+    scene, settings = mi.load_dict(small_glass(point())), {"max_depth": 5, "merging_radius": 1.0}
+    a = strategy_images(scene, 64, 16, **settings)[1]["weighted.merged"]
     monkeypatch.setattr(aim, "_specular_boxes", lambda *_: [])
-    b = layers_of_merges(scene, 100)
+    b = strategy_images(scene, 64, 16, 100, **settings)[1]["weighted.merged"]
     assert a.var(0, ddof=1).mean() < 0.2 * b.var(0, ddof=1).mean()
     bright = st.tiles(a).mean(0) > 0.1 * st.tiles(a).mean(0).max()
     st.assert_agree(st.compare_images(st.tiles(a)[:, bright], st.tiles(b)[:, bright]), at_least=5)
@@ -662,14 +597,6 @@ def test_a_lens_where_photons_are_aimed(monkeypatch):
     monkeypatch.setattr(aim, "_specular_boxes", lambda *_: [])
     b = images(scene, 512, 8, first=100, merging=True, merging_radius=0.5, skip="none")
     st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
-
-
-def layers_of_merges(scene, first=0):
-    """(seeds, height, width) of the first colour of the merges."""
-    method = mi.load_dict({"type": "bdpt", "max_depth": 5, "merging": True, "layers": "strategies"})
-    at = 3 + method.aov_names().index("weighted.merged.R")
-    found = [mi.render(scene, integrator=method, spp=64, seed=first + i) for i in range(16)]
-    return np.array([np.array(image, dtype=np.float64)[..., at] for image in found])
 
 
 def test_density_of_aimed_directions():
@@ -699,7 +626,7 @@ def test_density_of_aimed_directions():
 def test_what_needs_no_merging():
     """Expected: without specular surfaces no photon is traced, the render unbiased, as `explain` says."""
     scene = mi.load_dict(under_glass(ball(), plate=matte()))
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "merging": True})
+    method = bdpt(merging=True)
     assert "skipped (impossible): merging: without specular surfaces" in method.explain(scene)
     mi.render(scene, integrator=method, spp=4)
     assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
@@ -708,7 +635,7 @@ def test_what_needs_no_merging():
 def test_what_is_refused():
     """Expected: errors that name the parameter, what is in the way, and the remedy; by default, with merging
     where it is possible, one warning."""
-    method, default = (mi.load_dict({"type": "bdpt", **more}) for more in ({"merging": True}, {}))
+    method, default = bdpt(merging=True), bdpt()
     moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
     fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}

@@ -1,6 +1,5 @@
 """Photon-guided BSDF sampling through near-specular lobes; scenes as in `test_near_specular_merging`."""
 
-import json
 from pathlib import Path
 
 import internals
@@ -16,9 +15,12 @@ from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport import sds
 from mitsuba_bdpt.transport.photons import guided_hits
 from sds_scenes import (
+    ASIDE,
     NEAR_SPECULAR,
     STRATEGIES,
+    assert_same_images,
     ball,
+    guided,
     images,
     near_specular_scene,
     rough,
@@ -30,15 +32,7 @@ from sds_scenes import (
 
 SCENES = Path(__file__).parents[2] / "scenes"
 
-# Of a lamp that the plate does not mirror into the camera.
-ASIDE = [5.0, 0.0, 4.5]
-
-
-def guided(samples):
-    """The decision for all strategies, with so many guided samples."""
-    way = {"light_paths": 1.0, "connections": "one", "guided": samples}
-    more = {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 1.0, "mean": 0.0}
-    return json.dumps([way | more])
+ALWAYS, NEVER = {"guiding": "always", "spp": 128}, {"guiding": "never", "spp": 256}
 
 
 @pytest.mark.parametrize("case", NEAR_SPECULAR)
@@ -53,11 +47,7 @@ def test_images_are_those_without_guiding(case):
 
 @pytest.mark.parametrize(
     "parameters",
-    [
-        *STRATEGIES,
-        {"skip": "none", "stored_vertices": 1},
-        {"rr_depth": 1},
-    ],
+    [*STRATEGIES, {"skip": "none", "stored_vertices": 1}, {"rr_depth": 1}],
     ids=str,
 )
 def test_any_choice_of_strategies_has_the_same_mean(parameters):
@@ -72,10 +62,7 @@ def test_a_wide_lens():
     """Rationale: t = 0 samples SDS paths, and leaves them to s = 0. Expected: the tiles without guiding."""
     described = under_glass(ball(), plate=rough(0.02), kind="thinlens")
     described["sensor"] |= {"aperture_radius": 0.8}
-    described = mi.load_dict(described)
-    a = images(described, 256, 8, guiding="always", skip="none")
-    b = images(described, 256, 8, first=100, guiding="never", skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+    assert_same_images(mi.load_dict(described), ALWAYS | {"spp": 256}, NEVER, 12, skip="none")
 
 
 def half_sky():
@@ -95,20 +82,14 @@ def test_other_emitters(lamps):
     if lamps != "sky":
         position = [0.0, 0.5, 2.0]
         more = {"light": ball(), "point": {"type": "point", "position": position, "intensity": 1.0}}
-    described = mi.load_dict(under_glass(plate=rough(0.2), **more))
-    a = images(described, 128, 8, guiding="always")
-    b = images(described, 256, 8, first=100, guiding="never")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+    assert_same_images(mi.load_dict(under_glass(plate=rough(0.2), **more)), ALWAYS, NEVER, 12)
 
 
 @pytest.mark.parametrize("variant", ["spectral", "mono", "mono_polarized"])
 def test_variants(variant):
     """Expected: in each kind of variant the tiles without guiding."""
     mi.set_variant(variants.of(variant))
-    described = mi.load_dict(under_glass(ball(), plate=rough(0.03)))
-    a = images(described, 128, 8, guiding="always")
-    b = images(described, 256, 8, first=100, guiding="never")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+    assert_same_images(mi.load_dict(under_glass(ball(), plate=rough(0.03))), ALWAYS, NEVER, 12)
 
 
 def nested():
@@ -124,10 +105,7 @@ def nested():
 
 def test_nested_bsdfs():
     """Expected: through maps, masks and two sides the tiles without guiding."""
-    described = mi.load_dict(nested())
-    a = images(described, 128, 8, decisions=guided(4))
-    b = images(described, 256, 8, first=100, guiding="never")
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
+    assert_same_images(mi.load_dict(nested()), {"decisions": guided(4), "spp": 128}, NEVER, 12)
 
 
 @pytest.mark.parametrize("alpha", [0.001, 0.05])
@@ -210,8 +188,7 @@ def test_an_unrelated_ball_changes_no_prediction():
     found = []
     for more in ({}, {"ball": polished()}):
         scene = mi.load_dict(lit_metal(**more))
-        settings = mi.load_dict({"type": "bdpt", "max_depth": 8}).settings
-        render = Render(scene, scene.sensors()[0], settings, 0, 256)
+        render = Render(scene, scene.sensors()[0], internals.bdpt(max_depth=8).settings, 0, 256)
         light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256, 0)
         found.append([light.light.sum(), light.second.sum()])
     np.testing.assert_allclose(*found, rtol=0.25)
@@ -238,7 +215,7 @@ def test_pilots_of_any_seed_decide_alike(alpha, guides, monkeypatch):
     scene = mi.load_file(str(SCENES / "rough_glass_caustics.xml"), resolution=64, alpha=alpha)
 
     def chosen(guiding):
-        settings = mi.load_dict({"type": "bdpt", "max_depth": 8, "guiding": guiding}).settings
+        settings = internals.bdpt(max_depth=8, guiding=guiding).settings
         return Render(scene, scene.sensors()[0], settings, 0, 64).planner.run_pilot()[0]
 
     for seed in range(3):
@@ -253,10 +230,7 @@ def test_light_that_is_not_guided_is_in_a_second_pilot(monkeypatch):
     it."""
     scene = mi.load_file(str(SCENES / "rough_glass_caustics.xml"), resolution=64, alpha=0.005)
     monkeypatch.setitem(choice.COSTS, "guided", 1e9)
-    auto, never = (
-        mi.load_dict({"type": "bdpt", "max_depth": 8, "guiding": guiding}).settings
-        for guiding in ("auto", "emission")
-    )
+    auto, never = (internals.bdpt(max_depth=8, guiding=guiding).settings for guiding in ("auto", "emission"))
     found = [Render(scene, scene.sensors()[0], each, 0, 64).planner.run_pilot() for each in (auto, never)]
     assert not found[0][0].candidate.guided and found[0][0].variance == found[1][0].variance
 

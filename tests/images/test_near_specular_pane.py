@@ -8,59 +8,38 @@ which `test_merging.py` compares with a closed form.
 
 from functools import cache
 
-import mitsuba as mi
 import numpy as np
 import pytest
-import variants
+import sds_scenes
+import views
+from sds_scenes import glass, matte, principled, rough, transform
 
-SPP, SIZE, SEEDS = 64, 48, 4
+SIZE, SEEDS = 48, 4
 # Pixels around the highlight.
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] - (SIZE - 1) / 2
 BESIDE = np.hypot(ROWS, COLUMNS) > 14
 
-
-@pytest.fixture(autouse=True)
-def variant():
-    mi.set_variant(variants.of("rgb"))
-
-
-def glass(alpha):
-    return {"type": "roughdielectric", "int_ior": 1.5, "ext_ior": 1.0, "alpha": alpha}
-
-
-def principled(roughness):
-    clear = {"type": "rgb", "value": 1.0}
-    return {"type": "principled", "base_color": clear, "spec_trans": 1.0, "eta": 1.5, "roughness": roughness}
-
-
-PANES = {f"alpha {alpha}": glass(alpha) for alpha in (1e-4, 1e-3, 3e-3, 0.01, 0.02, 0.03)}
+PANES = {f"alpha {alpha}": rough(alpha) for alpha in (1e-4, 1e-3, 3e-3, 0.01, 0.02, 0.03)}
 PANES |= {f"roughness {roughness}": principled(roughness) for roughness in (0.0, 0.05, 0.1, 0.15, 0.2)}
 
 
 def images(bsdf, reflectance=0.5, seeds=SEEDS):
     """(seeds, height, width) of the first colour."""
-    transform = mi.ScalarTransform4f()
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
-    view = transform.look_at(origin=[0, -1.5, 5], target=[0, 0, 0], up=[0, 1, 0])
-    to_world = transform.translate([0, 0, 1]).scale([1.5, 1.5, 0.05])
-    matte = {"type": "diffuse", "reflectance": reflectance}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {"type": "perspective", "fov": 25, "to_world": view, "film": film},
-            "floor": {"type": "rectangle", "to_world": transform.scale(1.5), "bsdf": matte},
-            "pane": {"type": "cube", "to_world": to_world, "bsdf": bsdf},
-            "lamp": {"type": "point", "position": [0, 0, 2], "intensity": 10.0},
-        }
-    )
-    method = mi.load_dict({"type": "bdpt", "max_depth": 8, "skip": "none", "merging": True})
-    found = [mi.render(scene, integrator=method, spp=SPP, seed=seed) for seed in range(seeds)]
-    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+    to_world = transform().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])
+    scene = {
+        "type": "scene",
+        "sensor": views.camera(origin=(0, -1.5, 5), target=(0, 0, 0), fov=25, size=SIZE),
+        "floor": {"type": "rectangle", "to_world": transform().scale(1.5), "bsdf": matte(reflectance)},
+        "pane": {"type": "cube", "to_world": to_world, "bsdf": bsdf},
+        "lamp": {"type": "point", "position": [0, 0, 2], "intensity": 10.0},
+    }
+    settings = {"max_depth": 8, "skip": "none", "merging": True}
+    return sds_scenes.images(scene, 64, seeds, merges=reflectance > 0, **settings)
 
 
 @cache
 def under_ideal_glass():
-    return images({"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0})[:, BESIDE].mean()
+    return images(glass())[:, BESIDE].mean()
 
 
 @pytest.mark.parametrize("pane", PANES)

@@ -10,13 +10,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import views
-import welch as st
 from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.sampling import sobol
 from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
-from sds_scenes import ball, images, matte, point, transform, under_glass
+from sds_scenes import assert_same_images, ball, images, matte, point, transform, under_glass
 from snapshots import ROUNDING
 
 import drjit as dr  # isort: skip
@@ -50,9 +49,8 @@ def test_no_path_is_longer_than_max_depth(described, edges, lamp, way):
     scene = mi.load_dict(described(lamp))
     for depth in (edges - 1, edges):
         settings = {"max_depth": depth, "skip": "impossible"}
-        a, b = (
-            images(scene, 16, 1, **settings, **w) for w in (way, {"guiding": "emission", "merging": False})
-        )
+        a = images(scene, 16, 1, merges=depth == edges, **settings, **way)
+        b = images(scene, 16, 1, **settings, guiding="emission", merging=False)
         assert np.allclose(a, b, **ROUNDING) == (depth < edges)
 
 
@@ -155,6 +153,5 @@ def test_a_sun_with_hide_emitters():
     pixels[10:12, 8:10] = 200.0
     sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": transform().rotate([1, 0, 0], 90)}
     scene = mi.load_dict(under_glass(sky))
-    a = images(scene, 32, 6, guiding="always", hide_emitters=True)
-    b = images(scene, 32, 6, first=100, guiding="emission", hide_emitters=True)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=16)
+    given, other = {"guiding": "always"}, {"guiding": "emission"}
+    assert_same_images(scene, given, other, spp=32, seeds=6, hide_emitters=True)

@@ -1,5 +1,6 @@
 """Scenes of SDS paths: a floor under a plate of glass, lamp and camera above."""
 
+import json
 from functools import cache
 
 import internals
@@ -10,6 +11,8 @@ import welch as st
 
 LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 
+# Of a lamp that the plate does not mirror into the camera.
+ASIDE = [5.0, 0.0, 4.5]
 
 IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
 
@@ -36,6 +39,11 @@ def ball(radius=0.5):
     }
 
 
+def spark():
+    """A lamp with the flux of `ball`, so small that paths from it through the plate are merged."""
+    return ball(0.05) | {"emitter": {"type": "area", "radiance": 1000.0}}
+
+
 def glass():
     return {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}
 
@@ -55,12 +63,34 @@ def under_glass(light, floor=None, plate=None, kind="perspective", **more):
     }
 
 
-def images(scene, spp, seeds, first=0, **parameters):
-    """(seeds, height, width) of the first colour."""
+def rendered(method, scene, spp, seeds, first=0, merges=True):
+    """(seeds, height, width, channels); unless not ``merges``, ``merging=true`` merges vertices."""
+    found, merged = [], 0
+    for seed in range(first, first + seeds):
+        found.append(np.array(mi.render(scene, integrator=method, spp=spp, seed=seed), dtype=np.float64))
+        merged += method.statistics.get("merging", {}).get("merges", 0)
+    assert merged or not merges or method.settings.merging is not True, "nothing is merged"
+    return np.array(found)
+
+
+def images(scene, spp, seeds=8, first=0, merges=True, **parameters):
+    """(seeds, height, width) of the first colour; see `rendered`."""
     scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
     method = internals.bdpt(**{"max_depth": 6, "rr_depth": 100, **parameters})
-    found = [mi.render(scene, integrator=method, spp=spp, seed=first + i) for i in range(seeds)]
-    return np.array([np.array(image, dtype=np.float64)[..., 0] for image in found])
+    return rendered(method, scene, spp, seeds, first, merges)[..., 0]
+
+
+def assert_same_images(scene, given, other, at_least=16, size=4, **both):
+    """Expects the same tiles of ``size`` pixels, by Welch's test, with these parameters of `images`."""
+    a, b = images(scene, **both, **given), images(scene, first=100, **both, **other)
+    st.assert_agree(st.compare_images(st.tiles(a, size), st.tiles(b, size)), at_least=at_least)
+
+
+def guided(samples):
+    """The decision for all strategies, with so many guided samples."""
+    way = {"light_paths": 1.0, "connections": "one", "guided": samples}
+    more = {"coefficients": {"t<=1": 1.0, "s=1": 1.0}, "cost": 1.0, "variance": 1.0, "mean": 0.0}
+    return json.dumps([way | more])
 
 
 def bumpy(bsdf):
@@ -81,10 +111,10 @@ CASES = {
     "plastic": {"floor": {"type": "plastic"}},
     "rough metal": {"floor": {"type": "roughconductor", "alpha": 0.3}},
     "rough glass above": {"plate": {"type": "thindielectric"}},
-    "bumpy glass": {"plate": bumpy},
-    "bumpy floor": {"floor": bumpy},
+    "bumpy glass": {"plate": bumpy(glass())},
+    "bumpy floor": {"floor": bumpy(matte())},
     "masked floor": {"floor": {"type": "mask", "opacity": 0.6, "bsdf": {"type": "diffuse"}}},
-    "mirror": {"mirror": mirror},
+    "mirror": {"mirror": mirror()},
     "lens": {"kind": "thinlens"},
 }
 
@@ -98,12 +128,26 @@ CHANGES = {
 }
 
 
-def strategy_images(scene, spp, seeds, **more):
+def assert_no_difference(change, light, expected, spp, **parameters):
+    """Expects the tiles of ``expected`` images with one of `CHANGES`; the instance is of the plate."""
+    more, scene = CHANGES[change], under_glass(light)
+    scene["sensor"]["film"] |= more.get("film", {})
+    if change == "instance":
+        plate = scene.pop("plate") | {"to_world": transform().scale([4, 4, 0.1])}
+        again = {"type": "instance", "to_world": transform().translate([0, 0, 0.5])}
+        scene["group"] = {"type": "shapegroup", "plate": plate}
+        scene["again"] = again | {"group": {"type": "ref", "id": "group"}}
+    found = images(scene, spp, first=100, **parameters, **more.get("bdpt", {}))
+    if change == "crop window":
+        expected = expected[:, 6:10, 4:12]
+    st.assert_agree(st.compare_images(st.tiles(found), st.tiles(expected)), at_least=2)
+
+
+def strategy_images(scene, spp, seeds, first=0, **more):
     """Images and layers of the first colour by name, each (seeds, height, width)."""
     parameters = {"max_depth": 6, "rr_depth": 100, "merging": True, "merging_radius": 0.25}
     method = internals.bdpt(**parameters | {"layers": "strategies"} | more)
-    found = [np.array(mi.render(scene, integrator=method, spp=spp, seed=i)) for i in range(seeds)]
-    found = np.array(found, dtype=np.float64)
+    found = rendered(method, scene, spp, seeds, first)
     names = method.aov_names()
     assert found.shape[-1] == 3 + len(names)
     return found[..., 0], {n[:-2]: found[..., 3 + i] for i, n in enumerate(names) if n.endswith(".R")}
@@ -139,10 +183,10 @@ NEAR_SPECULAR = {
     "alpha .005": {"plate": rough(0.005)},
     "alpha .03": {"plate": rough(0.03)},
     "alpha .15": {"plate": rough(0.15)},
-    "ramp": {"plate": ramp},
+    "ramp": {"plate": ramp()},
     "principled": {"plate": principled(0.1)},
     "blend": {"plate": {"type": "blendbsdf", "weight": 0.4, "a": rough(0.01), "b": rough(0.3)}},
-    "bumpy": {"plate": bumpy},
+    "bumpy": {"plate": bumpy(rough(0.02))},
     "steel": {"plate": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}, "mirror": steel(0.02)},
     "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
     "lens": {"plate": rough(0.02), "kind": "thinlens"},
@@ -151,10 +195,7 @@ NEAR_SPECULAR = {
 
 @cache
 def near_specular_scene(case):
-    more = dict(NEAR_SPECULAR[case])
-    if callable(more["plate"]):
-        more["plate"] = more["plate"](rough(0.02)) if more["plate"] is bumpy else more["plate"]()
-    return mi.load_dict(under_glass(ball(), **more))
+    return mi.load_dict(under_glass(ball(), **NEAR_SPECULAR[case]))
 
 
 @cache

@@ -58,7 +58,8 @@ class Aim:
         """
         number = None
         if self.spheres:
-            aimed, u_x = _halved(u_direction.x)
+            aimed = u_direction.x >= 0.5
+            u_x = dr.minimum(2 * u_direction.x - dr.select(aimed, 1, 0), 1 - 2**-24)
             u_direction = mi.Point2f(u_x, u_direction.y)
         e = emitters.sample_emission(u_point, u_direction, shared, mi.Bool(True))
         if self.spheres:
@@ -100,12 +101,6 @@ class Aim:
         sin = dr.safe_sqrt(down * (2 - down))
         s, c = dr.sincos(dr.two_pi * u.y)
         return number, mi.Frame3f(axis).to_world(mi.Vector3f(sin * c, sin * s, 1 - down))
-
-
-def _halved(u: mi.Float) -> tuple[mi.Bool, mi.Float]:
-    """Whether ``u`` is in the upper half of [0, 1), and ``u`` rescaled in its half."""
-    upper = u >= 0.5
-    return upper, dr.minimum(2 * u - dr.select(upper, 1, 0), 1 - 2**-24)
 
 
 def _aimable(e: Emission) -> mi.Bool:

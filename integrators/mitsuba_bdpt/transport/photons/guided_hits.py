@@ -103,10 +103,8 @@ class _Guided(PhotonStrategy):
         return active & on_sds_path
 
 
-class Unguided(Guiding):
+class Unguided(PhotonStrategy):
     """Leaves out s = 0 where it could be guided, in a pilot."""
-
-    counters = ()
 
     def __init__(self, near_specular: bool):
         self.near_specular = near_specular
@@ -117,7 +115,7 @@ class Unguided(Guiding):
     def begin_camera(self, kernel, walk):
         if self.near_specular:
             return begun_near_specular(walk, light=False)
-        return super().begin_camera(kernel, walk)
+        return replace(walk, sds=State(mi.Bool(True), guided=mi.Float(0)))
 
     def advise(self, kernel, adjoint, vertex, walk, step) -> Advice | None:
         """A guide that has the BSDF's density of the walk's direction."""
@@ -125,9 +123,6 @@ class Unguided(Guiding):
             return None
         possible = is_sds_vertex(kernel, vertex, adjoint)
         return Advice(possible, mi.UInt32(0), dr.select(possible, step.pdf_fwd_w, 0))
-
-    def visit(self, kernel, z, walk, stream, shared, add, state):
-        return state
 
     def counts(self, active, on_sds_path):
         return active & ~on_sds_path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import drjit as dr
 import mitsuba as mi
@@ -18,8 +18,7 @@ class Photon:
     times the coefficient of the connection of the last edge; ``older``, its ``d_vc``; ``d_vm`` and
     ``d_vm_newest``. ``aim``: the emitter's own density of the first direction over that of `Aim`;
     ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``:
-    index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`, None without such
-    layers.
+    index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`.
     """
 
     p: mi.Point3f
@@ -35,26 +34,18 @@ class Photon:
     edges: mi.UInt32
     lane: mi.UInt32
     emitter: mi.UInt32
-    layer: mi.UInt32 | None = None
+    layer: mi.UInt32
 
     @staticmethod
-    def zeros(count: int, layered: bool = False) -> Photon:
-        """Memory for ``count`` photons, ``layered`` with path layers."""
+    def zeros(count: int) -> Photon:
+        """Memory for ``count`` photons."""
         # Dr.Jit would keep the types of the first variant in use.
-        kinds = get_type_hints(Photon) | {"layer": mi.UInt32 if layered else type(None)}
-        return Photon(**{name: dr.zeros(kind, count) for name, kind in kinds.items()})
+        return Photon(**{name: dr.zeros(kind, count) for name, kind in get_type_hints(Photon).items()})
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
         """The photons at ``index``."""
-        present = self._present().items()
-        return replace(
-            self, **{name: dr.gather(type(values), values, index, active) for name, values in present}
-        )
+        return replace(self, **{name: dr.gather(type(x), x, index, active) for name, x in vars(self).items()})
 
     def put(self, photon: Photon, index: mi.UInt32, active: mi.Bool):
         """Store ``photon`` at ``index``."""
-        dr.scatter(self._present(), photon._present(), index, active)
-
-    def _present(self) -> dict[str, Any]:
-        """Its fields by name; Dr.Jit scatters no None."""
-        return {name: values for name, values in vars(self).items() if values is not None}
+        dr.scatter(vars(self), vars(photon), index, active)

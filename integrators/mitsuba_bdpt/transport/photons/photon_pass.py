@@ -94,7 +94,7 @@ def trace(kernel: Kernel, policy: PhotonPolicy, aim: Aim, points: Points, count:
     kernel = kernel.bound(points)
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        traced = _traced(kernel, policy, aim, count, Photon.zeros(capacity, kernel.path_layers))
+        traced = _traced(kernel, policy, aim, count, Photon.zeros(capacity))
         if traced.count <= capacity:
             return traced
         capacity = traced.count  # again, with more memory
@@ -131,7 +131,7 @@ def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Pho
             edges=y.edges,
             lane=lanes,
             emitter=e.index,
-            layer=y.layer,
+            layer=y.layer if kernel.path_layers else mi.UInt32(0),
         )
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         out.put(found, place, keep & (place < most))
