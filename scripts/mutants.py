@@ -1375,7 +1375,7 @@ MUTANTS = (
         "transport/sds.py",
         "isolated = self.isolated & (step.delta",
         "isolated = (step.delta",
-        ("tests/images/test_guided_hits.py::test_glass_caustics_under_a_large_lamp[guided]",),
+        ("tests/images/test_guided_hits.py::test_glass_caustics[guided]",),
     ),
     Mutant(
         "merging: walks compare merges with the coefficient of t = 1, merges with its count",

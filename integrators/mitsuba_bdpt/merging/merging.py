@@ -103,9 +103,9 @@ class Merging(PhotonStrategy, PhotonPolicy):
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
         return dr.minimum(_probability(d_vc, self.ratio(vertex.si.p)) / survived, 1)
 
-    def stored(self, kernel, y, walk: Any, stream):
+    def stored(self, kernel, y, stream):
         keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
-        probability = self.kept(kernel, y, walk.sds.survived)
+        probability = self.kept(kernel, y, y.sds.survived)
         u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
         return keep & (u < probability), probability
 

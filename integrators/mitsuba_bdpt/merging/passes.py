@@ -25,8 +25,8 @@ SAMPLES_PER_PHOTON = 8
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Samples per pixel of a pass, of one that merges many vertices, and least samples of a pass: its photons and
-# its queries grow with them, and merges with their product (experiments, "Which paths are merged").
+# Samples per pixel of a pass, of one that merges many vertices, and least samples of a pass: merges grow with
+# their square (experiments, "Which paths are merged").
 _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 
 # Bits of the edges and of the subpath's index in the sort key of photons.
@@ -44,10 +44,7 @@ def why_not(sensor: mi.Sensor, media: bool) -> str:
 
 
 class Passes:
-    """Vertex merging in one render of ``pixels`` pixels; ``aim`` of the photons.
-
-    ``near_specular``: the scene has near-specular lobes, whose vertices are merged too.
-    """
+    """Vertex merging in one render of ``pixels`` pixels; ``near_specular``: the scene has such lobes."""
 
     def __init__(
         self,
@@ -58,7 +55,6 @@ class Passes:
         pixels: int,
         near_specular: bool,
     ):
-        # Without light subpaths most camera vertices are merged.
         many = near_specular or settings.light_paths == 0
         self._pass = _SHORT_PASS if many else _PASS
         self._footprints = Footprints.of(scene, sensor)

@@ -22,9 +22,8 @@ _LOWEST, _HIGHEST = 1 / 8, 8
 # Radius in diagonals of the scene where no pixels can be measured (meters, custom sensors, empty views).
 _OF_DIAGONAL = 1 / 512
 
-# Exponent alpha: the radius is proportional to i^((alpha - 1) / 2) in pass i (C. Knaus and M. Zwicker,
-# "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15). Here i is the number of samples per
-# pixel over `_OF_SAMPLES`, so that passes of any length have the same radius.
+# Exponent alpha: the radius is proportional to i^((alpha - 1) / 2) (C. Knaus and M. Zwicker, "Progressive
+# Photon Mapping: A Probabilistic Approach", 2011, eq. 15); i is the number of samples over `_OF_SAMPLES`.
 SHRINKING, _OF_SAMPLES = 2 / 3, 64
 
 
@@ -42,11 +41,10 @@ _STEEPEST_ROUNDING = OFFSET_ULPS * 2.0**-24
 
 @dataclass
 class Radius:
-    """``base`` + ``angle`` * distance from ``centre``, within ``low`` and ``high``.
+    """``base`` + ``angle`` * distance from ``centre``, within ``low`` and ``high`` (scene units).
 
-    In scene units; at least the rounding error of the position, since smaller discs contain too few photons,
-    or too many. Fields are opaque, so that passes share one kernel. A function of position only: otherwise
-    weights of photons and camera vertices would not sum to 1.
+    At least the rounding error of the position, since smaller discs contain too few photons, or too many.
+    Fields are opaque, so that passes share one kernel.
     """
 
     centre: mi.Point3f
@@ -88,9 +86,8 @@ class Footprints:
         """The radius of ``factor`` pixels."""
         angle = min(self.angle * factor, _STEEPEST)
         low, high = self.median * factor * _LOWEST, self.median * factor * _HIGHEST
-        radius = Radius(
-            mi.Point3f(*self.centre), *(mi.Float(x) for x in (self.base * factor, angle, low, high))
-        )
+        sizes = (mi.Float(x) for x in (self.base * factor, angle, low, high))
+        radius = Radius(mi.Point3f(*self.centre), *sizes)
         dr.make_opaque(radius)
         return radius
 
@@ -103,7 +100,10 @@ class Footprints:
         si = scene.ray_intersect(mi.Ray3f(ray))
         found = np.isfinite(np.array(si.t))
         if not ray.has_differentials or not found.any():
-            return Footprints._without_pixels(scene)
+            box = scene_box(scene)
+            diagonal = math.dist([*box.min], [*box.max])
+            size = diagonal * _OF_DIAGONAL if 0 < diagonal < math.inf else 1.0
+            return Footprints((0.0, 0.0, 0.0), size, 0.0, size, measured=False)
         spread = dr.norm(ray.d_x - ray.d)
         size = np.array(dr.norm(ray.o_x - ray.o + (ray.d_x - ray.d) * si.t))
         median, angle = float(np.median(size[found])), float(np.median(np.array(spread)))
@@ -111,10 +111,3 @@ class Footprints:
             return Footprints((0.0, 0.0, 0.0), median, 0.0, median)
         centre = world_matrix(sensor)[:3, 3]
         return Footprints(tuple(centre.tolist()), 0.0, angle, median)
-
-    @staticmethod
-    def _without_pixels(scene: mi.Scene) -> Footprints:
-        box = scene_box(scene)
-        diagonal = math.dist([*box.min], [*box.max])
-        size = diagonal * _OF_DIAGONAL if 0 < diagonal < math.inf else 1.0
-        return Footprints((0.0, 0.0, 0.0), size, 0.0, size, measured=False)

@@ -33,13 +33,10 @@ GUIDABLE = ("light", "second", "fourth", "vertices")
 
 @dataclass
 class Undersampled(Unsampled):
-    """Which merges count as missing in a render of ``samples`` per pixel.
-
-    ``kinds``: sums of sizes by kind, see `KINDS`.
-    """
+    """Which merges count as missing in a render of ``samples`` per pixel; ``sums`` of sizes by `KINDS`."""
 
     samples: mi.Float
-    kinds: mi.Float64 = field()
+    sums: mi.Float64 = field()
 
     only_specular = NARROW
 
@@ -51,10 +48,10 @@ class Undersampled(Unsampled):
     def begin(self, kernel, e, walk):
         return super().begin(kernel, e, walk) if kernel.plan.guided else walk
 
-    def stored(self, kernel, y, walk, stream):
+    def stored(self, kernel, y, stream):
         return has_lobe(kernel, y), 1.0
 
-    def is_merged(self, kernel, z, walk):
+    def is_merged(self, kernel, z):
         return has_lobe(kernel, z)
 
     def missing(self, kernel, merging, z, found, position):
@@ -65,7 +62,7 @@ class Undersampled(Unsampled):
         for bound in KINDS[:-1]:
             kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
         size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
-        dr.scatter_add(self.kinds, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
+        dr.scatter_add(self.sums, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
         return active & ~(expected >= FEWEST)  # NaN counts
 
     def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
@@ -86,22 +83,19 @@ class Undersampled(Unsampled):
 class Guidable(Undersampled):
     """Which merges are on paths that photons can guide.
 
-    Camera subpaths go on as long as no edge is connectible, and merge where s = 0 can be guided.
-    ``guidable``: sums of `GUIDABLE` over camera samples by tile of the film, ``tiles`` per direction; with
-    fewer than ``rarest`` expected samples in a pixel s = 0 does not find the light.
+    Camera subpaths go on as long as no edge is connectible, and merge where s = 0 can be guided. ``sums`` of
+    `GUIDABLE` over camera samples by tile of the film, ``tiles`` per direction; with fewer than ``rarest``
+    expected samples in a pixel s = 0 does not find the light.
     """
 
     rarest: mi.Float
     tiles: int
-    guidable: mi.Float64
 
     @staticmethod
     def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
         """Empty sums for a render of ``samples`` per pixel."""
-        sums = dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE))
-        return Guidable(
-            **vars(Undersampled.of(samples)), rarest=dr.opaque(mi.Float, rarest), tiles=tiles, guidable=sums
-        )
+        given, rare = (dr.opaque(mi.Float, x) for x in (samples, rarest))
+        return Guidable(given, dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE)), rare, tiles)
 
     def begin(self, kernel, e, walk):
         return replace(walk, active=walk.active & ~e.delta)  # s = 0 samples no others
@@ -110,7 +104,7 @@ class Guidable(Undersampled):
         walk = Unguided(kernel.near_specular).begin_camera(kernel, walk)
         return walk, replace(side, connect=None, isolated=True)
 
-    def is_merged(self, kernel, z, walk):
+    def is_merged(self, kernel, z):
         return is_sds_vertex(kernel, z, adjoint=False)
 
     def missing(self, kernel, merging, z, found, position):
@@ -125,5 +119,5 @@ class Guidable(Undersampled):
         active &= dr.isfinite(powers[-1])
         sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
         tile = kernel.camera.region.tile(position, self.tiles)
-        dr.scatter_reduce(dr.ReduceOp.Add, self.guidable, mi.ArrayXd(sums), tile)
+        dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.ArrayXd(sums), tile)
         return active

@@ -57,7 +57,7 @@ class Unsampled(PhotonPolicy):
     """Photons and camera subpaths are merged at the only non-delta vertex of paths that are not sampled."""
 
     # Sums of sizes by kind of light, see `undersampled.KINDS`: none is sampled.
-    kinds = (1.0, 0.0, 0.0)
+    sums = (1.0, 0.0, 0.0)
 
     def emission(self, e, aim):
         """Non-finite emissions are traced to see where their light arrives: their aim is NaN."""
@@ -68,15 +68,15 @@ class Unsampled(PhotonPolicy):
         # s = 0 samples the others, guided if need be.
         return replace(walk, active=walk.active & e.delta)
 
-    def stored(self, kernel, y, walk, stream):
+    def stored(self, kernel, y, stream):
         return is_sds_vertex(kernel, y, adjoint=True), 1.0
 
     def begin_camera(self, kernel: Kernel, walk: Walk, side: Side) -> tuple[Walk, Side]:
         """The camera subpath ``walk`` on its first edge."""
         return walk, replace(side, connect=None, only_specular=self.only_specular)
 
-    def is_merged(self, kernel: Kernel, z: Vertex, walk: Walk) -> mi.Bool:
-        """Mask: a camera subpath may merge at ``z``; ``walk`` as before its arrival."""
+    def is_merged(self, kernel: Kernel, z: Vertex) -> mi.Bool:
+        """Mask: a camera subpath may merge at ``z``."""
         return is_sds_vertex(kernel, z, adjoint=False)
 
     def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position) -> mi.Bool:
@@ -136,7 +136,7 @@ def _merged(kernel: Kernel, merging: Merging, batch: Batch, policy: Unsampled) -
 
     def visit(z, state, walk):
         seen, size, through = state
-        there = policy.is_merged(kernel, z, walk)
+        there = policy.is_merged(kernel, z)
         size = dr.if_stmt((z, size), there, merge, lambda z, size: size, label="unsampled light")
         first = z.hit & (z.edges == 1)
         through = dr.select(first, dr.reinterpret_array(mi.UInt32, z.si.shape), through)

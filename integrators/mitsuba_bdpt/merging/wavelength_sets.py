@@ -1,8 +1,7 @@
 """Sets of wavelengths that photons and camera subpaths share in a merging pass.
 
-A photon's flux is given at its own wavelengths, so it merges only with camera vertices of the same
-wavelengths. A pass has `SETS` sets; photon subpaths and lanes use them in turn, and the photons' grid has
-cells of each set. The sets of a pass are stratified, and rotated from pass to pass.
+A photon merges only with camera vertices of the same wavelengths. Photon subpaths and lanes use the `SETS` of
+a pass in turn. The sets of a pass are stratified, and rotated from pass to pass.
 """
 
 from __future__ import annotations

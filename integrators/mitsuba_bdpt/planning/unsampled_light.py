@@ -203,7 +203,7 @@ def estimate(
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
     shapes = _brightest(np.array(found.through), np.array(found.size))
-    never, rare, few = np.array(policy.kinds)
+    never, rare, few = np.array(policy.sums)
     size = max(never + rare, np.finfo(np.float32).tiny)
     if never < rare:
         meant = {id(bsdf) for bsdf in prepared.near_specular}
@@ -221,7 +221,7 @@ def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, 
     rarest = fewest / int(prepared.camera.region.size.prod())
     policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)
     _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, policy)
-    *of_light, vertices = np.array(policy.guidable).reshape(-1, len(names)).T / lanes
+    *of_light, vertices = np.array(policy.sums).reshape(-1, len(names)).T / lanes
     return GuidableLight(*of_light, float(vertices.sum()))
 
 

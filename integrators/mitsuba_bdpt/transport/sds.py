@@ -168,9 +168,7 @@ class PhotonStrategy:
 
 def begun_near_specular(walk, light: bool, guided: mi.Float | None = None):
     """``walk`` with the `State` of a subpath along which near-specular events count as specular."""
-    no, possible = mi.Bool(False), mi.Bool(True)
-    if light:  # s = 0 is its only alternative so far
-        possible = mis.is_used(walk.partial.d_vc)
-    diffuse = None if guided is None else no
-    state = State(possible, possible, guided, specular=no, diffuse=diffuse, newest=guided)
-    return replace(walk, sds=state)
+    # On the light side s = 0 is the only alternative so far.
+    possible = mis.is_used(walk.partial.d_vc) if light else mi.Bool(True)
+    no, diffuse = mi.Bool(False), None if guided is None else mi.Bool(False)
+    return replace(walk, sds=State(possible, possible, guided, None, no, diffuse, newest=guided))

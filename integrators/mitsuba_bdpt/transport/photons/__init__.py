@@ -1,7 +1,5 @@
-"""Photons: stored vertices of light subpaths traced before the samples.
+"""Photons: stored vertices of light subpaths traced before the samples, for SDS paths.
 
-`photon_pass` traces them. The component `merging` merges camera vertices with them (vertex merging, photon
-mapping). `photon_guide` builds a density of directions from them, from which `guided_hits` samples
-(photon-guided BSDF sampling). `aim` samples their first directions. All serve SDS paths
-(specular-diffuse-specular), which no connection can sample.
+`photon_pass` traces them, with first directions by `aim`. The component `merging` merges camera vertices with
+them; `photon_guide` builds a density of directions from them, from which `guided_hits` samples.
 """

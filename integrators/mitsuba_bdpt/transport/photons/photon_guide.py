@@ -54,15 +54,8 @@ class Guide:
         place = _place(found.p, low, scale)
         # By subpath at equal places: independent of the order of threads.
         order = dr.argsort((place << _LANE_BITS) | mi.UInt64(found.lane))
-        guide = Guide(
-            found.at(order),
-            mi.Float(0),
-            dr.gather(mi.UInt64, place, order),
-            dr.opaque(mi.UInt32, count),
-            low,
-            scale,
-            mi.Int32(WINDOW),
-        )
+        place, number = dr.gather(mi.UInt64, place, order), dr.opaque(mi.UInt32, count)
+        guide = Guide(found.at(order), mi.Float(0), place, number, low, scale, mi.Int32(WINDOW))
         guide.slope = _slopes(guide)
         dr.make_opaque(guide)
         return guide
@@ -70,10 +63,9 @@ class Guide:
 
 @dr.syntax
 def _slopes(guide: Guide) -> mi.Float:
-    """Slope of each photon: the third least to others in its window.
+    """Slope of each photon: the third least to others in its window, as light may come from several sides.
 
-    Light may be focused from several sides: photons nearest in direction come from the same one. With fewer
-    others 1 over the length of the last edge.
+    With fewer others 1 over the length of the last edge.
     """
     index = dr.arange(mi.UInt32, dr.width(guide.place))
     own = guide.photons.at(index)
@@ -114,10 +106,7 @@ def _spread(x: mi.UInt64) -> mi.UInt64:
 
 @dr.syntax
 def find(guide: Guide, p: mi.Point3f) -> mi.UInt32:
-    """Index of the first photon at or behind the place of ``p``.
-
-    `dr.binary_search` is unrolled to the bound of all guides and slower.
-    """
+    """Index of the first photon at or behind the place of ``p``; `dr.binary_search` is slower."""
     place = _place(p, guide.low, guide.scale)
     low, high = mi.UInt32(0), mi.UInt32(guide.count)
     while dr.hint(low < high, label="place among photons", exclude=[guide, place]):

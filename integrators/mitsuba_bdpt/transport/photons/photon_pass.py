@@ -50,8 +50,8 @@ class PhotonPolicy:
         """The subpath ``walk`` on its first edge."""
         return walk
 
-    def stored(self, kernel: Kernel, y: Vertex, walk: Walk, stream: Stream) -> tuple:
-        """Mask: ``y`` is stored; the probability of that. ``walk`` as before its arrival."""
+    def stored(self, kernel: Kernel, y: Vertex, stream: Stream) -> tuple:
+        """Mask: ``y`` is stored; the probability of that."""
         raise NotImplementedError
 
 
@@ -64,7 +64,7 @@ class GuidePhotons(PhotonPolicy):
     def begin(self, kernel, e, walk):
         return begun_near_specular(walk, light=True) if kernel.near_specular else walk
 
-    def stored(self, kernel, y, walk, stream):
+    def stored(self, kernel, y, stream):
         keep = is_sds_vertex(kernel, y, adjoint=True)
         return keep & (kernel.heuristic.present(y.partial.d_vc) > 0), 1.0
 
@@ -114,7 +114,7 @@ def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Pho
     present = kernel.heuristic.present
 
     def visit(y, counters, walk):
-        keep, probability = policy.stored(kernel, y, walk, stream)
+        keep, probability = policy.stored(kernel, y, stream)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         found = Photon(
