@@ -48,7 +48,7 @@ def evaluated(layer: mi.UInt32 | None, f: Evaluation, adjoint: bool) -> mi.UInt3
 
 def joined(of_camera: Any, of_light: mi.UInt32 | None) -> mi.UInt32 | None:
     """Layer of the path of a camera and a light subpath with these numbers, each after its last event."""
-    if of_light is None:
+    if of_camera is None or of_light is None:
         return None
     seen = dr.select(of_camera == EMISSION, of_light, INDIRECT)
     specular = dr.select(of_camera == DIRECT, CAUSTIC, of_camera)
