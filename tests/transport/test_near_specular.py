@@ -89,23 +89,15 @@ BROAD = {
 }
 
 SHARP = {
-    "metal": lambda: metal(0.05),
-    "metal, ggx": lambda: metal(0.001, distribution="ggx"),
     "brushed metal": lambda: {"type": "roughconductor", "alpha_u": 0.2, "alpha_v": 0.01},
-    "glass": lambda: glass(0.03),
     "frosted glass": lambda: glass(0.2),
     "glass of nearly no refraction": lambda: glass(0.5, int_ior=1.05),
     "anisotropic glass": lambda: {"type": "roughdielectric", "alpha_u": 0.3, "alpha_v": 0.02},
     "roughplastic": lambda: {"type": "roughplastic", "alpha": 0.01},
     "pplastic": lambda: {"type": "pplastic", "alpha": 0.01},
     "principled 0": lambda: principled(0.0),
-    "principled 0.2": lambda: principled(0.2),
-    "principled metal": lambda: principled(0.1, metallic=1.0),
-    "principled glass 0": lambda: principled(0.0, spec_trans=1.0),
-    "principled glass 0.2": lambda: principled(0.2, spec_trans=1.0),
     "principled glass 0.5": lambda: principled(0.5, spec_trans=1.0, eta=1.3),
     "clearcoat": lambda: principled(0.6, clearcoat=1.0, clearcoat_gloss=1.0),
-    "thin glass": lambda: thin(0.1, spec_trans=1.0),
     "hair": lambda: {"type": "hair", "longitudinal_roughness": 0.05, "azimuthal_roughness": 0.05},
     "textured metal": lambda: metal(speck(0.01)),
     "textured principled": lambda: principled(speck(0.05)),
@@ -184,17 +176,8 @@ class Sharp(mi.BSDF):
         bs.sampled_type = mi.UInt32(int(mi.BSDFFlags.GlossyReflection))
         return bs, weight
 
-    def eval(self, ctx, si, wo, active=True):
-        return self.inner.eval(ctx, si, wo, active)
-
     def pdf(self, ctx, si, wo, active=True):
         return self.largest + 0 * wo.z
-
-    def eval_pdf(self, ctx, si, wo, active=True):
-        return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
-
-    def to_string(self):
-        return "Sharp"
 
     def traverse(self, callback):
         callback.put("largest", self.largest, mi.ParamFlags.Differentiable)

@@ -1,14 +1,10 @@
 """The samples of one kernel launch: their pixels, and which share a light subpath.
 
 The pixels of a batch are cut into S parts of equal size (the last ones may be short); a lane has a sample of
-one pixel of each part. Equal offsets in all parts would correlate pixels at one distance all over the image,
-and the noise would show stripes. So the pixels of each part are permuted:
-
-* All samples of a pixel share with the same other pixels in all passes, so that its light subpaths are
-  neighbours in the sequence and form a net where its camera samples do (see `points`).
-* Runs of neighbouring pixels stay together in large parts, which keeps rays of neighbouring lanes coherent.
-* A Feistel network permutes runs in a table of rows and columns: each column is rotated by a hash of its
-  number, then each row, then each column. It is a bijection for any number of runs and needs no memory.
+one pixel of each part, and all samples of a pixel share with the same pixels. In large parts the pixels are
+runs of neighbours. A Feistel network permutes the runs of each part, so that no distance is preferred (see
+docs/user/samplers.md): in a table of rows and columns, each column is rotated by a hash of its number, then
+each row, then each column. It is a bijection for any number of runs.
 
 The remainder, less than a run and the few runs that fill no row of the table, stays in place.
 """

@@ -2,9 +2,7 @@
 
 Directions point away from the surface: ``c`` to the camera's side of a vertex, ``l`` to the light's side. On
 camera subpaths ``si.wi`` is ``c``. On light subpaths ``si.wi`` is ``l``, and the BSDF is evaluated in
-*radiance* mode with the two swapped, times the ratio of geometric cosines |n.c| / |n.l|. This is exact for
-bump and normal maps, interpolated normals and hair; Mitsuba's importance mode with Veach's correction
-(thesis, eq. 5.19) is not.
+*radiance* mode with the two swapped, times |n.c| / |n.l|, see docs/method/method.md.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from .draws import needs_full_pdf, nested
 from .near_specular import spread_interactions
 from .spectra import brightest, is_finite, is_zero
 
-# Two points of one plane are connected under a cosine that is rounding; its square underflows.
+# Two points of one plane are connected under a cosine that is rounding.
 _LEAST_COS = 1e-18
 
 
@@ -68,9 +66,8 @@ class Traits:
     ``full_pdf``: see `draws.needs_full_pdf`; ``round_trip``: a delta event may exist from one end only, with
     maps: Mitsuba's reject sampled directions (not incident ones) on different sides of the surface and of the
     perturbed normal, and flip the normal towards the incident direction; ``glossy``: one has a glossy lobe;
-    ``transmits``: one has a non-delta lobe on the other side; ``mapped``: one has a bump or normal map;
-    ``parts``: one is sampled by its parts, see `draws`; ``reverse``: weights need reverse densities;
-    ``only_delta``: only delta lobes are sampled.
+    ``transmits``: one has a non-delta lobe on the other side; ``parts``: one is sampled by its parts, see
+    `draws`; ``reverse``: weights need reverse densities; ``only_delta``: only delta lobes are sampled.
     """
 
     full_pdf: bool
@@ -78,7 +75,6 @@ class Traits:
     dispatch: BSDFDispatch
     glossy: bool = False
     transmits: bool = False
-    mapped: bool = False
     parts: bool = False
     reverse: bool = True
     only_delta: bool = False
@@ -107,7 +103,7 @@ class Traits:
         """
         hit = {id(bsdf): bsdf for bsdf in bsdfs}
         inner = {id(bsdf): bsdf for bsdf in family or nested(hit.values())}
-        maps = [bsdf for bsdf in inner.values() if bsdf.class_name() in draws.MAPS]
+        maps = (bsdf for bsdf in inner.values() if bsdf.class_name() in draws.MAPS)
         flags, f = [int(bsdf.flags()) for bsdf in hit.values()], mi.BSDFFlags
         parts = any(draws.by_parts(b) for b in hit.values())
         full_pdf = needs_full_pdf(inner.values())
@@ -118,7 +114,6 @@ class Traits:
             dispatch=BSDFDispatch(hit.values(), None if full_pdf or parts else unhit),
             glossy=any(has & int(f.Glossy) for has in flags),
             transmits=any(has & (int(f.DiffuseTransmission) | int(f.GlossyTransmission)) for has in flags),
-            mapped=bool(maps),
             parts=parts,
         )
 
@@ -209,7 +204,7 @@ def _evaluated(bsdf, si, wo, active, traits: Traits, adjoint: bool):
         return value, pdf_fwd_w, pdf_rev_w
 
     def ask(self, si, wo, active):
-        value, pdf = _value_and_pdf(self, si, wo, active, traits)
+        value, pdf = _value_and_pdf(self, si, wo, active)
         if not traits.reverse:
             return value, pdf, mi.Float(0)
         return value, pdf, self.pdf(mi.BSDFContext(), with_wi(si, wo), si.wi, active)
@@ -217,10 +212,10 @@ def _evaluated(bsdf, si, wo, active, traits: Traits, adjoint: bool):
     return traits.dispatch(bsdf, ask, si, wo, active)
 
 
-def _value_and_pdf(bsdf, si, wo, active, traits: Traits):
+def _value_and_pdf(bsdf, si, wo, active):
     """Value (in world frames) and density of the local direction ``wo``, in one call."""
-    if traits.mapped:  # Mitsuba's bump shadowing squares the cosine: 0 times infinity in one plane
-        active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
+    # Mitsuba's bump shadowing squares the cosine: 0 times infinity in one plane.
+    active = active & (dr.abs(mi.Frame3f.cos_theta(wo)) > _LEAST_COS)
     value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
     return polarization.in_world(si, value, -wo, si.wi), pdf
 
@@ -242,8 +237,7 @@ def sample(
 ) -> tuple[Step, Evaluation | None]:
     """Sample the next direction of a subpath; ``u1`` picks the lobe.
 
-    Returns the `Step`, and the `Evaluation` of ``target`` or None. The adjoint factor of a light subpath is
-    part of ``weight`` and of the evaluation's ``value``.
+    Returns the `Step`, and the `Evaluation` of ``target`` or None, with the adjoint factor on light subpaths.
     """
 
     def call(bsdf, si, u1, u2, sampled, *connected) -> Any:
@@ -261,12 +255,11 @@ def sample(
 
 @dataclass
 class _Drawn:
-    """A sample of a BSDF, ``bs`` in radiance mode; delta: ``pdf_fwd_w`` is the probability of the event.
+    """A sample of a BSDF in radiance mode; delta: ``pdf_fwd_w`` is the probability of the event.
 
-    ``back``, if needed: weight of the delta event sampled from its other end, 0 if it does not lead back;
-    ``value``, of light subpaths with more than delta lobes: of the direction from its other end (NaN as in
-    `_evaluation`); ``of_parts``: density and rejection as in `draws.Draw` in scenes with BSDFs sampled by
-    parts.
+    ``back``, if needed: weight of the delta event sampled from its other end, see `_back`; ``value``, of
+    light subpaths with more than delta lobes: f |cos| of the direction from its other end; ``of_parts``:
+    density and rejection as in `draws.Draw` in scenes with BSDFs sampled by parts.
     """
 
     bs: mi.BSDFSample3f
@@ -281,8 +274,7 @@ class _Drawn:
 def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
     """Sample a direction with densities both ways, in one virtual call (two with `BSDFDispatch.shared`)."""
     valued, shared = adjoint and not traits.only_delta, traits.dispatch.shared
-    # Light: the Mueller matrix of the other direction does not follow. (Mitsuba's importance mode turns
-    # retarders the wrong way.)
+    # A Mueller matrix does not follow from the other end's. (Mitsuba's importance mode errs for retarders.)
     asks_back = traits.round_trip or (adjoint and bool(mi.is_polarized))
 
     def ask(self, si, u1, u2, active):
@@ -303,7 +295,7 @@ def _drawn(bsdf, si, u1, u2, active, traits: Traits, adjoint: bool) -> _Drawn:
         density = found.density if draws.by_parts(self) else pdf_fwd_w
         value, pdf_rev_w = None, mi.Float(0)
         if valued and not shared:
-            value, pdf = _value_and_pdf(self, with_wi(si, bs.wo), si.wi, smooth, traits)
+            value, pdf = _value_and_pdf(self, with_wi(si, bs.wo), si.wi, smooth)
             value = _evaluation(value, pdf_fwd_w, pdf).value
             pdf_rev_w = pdf if traits.reverse else pdf_rev_w
         elif traits.reverse:
@@ -352,21 +344,15 @@ def _step(si, drawn: _Drawn, adjoint: bool) -> Step:
 
 
 def _back(bsdf, si, bs, u1, u2, active):
-    """Weight of a delta event sampled from its other end, 0 if it does not lead back.
-
-    Assumes equal probabilities from either end, as of Mitsuba's BSDFs.
-    """
+    """Weight of a delta event sampled from its other end, as probably; 0 if it does not lead back."""
     back = draws.draw(bsdf, with_wi(si, bs.wo), u1, u2, active)
     weight = polarization.in_world(si, back.weight, -si.wi, bs.wo)
     return dr.select(dr.squared_norm(back.bs.wo - si.wi) < 1e-4, weight, 0)
 
 
 def _event_cos_ratio(si, bs):
-    """|m.l| / |m.c| about the normal m of a delta event; 1 without refraction.
-
-    Under a bump or normal map m is not the shading normal. On refraction m is along eta_c c + eta_l l.
-    """
-    m = bs.eta * bs.wo + si.wi  # bs.eta = eta_c / eta_l when sampling from l
+    """|m.l| / |m.c| about the normal m (of a map) of a delta event; 1 without refraction."""
+    m = bs.eta * bs.wo + si.wi  # along eta_c c + eta_l l; bs.eta = eta_c / eta_l when sampling from l
     ratio = dr.abs(dr.dot(m, si.wi) / dr.dot(m, bs.wo))
     refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission)
     refracted &= dr.abs(bs.eta - 1) > 1e-5  # equal indices: straight on, and m is zero
@@ -374,10 +360,7 @@ def _event_cos_ratio(si, bs):
 
 
 def polarizing(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
-    """The ``bsdfs``, and nested ones, whose null transmission polarizes.
-
-    Tested at points all over their textures, from both sides.
-    """
+    """The ``bsdfs``, and nested ones, whose null transmission polarizes at a `spread_interactions` point."""
     if not mi.is_polarized:
         return []
     si = spread_interactions()

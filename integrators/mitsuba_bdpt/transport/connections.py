@@ -127,11 +127,10 @@ _OF_GUESSES = 2
 
 @dataclass
 class _Drawn:
-    """A drawn inner connection.
+    """A drawn inner connection: its weighted ``value``, and the ``total`` size of all.
 
-    Weighted ``value`` of the drawn one, ``total`` size of all, ``end`` of its shadow ray (its slot if
-    `ShapeErrors.small`), rescaled random number ``u``, `Counters`, layers. In scenes with media, where the
-    weight is known after the shadow ray, ``unweighted``: value, light and camera side, size in the draw.
+    ``end`` of its shadow ray (its slot if `ShapeErrors.small`), rescaled random number ``u``. In scenes with
+    media, where the weight is known after the shadow ray, ``unweighted``: value, light and camera side, size.
     """
 
     value: mi.Spectrum
@@ -226,7 +225,7 @@ def _as_drawn(kernel: Kernel, z: Vertex, y: PathVertex, c: Contribution) -> Cont
 
 
 def _seen(kernel: Kernel, z: Vertex, c: Contribution, ray: mi.Ray3f, own, stream: Stream, number):
-    """The connection ``c`` of ``z`` after its shadow ray; ``number``: from 1, of its random numbers."""
+    """The connection ``c`` of ``z`` after its shadow ray; ``number``: of its random numbers, from 1."""
     return kernel.space.seen(kernel, replace(c, shadow_ray=ShadowRay(ray, stream, z, ray.d, number, own)))
 
 

@@ -1,15 +1,14 @@
 """Samples Mitsuba's BSDFs with the density of the sampled direction.
 
 Multiple importance sampling requires that the density of a sample equals ``pdf()`` of its direction.
-Mitsuba's ``blendbsdf`` (3.9.1) violates it: it keeps directions that one part sampled and rejected (a
-``diffuse`` from behind, a ``roughdielectric`` below the horizon), with the value of the other part, and mixes
-the probability of a delta event with the other part's density. So a blend is sampled here by its parts.
+Mitsuba's ``blendbsdf`` (3.9.1) violates it, see docs/user/differences.md; it is sampled here by its parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -111,20 +110,19 @@ def _part(bsdf, si, u1, u2, active) -> Draw:
     Rejected on a side to which the sampled lobe (if known) does not scatter, and where its weight is 0
     although it is not black: where a black part is sampled, the other one may contribute.
     """
-    found, cos_theta = draw(bsdf, si, u1, u2, active), mi.Frame3f.cos_theta
+    found = draw(bsdf, si, u1, u2, active)
     if by_parts(bsdf):
         return found
-    bs = found.bs
-    smooth = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    bs, has = found.bs, partial(mi.has_flag, found.bs.sampled_type)
+    smooth = active & ~has(mi.BSDFFlags.Delta)
     f, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, bs.wo, smooth)
     rejected = is_zero(found.weight) & (~is_zero(f) | (pdf == 0) | (bs.sampled_type == 0))
     if not any(b.class_name() in MAPS for b in nested([bsdf])):  # sides refer to another frame
-        side = cos_theta(si.wi) * cos_theta(bs.wo)  # false for NaN
-        reflects, passes = (
-            mi.has_flag(bs.sampled_type, f) for f in (mi.BSDFFlags.Reflection, mi.BSDFFlags.Transmission)
-        )
+        side = mi.Frame3f.cos_theta(si.wi) * mi.Frame3f.cos_theta(bs.wo)  # false for NaN
+        reflects, passes = has(mi.BSDFFlags.Reflection), has(mi.BSDFFlags.Transmission)
         rejected |= ((side > 0) & passes & ~reflects) | ((side < 0) & reflects & ~passes)
-    return Draw(bs, found.weight, found.density, dr.select(smooth, rejected, found.rejected))
+    found.rejected = dr.select(smooth, rejected, found.rejected)
+    return found
 
 
 def _density(bsdf, si, wo, pdf, active):
@@ -192,7 +190,7 @@ def needs_full_pdf(bsdfs: Iterable[mi.BSDF]) -> bool:
 
 
 def family(bsdfs: Iterable[mi.BSDF]) -> list[tuple[mi.BSDF, dict]]:
-    """``bsdfs`` and all nested in them (twosided, mask, blend, maps), each once, with their children."""
+    """``bsdfs`` and all nested in them, each once, with their children."""
     found, left = {}, list(bsdfs)
     for bsdf in left:  # grows in the loop
         if id(bsdf) not in found:

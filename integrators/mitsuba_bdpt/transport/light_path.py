@@ -23,9 +23,8 @@ class Thinning:
     """Stochastic thinning of the stored vertices of a long light subpath in media.
 
     Keeps the first `KEPT` / 2, and of later ones the i-th with probability (`KEPT` / 2)^2 / (i (i - 1)) by
-    systematic sampling: with C(i) the sum of the first i probabilities and u in [0, 1), the i-th is kept if
-    an integer lies in (C(i - 1) + u, C(i) + u]. C(i) = `KEPT` - (`KEPT` / 2)^2 / i bounds the number of kept
-    vertices. Computed in integer units of 1 / `_UNIT`, so that the probability includes rounding.
+    systematic sampling: if an integer lies in (C(i - 1) + u, C(i) + u], C(i) = `KEPT` - (`KEPT` / 2)^2 / i
+    the sum of the first i probabilities. In integer units of 1 / `_UNIT`, so that they include rounding.
 
     ``tried``: vertices so far; ``offset``: u.
     """

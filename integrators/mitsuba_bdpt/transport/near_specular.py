@@ -20,8 +20,7 @@ from ..geometry.mitsubas_choices import spread_points
 from ..host.introspection import number, own_parameters
 
 # Least density (1 / sr, at the axis of the lobe at normal incidence) of a near-specular lobe: that of alpha
-# .063 in reflection, of .38 in refraction by glass (from both sides, see `is_narrow`, of .25). See
-# experiments, "Near-specular lobes".
+# .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
 NARROW = 20.0
 
 # Least density (1 / sr) from both sides of an event through which photons guide; see experiments,
@@ -62,7 +61,7 @@ def is_narrow(f, least: float | None = None):
 def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:
     """Approximate largest density (solid angle) of the BSDF's own glossy lobes, 0 if it has none.
 
-    ``held``: its `children`. Attributes of meshes count as 0, that is, as sharp.
+    ``held``: its `children`. Attributes of meshes count as 0.
     """
     if not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) or bsdf.class_name() in _AROUND_OTHERS:
         return 0.0
@@ -97,6 +96,10 @@ def _refracted(alpha: float, eta: float) -> float:
     return _microfacets(alpha) * (max(eta, 1.0) / max(abs(eta - 1), 1e-6)) ** 2
 
 
+def _unit(x: float) -> float:
+    return min(max(x, 0), 1)
+
+
 def _alpha(least: Bound) -> float:
     return math.sqrt(max(least("alpha_u", "alpha"), 0) * max(least("alpha_v", "alpha"), 0))
 
@@ -109,28 +112,19 @@ def _principled(bsdf, least: Bound) -> float:
     alpha = max(max(least("roughness"), 0) ** 2, 1e-3)
     found = _microfacets(alpha) / 4
     if mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission):
-        found = max(found, _refracted(alpha, least("eta") or _eta(least("specular"))))
-    if coat := -least("clearcoat", sign=-1):
-        found = max(found, coat * _clearcoat(-least("clearcoat_gloss", sign=-1)))
+        eta = least("eta") or 2 / (1 - math.sqrt(0.08 * _unit(least("specular")))) - 1
+        found = max(found, _refracted(alpha, eta))
+    if coat := -least("clearcoat", sign=-1):  # GTR1, sampled at a quarter of the others' rate
+        a = 0.1 + (0.001 - 0.1) * _unit(-least("clearcoat_gloss", sign=-1))
+        found = max(found, coat * (a**2 - 1) / (2 * math.pi * math.log(a) * a**2) / 4 / 4)
     return found
-
-
-def _eta(specular: float) -> float:
-    """Relative index of refraction by ``specular`` of `principled`."""
-    return 2 / (1 - math.sqrt(0.08 * min(max(specular, 0), 1))) - 1
-
-
-def _clearcoat(gloss: float) -> float:
-    """Largest density of the clearcoat's lobe (GTR1), which is sampled at a quarter of the others' rate."""
-    a = 0.1 + (0.001 - 0.1) * min(max(gloss, 0), 1)
-    return (a**2 - 1) / (2 * math.pi * math.log(a) * a**2) / 4 / 4
 
 
 def _thin(bsdf, least: Bound) -> float:
     """Of `principledthin`, which is specular only with ``spec_trans``; it refracts by a narrower lobe."""
     if not least("spec_trans", sign=-1):
         return 0.0
-    narrower = min(max(0.65 * least("eta") - 0.35, 0), 1)
+    narrower = _unit(0.65 * least("eta") - 0.35)
     return _microfacets(max((narrower * max(least("roughness"), 0)) ** 2, 1e-3)) / 4
 
 
@@ -150,10 +144,7 @@ _AROUND_OTHERS = frozenset({"TwoSidedBRDF", "MaskBSDF", "BlendBSDF", "BumpMap", 
 
 
 def _bound(texture: mi.Texture, sign: int, cached: Callable) -> float:
-    """Least value of ``sign`` times a ``texture`` that is read as one number per point.
-
-    ``cached(find)``: the result of ``find()``.
-    """
+    """Least value of ``sign`` times a ``texture`` of one number per point; ``cached(find)``: ``find()``."""
     kind = texture.class_name()
     if kind == "UniformSpectrum":
         return sign * float(number(own_parameters(texture)["value"]))

@@ -11,10 +11,10 @@ from .bsdf import Evaluation, Target
 
 def sample(kernel, vertex, adjoint: bool, u1, u2, active, target: Target | None):
     """Continue a subpath: the `Step`, and the `Evaluation` of ``target`` or None."""
-    step, f, on_surface = None, None, _of(target, ~vertex.volume)
+    step = f = None
     if kernel.surfaces:
         given = vertex.bsdf, vertex.si, u1, u2, active & ~vertex.volume, kernel.traits
-        step, f = bsdf.sample(*given, on_surface, adjoint)
+        step, f = bsdf.sample(*given, _of(target, ~vertex.volume), adjoint)
     if (phase := kernel.space.phase) is None:
         return step, f
     in_volume = phase.sample(vertex, u1, u2, active & vertex.volume, _of(target, vertex.volume))
