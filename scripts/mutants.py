@@ -369,8 +369,8 @@ MUTANTS = (
     Mutant(
         "count of light subpaths",
         "transport/kernel.py",
-        "kernel.bound(points, _count_light(kernel, batch, sharing), Observer())",
-        "kernel.bound(points, 1 / kernel.plan.camera_paths_per_light_path, Observer())",
+        "kernel.bound(points, count_light, observer)",
+        "kernel.bound(points, 1 / kernel.plan.camera_paths_per_light_path, observer)",
         ("tests/images/test_plausible_bugs.py::test_splats_of_few_pixels_count_once[3-1]",),
     ),
     Mutant(
@@ -1777,8 +1777,8 @@ MUTANTS = (
     Mutant(
         "joined light subpaths: t <= 1 does not count them all",
         "transport/kernel.py",
-        "return 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size",
-        "return 1.0 if batch.spread else sharing.lanes / batch.size",
+        "1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size",
+        "1.0 if batch.spread else sharing.lanes / batch.size",
         ("tests/images/test_joined_light_paths.py::test_images_are_those_of_all_connections[diffuse]",),
     ),
     Mutant(

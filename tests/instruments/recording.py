@@ -472,7 +472,7 @@ def replay(outliers: list[Outlier]) -> list[list[Path]]:
         recorder = Recorder(len(slots))
         with stepwise(launch.kernel):
             drawn = launch.kernel, recorder, launch.batch, launch.points, launch.spp
-            dr.eval(kernel.retrace(*drawn, mi.UInt32(slots), recorder))
+            dr.eval(kernel.trace(*drawn, mi.UInt32(slots), recorder))
         for lane, i in enumerate(numbers):
             o = outliers[i]
             wanted = (lambda p, o=o: (p.s, p.t) == (o.s, o.t)) if o.s else (lambda p: p.t >= 2)

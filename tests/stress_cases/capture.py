@@ -180,7 +180,7 @@ class Capture(Observer):
         points = Points("independent", dr.opaque(mi.UInt32, seed))
         slot = dr.arange(mi.UInt32, self.lanes)
         with stepwise(unbound):
-            dr.eval(kernel.retrace(unbound, self, batch, points, samples, slot, self))
+            dr.eval(kernel.trace(unbound, self, batch, points, samples, slot, self))
 
     # What the kernel shows: it has an observer, see `Observer`.
 

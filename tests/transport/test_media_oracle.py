@@ -142,7 +142,7 @@ def recorded(scene, integrator):
     render.kernel.camera = points_of
     slots = dr.arange(mi.UInt32, LANES)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), recording.stepwise(render.kernel):
-        dr.eval(kernel.retrace(render.kernel, recorder, batch, points, samples, slots, recorder))
+        dr.eval(kernel.trace(render.kernel, recorder, batch, points, samples, slots, recorder))
     (sigma,) = render.kernel.space.media.mean(render.kernel.sensor_medium).numpy()
     made = [points_of.completed(path, lane) for lane in range(LANES) for path in recorder.paths(lane)]
     return made, float(sigma)

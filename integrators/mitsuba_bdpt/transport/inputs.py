@@ -64,7 +64,7 @@ class Shared:
 class Observer:
     """Observes the subpaths of a lane during recording, for tools; does nothing.
 
-    See `kernel.retrace`. Arguments are Dr.Jit arrays and must not be changed. In recorded loops they have no
+    See `kernel.trace`. Arguments are Dr.Jit arrays and must not be changed. In recorded loops they have no
     values yet; disable `SymbolicLoops` and `SymbolicConditionals` to read them. Lanes whose subpath has ended
     keep the values of their last step, with ``active`` false.
     """
@@ -76,10 +76,7 @@ class Observer:
         """A subpath is on its first edge; ``side``: its `walk.Side`."""
 
     def vertex(self, side, walk, vertex, step):
-        """A subpath has reached a `walk.Vertex` and sampled the next ``step``.
-
-        ``step``: a `bsdf.Step`, None in scenes without surfaces; ``walk`` as before its arrival.
-        """
+        """A ``walk``, as before its arrival, has reached a `walk.Vertex`; ``step`` from there, or None."""
 
     def drawn(self, end):
         """An inner connection was drawn; ``end``: light vertex or end of the shadow ray."""

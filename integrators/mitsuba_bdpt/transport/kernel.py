@@ -45,7 +45,6 @@ from .batch import Batch, Places, Sharing
 from .contribution import Counters, counted_by_camera, counted_by_light
 from .inputs import Kernel, Observer, Shared
 from .sds import PhotonStrategy
-from .subpaths import CameraSample
 from .walk import random_walk
 
 
@@ -62,39 +61,37 @@ class Lane:
     emission: Cell | None = None
 
 
-def trace(kernel: Kernel, sink, batch: Batch, points: Points, spp: int) -> mi.UInt64:
+def trace(
+    kernel: Kernel,
+    sink,
+    batch: Batch,
+    points: Points,
+    spp: int,
+    slot: mi.UInt32 | None = None,
+    observer: Observer | None = None,
+) -> mi.UInt64:
     """Trace one batch and accumulate its contributions in ``sink`` (see `image.sink`).
 
-    ``spp``: samples per pixel of the render, which place the batch in the image's sequence. Returns
+    ``spp``: samples per pixel of the render, which place the batch in the image's sequence. Tools trace only
+    the camera samples ``slot``, each with the light subpath of its lane, with an ``observer``. Returns
     `Counters.summed`; evaluates nothing.
     """
     sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(kernel, batch, sharing), Observer())
-    index = dr.arange(mi.UInt32, sharing.lanes)
+    # Exact also if S does not divide the pixels; a pilot divides by the number of light subpaths itself.
+    count_light = 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size
+    kernel = kernel.bound(points, count_light, observer)
+    index = dr.arange(mi.UInt32, sharing.lanes) if slot is None else sharing.lane(slot)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
     def trace_sample(slot) -> Counters:
         active = slot < dr.opaque(mi.UInt32, batch.size)
         return _camera_subpath(kernel, sink, lane, slot, active)
 
-    if kernel.plan.light:
+    if kernel.plan.light and slot is None:
         of_camera = _camera_paths(kernel, sharing.slots(index), trace_sample)
     else:
-        of_camera = trace_sample(index)
+        of_camera = trace_sample(index if slot is None else slot)
     return (of_light + of_camera).summed()
-
-
-def retrace(
-    kernel: Kernel, sink, batch: Batch, points: Points, spp: int, slot: mi.UInt32, observer: Observer
-) -> mi.UInt64:
-    """Trace the camera samples ``slot`` again, like `trace`, with an ``observer``.
-
-    ``slot``: ``UInt32``; each with the light subpath of its lane. For tools that inspect single samples.
-    """
-    sharing = shared_by(kernel, batch, points)
-    kernel = kernel.bound(points, _count_light(kernel, batch, sharing), observer)
-    lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), sharing.lane(slot))
-    return (of_light + _camera_subpath(kernel, sink, lane, slot, mi.Bool(True))).summed()
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
@@ -105,14 +102,6 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
     return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths, points.seed)
-
-
-def _count_light(kernel: Kernel, batch: Batch, sharing: Sharing) -> float:
-    """Light subpaths per camera subpath, exact also if S does not divide the pixels.
-
-    1 for a pilot, which divides by their number itself.
-    """
-    return 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size
 
 
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
@@ -212,17 +201,9 @@ def _camera_paths(kernel: Kernel, slot_of, trace_sample) -> Counters:
 
 def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and connect it with the lane's light subpath."""
-    sample, begun, side = subpaths.camera_subpath(kernel, lane.place, lane.shared, slot, active, sink.alpha)
-    visit = _camera_visit(kernel, sink, lane, sample)
-    state = sink.begin(), counted_by_camera(kernel)
-    (total, counters), walk = random_walk(kernel, side, begun, visit, state)
-    counters += walk.counted("camera", begun.active)
-    return counters + sink.end(kernel, lane, sample, total, walk.seen)
-
-
-def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
-    """The strategies with t >= 2 at each vertex of a camera subpath."""
-    plan, start, shared = kernel.plan, sample.start, lane.shared
+    plan, shared = kernel.plan, lane.shared
+    sample, begun, side = subpaths.camera_subpath(kernel, lane.place, shared, slot, active, sink.alpha)
+    start = sample.start
 
     def add(c, total, lost):
         c = contribution.seen(kernel, c)
@@ -248,4 +229,7 @@ def _camera_visit(kernel: Kernel, sink, lane: Lane, sample: CameraSample):
             counters += counted
         return total, counters
 
-    return visit
+    state = sink.begin(), counted_by_camera(kernel)
+    (total, counters), walk = random_walk(kernel, side, begun, visit, state)
+    counters += walk.counted("camera", begun.active)
+    return counters + sink.end(kernel, lane, sample, total, walk.seen)

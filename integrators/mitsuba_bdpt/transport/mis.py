@@ -4,10 +4,10 @@ Source: Iliyan Georgiev, "Implementing Vertex Connection and Merging", technical
 2012; equation numbers are the report's. Each subpath carries two numbers, ``d_vcm`` and ``d_vc``, from which
 the weight of any strategy follows:
 
-* ``d_vcm``: the *newest* alternative strategy, which samples the subpath's last vertex from the other side.
-  It is multiplied by the density of doing so.
-* ``d_vc``: all older alternatives. It is multiplied by that density and by the reverse density (solid angle)
-  of the vertex before the last.
+* ``d_vcm``: the *newest* alternative strategy, which samples the subpath's last vertex from the other side,
+  over the density of doing so;
+* ``d_vc``: all older alternatives, over that density and the reverse density (solid angle) of the vertex
+  before the last.
 
 With vertex merging two further numbers, ``d_vm`` and ``d_vm_newest``, stand for the merges at older vertices
 and the newest (eqs. 38, 39, times eta); a path is merged where V, the sum of kappa p of its merges, is at
@@ -27,7 +27,7 @@ partial sum marks classes that are not in use: nothing is computed for them.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -78,8 +78,10 @@ def is_absent(x: PartialSum) -> bool:
     return isinstance(x, (int, float)) and x == 0
 
 
-def choose(mask: mi.Bool, a: PartialSum, b: PartialSum) -> PartialSum:
-    """``dr.select`` of two coefficients or partial sums; 0 if neither class is in use."""
+def choose(mask: mi.Bool, a: Any, b: Any) -> Any:
+    """``dr.select`` of two coefficients, partial sums or `Partial`; 0 if neither class is in use."""
+    if isinstance(a, Partial):
+        return Partial(*(choose(mask, x, vars(b)[name]) for name, x in vars(a).items()))
     return 0 if is_absent(a) and is_absent(b) else dr.select(mask, a, b)
 
 
@@ -116,10 +118,7 @@ class Heuristic:
         return dr.minimum(inverse_pdf, SATURATION)
 
     def equal_weight(self, ratio: mi.Float) -> mi.Float:
-        """Factor of an estimate f / p if its own weight, of a density ``ratio`` times p, is to be that of p.
-
-        Estimates times weights are w f / (ratio p), with w proportional to ratio or ratio^2.
-        """
+        """Factor of an estimate f / p if its own weight, of a density ``ratio`` times p, is to be that of p."""
         return ratio if self.name == "power" else mi.Float(1)
 
     def weigh(
@@ -187,10 +186,9 @@ def to_area(
 ) -> Partial:
     """Convert to the area measure at a new vertex (known part of eqs. 31, 32, 34, 35).
 
-    ``dist2``: squared length of the edge; 1 on the first edge of a light subpath, whose ``d_vcm`` contains it
-    (none from infinity), and of a parallel sensor, whose density is one across the edge; ``cos``: absolute
-    geometric cosine at the new vertex; ``tr``: T~ of the edge, sampled by this subpath and connected by the
-    newest alternative (None without media).
+    ``dist2``: squared length of the edge; 1 on the first edge of a light subpath, whose ``d_vcm`` contains
+    it, and of a parallel sensor; ``cos``: absolute geometric cosine at the new vertex; ``tr``: T~ of the
+    edge, None without media.
     """
     return Partial(
         d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),

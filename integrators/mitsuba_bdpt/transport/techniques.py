@@ -95,10 +95,7 @@ def _known(value, *pdfs):
 
 
 def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
-    """Sample an emitter for the camera vertex ``z``.
-
-    Returns an `emitters.Direct` and its `bsdf.Target`.
-    """
+    """Sample an emitter for the camera vertex ``z``; returns it and its `bsdf.Target`."""
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
     active &= kernel.space.allows_next_event(z)
     u = kernel.points.draw_2d("camera", stream, Purpose.EMITTER, z.event)
@@ -107,10 +104,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
 
 
 def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -> Contribution:
-    """s = 1: connect a camera vertex with a sampled emitter point (eqs. 44, 45).
-
-    ``sds`` as in `hit_emitter`.
-    """
+    """s = 1: connect ``z`` with a sampled emitter point (eqs. 44, 45); ``sds`` as in `hit_emitter`."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
     value = z.throughput * f.value * e.weight
@@ -189,10 +183,7 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
 
 
 def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
-    """Sample a connection of the light vertex ``y`` with the sensor.
-
-    Returns the result of `Sensor.connect` and its `bsdf.Target`.
-    """
+    """Sample a connection of the light vertex ``y`` with the sensor; returns it and its `bsdf.Target`."""
     active = y.hit & y.connectible() & (y.edges + 1 <= kernel.reach)
     connection = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
     active &= connection.valid
@@ -207,17 +198,13 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: connect a light vertex with `look_at_sensor`'s point (eqs. 46, 47)."""
     h, connection, f = kernel.heuristic, y.endpoint, y.f
     to_area = y.cosine(connection.d) / connection.dist2
-    estimate = polarization.extended(y.throughput, f.value, adjoint=True) * (
-        connection.importance / connection.dist2
-    )
-    value = estimate * dr.rcp(kernel.count_light)
+    estimate = polarization.extended(y.throughput, f.value, adjoint=True)
+    value = estimate * (connection.importance / connection.dist2) * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
     densities = f.pdf_rev_w, connection.pdf_w * to_area
     light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_count)
-    camera_side = 0
-    if kernel.plan.arrival:
-        camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
+    camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     if kernel.sds.near_specular:
         active &= ~connects_sds_path(y.edges + 1, (y.sds, f, 0))

@@ -21,7 +21,6 @@ from . import bsdf, mis, path_layers, scattering, spectra
 from .alternatives import newest_coefficient
 from .contribution import Counters, one
 from .inputs import Kernel, Shared
-from .mis import choose
 from .near_specular import is_narrow
 from .sds import PhotonStrategy, State
 
@@ -238,15 +237,8 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     # A hit at exactly zero cosine has probability zero; its densities would be infinite.
     hit &= cos > 0
     in_area = mis.to_area(h, partial, dist2, cos, tr)
-    d_vcm = partial.d_vcm
     if tr is not None:  # the environment is also the other end of a strategy
-        d_vcm = h.scale(d_vcm, dr.rcp(tr))
-    partial = mis.Partial(
-        choose(hit, in_area.d_vcm, d_vcm),
-        choose(hit, in_area.d_vc, partial.d_vc),
-        choose(hit, in_area.d_vm, partial.d_vm),
-        choose(hit, in_area.d_vm_newest, partial.d_vm_newest),
-    )
+        partial = replace(partial, d_vcm=h.scale(partial.d_vcm, dr.rcp(tr)))
     on_surface = rays.surface_anchor(si, ray, kernel.shape_errors)
     return Vertex(
         si=si,
@@ -254,7 +246,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
         cos=cos,
         anchor=dr.select(volume, rays.free_anchor(si.p), on_surface),
         throughput=throughput,
-        partial=partial,
+        partial=mis.choose(hit, in_area, partial),
         edges=walk.edges,
         previous=walk.previous,
         seen=walk.seen,
@@ -309,10 +301,9 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first
     passes = step.null & sampled if kernel.has_media else mi.Bool(False)
     active = vertex.hit & (walk.edges < side.last_edge) | passes
     coefficient = newest_coefficient(kernel, vertex, side.adjoint)
-    sds, merges = _sds(kernel, side, walk, vertex, coefficient, step)
-    before, after = walk.partial, mis.scatter(h, vertex.partial, coefficient, step)
-    d_vcm, d_vc = choose(passes, before.d_vcm, after.d_vcm), choose(passes, before.d_vc, after.d_vc)
-    partial = mis.Partial(d_vcm, d_vc, *merges)
+    partial = mis.scatter(h, vertex.partial, coefficient, step)
+    sds, partial.d_vm, partial.d_vm_newest = _sds(kernel, side, walk, vertex, coefficient, step)
+    partial = mis.choose(passes, walk.partial, partial)
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
     eta = walk.eta * step.eta if kernel.refracts else 1
@@ -373,11 +364,11 @@ def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mi
     if strategy.merges:
         rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
         ratio = strategy.ratio(vertex.si.p)
-        return state, mis.scattered_merges(h, vertex.partial, step, ratio, rival)
+        return state, *mis.scattered_merges(h, vertex.partial, step, ratio, rival)
     if state is None:
-        return None, (0, 0)
+        return None, 0, 0
     state = state.after(h, vertex, coefficient, step)
     if mis.is_absent(vertex.partial.d_vm):
-        return state, (0, 0)
+        return state, 0, 0
     guided = h.scale(vertex.partial.d_vc, vertex.advice.other)
-    return state, (mis.scattered_guided(h, vertex.partial, step, guided, state.isolated), 0)
+    return state, mis.scattered_guided(h, vertex.partial, step, guided, state.isolated), 0
