@@ -59,24 +59,6 @@ def test_recursion_with_transmittances(name, classes):
         np.testing.assert_allclose(weights[explicit.used.any(1)].sum(1), 1, atol=1e-4)
 
 
-def test_any_transmittance_is_a_partition():
-    """Rationale: T~ of a grid is not its T; weights add up to 1 whatever T~ is, as long as all strategies
-    have the same one. Expected: with T~ unrelated to T the recursion's weights sum to 1 within 1e-4, and
-    without T~ in one class they do not.
-    """
-    rng = np.random.default_rng(2)
-    paths = in_media(rng, random_paths(rng, 500, 4), 2)
-    kappa = COEFFICIENTS["n1c1"]
-    weights = recursion(paths, kappa, "balance")
-    used = oracle.Explicit(paths, kappa).used
-    possible = used.any(1)
-    np.testing.assert_allclose(np.where(used, weights, 0).sum(1)[possible], 1, atol=1e-4)
-    paths.transmittance = np.ones_like(paths.transmittance)
-    without = recursion(paths, kappa, "balance")
-    mixed = np.where(used, np.where(np.arange(6) == 2, without, weights), 0)
-    assert np.abs(mixed.sum(1) - 1)[possible].mean() > 0.02
-
-
 # -- the kernel ---------------------------------------------------------------------------------------
 
 SIGMA, G, NEAR = 0.8, 0.4, 0.1

@@ -1,20 +1,14 @@
 """The weights: the recursion of the core against explicit densities (Veach's ratios).
 
-Three layers, from arithmetic to scenes:
+* `test_recursion_*`: ``mis.py`` alone, called in the order in which ``walk.py`` and ``techniques.py`` call
+  it, on random numbers of any size.
+* `test_kernel_*`: the unchanged kernel in a scripted world. The scene, the BSDFs, the emitters and the sensor
+  are stand-ins that walk each lane along a path drawn beforehand and answer with densities drawn beforehand;
+  positions and normals are real, so that cosines, distances and shading frames are the core's own work. That
+  every call gets the right vertex, direction, cosine, coefficient and mask is what this layer tests.
 
-* `test_recursion_*`: ``mis.py`` alone, called in the order in which ``walk.py`` and
-  ``techniques.py`` call it, on random numbers of any size.
-* `test_kernel_*`: the real code, unchanged: ``kernel._light_subpath`` and ``_camera_subpath``, the
-  random walks and all functions of ``techniques.py``, in a scripted world. There the scene, the BSDFs,
-  the emitters and the sensor are stand-ins that walk each lane along a path drawn beforehand and
-  answer with densities drawn beforehand; positions and normals are real, so that cosines, distances
-  and shading frames are the core's own work. Recorders around ``connect``'s functions keep the
-  weight of each strategy. That every call gets the right vertex, direction, cosine, coefficient and
-  mask is what this layer tests.
-* `test_densities_*`: in real scenes, the densities of one and the same path from both of their
-  homes (emission and hit, camera ray and join) are equal; the scripted world cannot see that.
-
-Statistics of whole images are in ``test_strategies.py``.
+That densities of one path from both of its ends are equal in real scenes is tested in ``tests/emitters`` and
+``tests/sensors``; statistics of whole images in ``test_strategies.py``.
 """
 
 from __future__ import annotations
@@ -35,7 +29,6 @@ from mitsuba_bdpt.emitters import emitters
 from mitsuba_bdpt.geometry import rays, rounding
 from mitsuba_bdpt.geometry.hits import Hits
 from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.sensors import records as sensor_records
 from mitsuba_bdpt.transport import (
     bsdf,
@@ -168,33 +161,6 @@ def test_recursion_extreme_densities(name, classes):
             paths = random_paths(rng, 500, k, decades=1)
             getattr(paths, field)[:] *= rng.choice(np.float32([1e-29, 1e29]))
             check(paths, kappa, name, recursion(paths, kappa, name), relative=1e-4)
-
-
-@pytest.mark.parametrize("name", settings.HEURISTICS)
-def test_partial_sums_survive_zero_and_infinity(name):
-    """Rationale: 1e30 / 1e-30 is inf in float32, and inf times a reverse density of 0 is NaN (seen).
-
-    Expected: every function of ``mis.py`` returns finite numbers, weights in [0, 1], for all
-    combinations of 0, the smallest and largest densities and 1; cosines > 0 as in `walk._vertex`. Two
-    terms of 1e-30 or 1e30 combine as well as two of 1 (to 1e-5: a few roundings).
-    """
-    h = mis.Heuristic(name)
-    for scale in (1e-30, 1e-20, 1e20, 1e30):  # sums scale with their terms: squares would not survive
-        total = h.combine(mi.Float(3 * scale), mi.Float(4 * scale)).numpy()
-        np.testing.assert_allclose(total, {"balance": 7, "power": 5}[name] * scale, rtol=1e-5)
-    values = np.float32([0, 1e-30, 1, 1e30])
-    grid = [mi.Float(x.ravel()) for x in np.meshgrid(values, values, values, values[1:])]
-    a, rev, density, fwd = grid
-    start = mis.Partial(h.start(dr.rcp(fwd * fwd)), h.start(a))
-    for partial in (start, mis.to_area(h, start, dr.rcp(fwd), mi.Float(1e-6))):
-        step = SimpleNamespace(pdf_fwd_w=fwd, pdf_rev_w=rev, cos_out=a, delta=mi.Bool(False))
-        folded = mis.scatter(h, partial, 0.3, step)
-        for x in (partial, folded):
-            side = mis.alternatives(h, x, 0.3, rev, density)
-            weight = h.weight(0.3, side, h.start(dr.rcp(density)))
-            for number in (x.d_vcm, x.d_vc, side):
-                assert np.isfinite(number.numpy()).all()
-            assert ((weight.numpy() >= 0) & (weight.numpy() <= 1)).all()
 
 
 # -- layer 2: the real kernel in a scripted world ----------------------------------------------------
@@ -1028,155 +994,3 @@ def test_kernel_guides_through_near_specular_events(name, classes, lens, monkeyp
         assert not weights[:, k + 2 :][~used[:, k + 2 :] & ~world.paths.delta_emitter[:, None]].any()
         total, pure = total + explicit.sds.sum(), pure + explicit.pure.sum()
     assert total > 100 and pure > 30
-
-
-# -- layer 3: densities of real scenes ---------------------------------------------------------------
-
-T = mi.ScalarTransform4f
-
-
-def lamp(shape, weight=1.0):
-    return {
-        **shape,
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": 3.0, "sampling_weight": weight},
-    }
-
-
-def sky_map():
-    pixels = np.random.default_rng(5).uniform(0.2, 2, (8, 16, 3)).astype(np.float32)
-    return {
-        "type": "envmap",
-        "bitmap": mi.Bitmap(pixels),
-        "to_world": T().rotate([1, 0, 0], 50).rotate([0, 1, 0], 30),
-    }
-
-
-TURN = T().translate([0.3, 0.2, -0.4]).rotate([0, 1, 0], 25)
-EMITTERS = {
-    "sphere": [lamp({"type": "sphere", "center": [0.3, 0.2, -0.4], "radius": 0.4})],
-    "glowing inside": [lamp({"type": "sphere", "radius": 8.0, "flip_normals": True})],
-    "rectangle": [lamp({"type": "rectangle", "to_world": TURN.scale(0.5)})],
-    "disk": [lamp({"type": "disk", "to_world": TURN.scale(0.5)})],
-    "cylinder": [lamp({"type": "cylinder", "radius": 0.3, "to_world": TURN})],
-    "mesh": [lamp({"type": "cube", "to_world": TURN.scale(0.3)})],
-    "constant": [{"type": "constant", "radiance": 1.0}],
-    "envmap": [sky_map()],
-    "several": [
-        lamp({"type": "sphere", "center": [-1, 0.5, 0], "radius": 0.3}, 0.7),
-        lamp({"type": "rectangle", "to_world": T().translate([1, 0, 0]).scale(0.4)}, 3.0),
-        {"type": "point", "position": [0, 1.5, 0], "intensity": 1.0},
-        sky_map(),
-    ],
-}
-
-
-def real_scene(name):
-    """The emitters between a floor and a ball."""
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "floor": {
-                "type": "rectangle",
-                "to_world": T().translate([0, -2, 0]).rotate([1, 0, 0], -90).scale(4),
-            },
-            "ball": {"type": "sphere", "center": [0.5, 0, 2.5], "radius": 0.8},
-            **{f"emitter {i}": e for i, e in enumerate(EMITTERS[name])},
-        }
-    )
-
-
-def relative_gap(a, b, mask):
-    """Relative differences where ``mask`` holds."""
-    mask = np.broadcast_to(mask.numpy(), 4096)
-    a, b = (np.broadcast_to(x.numpy(), 4096)[mask] for x in (a, b))
-    assert mask.sum() > 100
-    return np.abs(a - b) / np.abs(b)
-
-
-def assert_equal(a, b, mask):
-    """Equal to 2e-3 for 95 % of the samples. Hit points are float32: where a surface is nearly seen
-    from the side a position's last digit decides the cosine, and at an edge the face."""
-    assert np.quantile(relative_gap(a, b, mask), 0.95) < 2e-3
-
-
-@pytest.mark.parametrize("name", EMITTERS)
-def test_densities_of_emission_are_those_of_hits(name):
-    """Rationale: a path's densities are computed in four places (emission, first light vertex,
-    next-event estimation, hit by a camera subpath); weights are right only if all agree.
-
-    4,096 emissions are traced to y_1 and back to y_0; next-event samples from y_1 likewise.
-    Expected: the same three densities from both ends. Tolerance: see `assert_equal`.
-    """
-    scene, n = real_scene(name), 4096
-    assert scene.shapes()  # as a render does first: it decides of which Python class they are
-    lights = emitters.Emitters(scene)
-    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
-    rng = mi.PCG32(n)
-
-    def pair():
-        return mi.Point2f(rng.next_float32(), rng.next_float32())
-
-    e = lights.sample_emission(pair(), pair(), like, mi.Bool(True))
-    ray = rays.spawn(e.anchor, e.d, like)
-    y1 = scene.ray_intersect(ray)
-    there = y1.is_valid() & ~e.delta
-    anchor = rays.surface_anchor(y1, ray, lights.shape_errors)
-    y0 = scene.ray_intersect(rays.spawn(anchor, -e.d, like), there)
-    near = dr.norm(y0.p - e.si.p) < 1e-3
-    there &= dr.select(e.infinite, ~y0.is_valid(), y0.is_valid() & near)
-    connect_, first, second = lights.hit_densities(y0, y1.p, there)
-    scale = dr.select(e.infinite, 1, dr.squared_norm(y0.p - y1.p))
-    assert_equal(e.pdf_first, first, there)
-    assert_equal(e.pdf_second, second, there)
-    assert_equal(lights.connection_density(e, y1, there), connect_ * scale, there)
-
-    direct = lights.sample_direct(y1, pair(), y1.is_valid())
-    there = y1.is_valid() & (dr.max(direct.weight) > 0) & ~direct.delta
-    z0 = scene.ray_intersect(rays.spawn(anchor, direct.d, like), there)
-    near = dr.norm(z0.p - direct.anchor.p) < 1e-3
-    there &= dr.select(direct.infinite, ~z0.is_valid(), z0.is_valid() & near)
-    connect_, first, second = lights.hit_densities(z0, y1.p, there)
-    dist2 = dr.squared_norm(z0.p - y1.p)
-    to_area = dr.select(direct.infinite, 1, dr.abs(dr.dot(z0.n, direct.d)) / dist2)
-    assert_equal(direct.pdf_w * to_area, connect_, there)
-    ratio = first * second / (connect_ * dr.select(direct.infinite, 1, dist2))
-    assert_equal(direct.emission_ratio, ratio, there & (ratio > 0))
-
-
-@pytest.mark.parametrize("crop", [False, True])
-@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
-def test_densities_of_camera_rays_are_those_of_joins(kind, crop):
-    """Rationale: the density of a camera ray enters s = 0 and s = 1, that of a join t = 1.
-
-    4,096 camera rays to random distances are joined back from there. Expected: the same density,
-    distance and direction to 1e-4 (float32 through a 4x4 matrix), the film position to 0.01 pixels.
-    """
-    more = {"aperture_radius": 0.1, "focus_distance": 2.5} if kind == "thinlens" else {}
-    window = {"crop_width": 20, "crop_height": 10, "crop_offset_x": 7, "crop_offset_y": 11}
-    sensor = mi.load_dict(
-        {
-            "type": kind,
-            "fov": 70,
-            "near_clip": 0.05,
-            "far_clip": 100,
-            "to_world": T().look_at([1, 2, 3], [0.2, 0.1, -1], [0, 1, 0.1]),
-            "film": {"type": "hdrfilm", "width": 40, "height": 30, **(window if crop else {})},
-            **more,
-        }
-    )
-    scene = mi.load_dict({"type": "scene"})
-    camera = sensors.prepare(sensor, rounding.ShapeErrors(scene), scene)
-    like = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
-    rng = mi.PCG32(4096)
-    u = [mi.Point2f(rng.next_float32(), rng.next_float32()) for _ in range(3)]
-    width, height = (int(x) for x in sensor.film().crop_size())
-    index = mi.UInt32(u[2].x * (width * height - 1))
-    start = camera.start(camera.region.pixel(index), u[0], u[1], like)
-    join = camera.connect(start.p + start.ray.d * (0.5 + 5 * u[2].y), u[1], None)
-    everything = mi.Bool(np.ones(4096, dtype=bool))
-    inside = np.array(join.valid)
-    assert inside.mean() > 0.999  # rounding may move a ray over the film's edge
-    assert relative_gap(join.pdf_w, start.pdf_w, everything).max() < 1e-4
-    assert dr.max(dr.norm(join.d + start.ray.d)) < 1e-4
-    assert np.abs(np.array(join.position) - np.array(start.position)).max() < 0.01

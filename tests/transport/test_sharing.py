@@ -131,23 +131,3 @@ def test_noise_of_scenes_has_no_stripes(name, camera_paths):
     with 128 renders the largest of all lags is found as 0.012 where all are 0."""
     renders = noise_of(load_scene(name, resolution=64), camera_paths, 16, 128)
     assert correlations(renders).max() < 0.03
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("camera_paths", [2, 8, 16])
-@pytest.mark.parametrize(
-    ("size", "crop"),
-    [((61, 47), None), ((53, 67), None), ((160, 90), (3, 40, 101, 37)), ((96, 96), (17, 5, 48, 64))],
-)
-def test_noise_of_odd_films_and_crops_has_no_stripes(size, crop, camera_paths):
-    """Expected: as above, in Mitsuba's Cornell box, on films whose size S does not divide and on crop
-    windows."""
-    room = mi.cornell_box()
-    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
-    if crop:
-        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
-        film |= dict(zip(names, crop, strict=True))
-    room["sensor"]["film"] = film
-    renders = noise_of(mi.load_dict(room), camera_paths, 16, 128)
-    assert renders.shape[1:] == ((crop[3], crop[2]) if crop else size[::-1])
-    assert correlations(renders).max() < 0.03

@@ -118,7 +118,7 @@ class Heuristic:
         return dr.minimum(inverse_pdf, SATURATION)
 
     def equal_weight(self, ratio: mi.Float) -> mi.Float:
-        """Factor of an estimate f / p if its own weight, of a density ``ratio`` times p, is to be that of p."""
+        """Factor of an estimate f / p, of density ``ratio`` times p, that is to have the weight of p."""
         return ratio if self.name == "power" else mi.Float(1)
 
     def weigh(
