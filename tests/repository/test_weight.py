@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7687,
-    "transport merging guided_emission": 5804,
+    "transport merging guided_emission": 5761,
     "planning": 2154,
     "emitters": 2680,
     "cli": 1812,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 4746, "tests": 44263}
+OUTSIDE = {"scripts": 4746, "tests": 44039}
 MOST_WORDS = 32388
 
 
