@@ -25,7 +25,7 @@ MOST = {
     "": 1554,  # top files
 }
 OUTSIDE = {"scripts": 4746, "tests": 44039}
-MOST_WORDS = 32388
+MOST_WORDS = 31401
 
 
 def _lines(files):
