@@ -64,9 +64,7 @@ class Places:
     def __init__(self, kernel: Kernel, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
-        self._pilot = batch.spread > 0
-        if self._pilot:
-            self._spread = dr.opaque(mi.UInt64, batch.spread)
+        self._spread = dr.opaque(mi.UInt64, batch.spread) if batch.spread else None
         self._pixels = dr.opaque(mi.UInt64, batch.pixels)
         self._samples = dr.opaque(mi.UInt32, batch.samples)
         self._first_sample = dr.opaque(mi.UInt32, batch.first_sample)
@@ -74,14 +72,14 @@ class Places:
 
     def _split(self, slot):
         pixel, sample = _divided(slot, self._samples)
-        if self._pilot:
+        if self._spread is not None:
             # Random: a regular stride would miss columns of films of that width.
             within = mi.UInt64(sobol.mix(pixel + 1)) % self._spread
             pixel = mi.UInt32((mi.UInt64(pixel) * self._spread + within) // self._pixels)
         return pixel + self._first_pixel, sample + self._first_sample
 
     def index(self, slot: mi.UInt32) -> mi.UInt64:
-        if self._pilot:  # each sample has its own sequence
+        if self._spread is not None:  # each sample has its own sequence
             return mi.UInt64(slot) << 32
         pixel, sample = self._split(slot)
         return mi.UInt64(pixel) * self._spp + mi.UInt64(sample)

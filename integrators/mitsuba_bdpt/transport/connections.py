@@ -186,8 +186,7 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, u, stream: Stream
     """
     candidates = candidate_count(kernel, z, path)
     some = candidates > 0
-    newest = newest_coefficient(kernel, z, adjoint=False)
-    at_z = ProxyVertex.of(kernel, z, newest, some, alone=False)
+    at_z = ProxyVertex.of(kernel, z, some, adjoint=False)
     count = mi.Float(candidates)
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_GUESSES))
     u_evenly, word = sequential(word)

@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..geometry import polarization, rays
 from . import mis
-from .alternatives import newest_coefficient
 from .contribution import one
 from .inputs import KEPT, Kernel
 from .proxy_vertices import Diffuse, Lobe, ProxyVertex
@@ -124,8 +123,7 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
     if kernel.sds.near_specular:
         entries["flags"] = one(vertex.sds.isolated) + 2 * one(vertex.sds.specular)
     if path.guesses:
-        newest = newest_coefficient(kernel, vertex, adjoint=True)
-        proxy = ProxyVertex.of(kernel, vertex, newest, keep, alone=True)
+        proxy = ProxyVertex.of(kernel, vertex, keep, adjoint=True)
         entries |= {"proxy": proxy.diffuse, "lobe": proxy.lobe}
     for name, local in path.entries.items():
         local.write(entries[name], slot, keep)

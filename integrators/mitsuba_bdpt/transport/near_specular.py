@@ -82,13 +82,10 @@ def density(bsdf: mi.BSDF, held: dict, cached: Cached) -> float:
 
 # -- Mitsuba's BSDFs --------------------------------------------------------------------------
 
-# Least alpha of microfacets in Mitsuba.
-_SMOOTHEST = 1e-4
-
 
 def _microfacets(alpha: float) -> float:
     """Density of half vectors along the normal, of GGX and Beckmann; ``alpha``^2 = alpha_u alpha_v."""
-    return 1 / (math.pi * max(alpha, _SMOOTHEST) ** 2)
+    return 1 / (math.pi * max(alpha, 1e-4) ** 2)  # Mitsuba's least alpha
 
 
 def _refracted(alpha: float, eta: float) -> float:

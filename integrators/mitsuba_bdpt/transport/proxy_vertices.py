@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import scattering, spectra
+from .alternatives import newest_coefficient
 
 # Factor of an approximation on a side to which the BSDF does not scatter: shading normals and bumps may.
 WRONG_SIDE = 0.0002
@@ -83,15 +84,12 @@ class ProxyVertex:
     lobe: Lobe | None = None
 
     @staticmethod
-    def of(kernel, vertex, coefficient, active: mi.Bool, alone: bool) -> ProxyVertex:
-        """The proxy of ``vertex``; ``coefficient`` of its newest alternative's class.
-
-        ``alone``: the brightness matters, as it is not common to all compared connections.
-        """
+    def of(kernel, vertex, active: mi.Bool, adjoint: bool) -> ProxyVertex:
+        """The proxy of ``vertex``; that of a camera vertex, common to all candidates, has no brightness."""
         si, partial, flags = vertex.si, vertex.partial, vertex.bsdf.flags()
         wi, n, size = si.to_world(si.wi), mi.Vector3f(si.n), mi.Float(1)
         density, diffuse_pdf, lobe = partial.d_vc * vertex.cos, mi.Float(1), None
-        if alone:
+        if adjoint:
             up = mi.Vector3f(0, 0, dr.sign(si.wi.z))
             f = scattering.evaluate(kernel, vertex, up, active, reverse=False)
             size = _brightness(vertex, f.value) * dr.pi
@@ -103,9 +101,10 @@ class ProxyVertex:
                 lambda size: (size, mi.Float(1), mi.Float(0), mi.Float(0), mi.Float(2)),
             )
             lobe = Lobe(wi, mi.Vector3f(si.sh_frame.n), diffuse_pdf, peak, pdf, width2, density * pdf)
-        size = dr.maximum(size, _LEAST_SIZE if alone else 0)
+        size = dr.maximum(size, _LEAST_SIZE if adjoint else 0)
         behind = dr.select(mi.has_flag(flags, mi.BSDFFlags.Transmission), 1, mi.Float(WRONG_SIDE))
-        others = partial.d_vcm * coefficient + density * (diffuse_pdf * dr.inv_pi)
+        newest = newest_coefficient(kernel, vertex, adjoint)
+        others = partial.d_vcm * newest + density * (diffuse_pdf * dr.inv_pi)
         diffuse = Diffuse(dr.mulsign(n, dr.dot(n, wi)), size, behind, others)
         return ProxyVertex(mi.Point3f(si.p), diffuse, lobe)
 
