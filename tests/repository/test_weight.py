@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7687,
-    "transport merging guided_emission": 5761,
+    "transport merging guided_emission": 5752,
     "planning": 2154,
     "emitters": 2680,
     "cli": 1812,
