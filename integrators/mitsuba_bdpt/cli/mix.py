@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from argparse import Namespace
-from collections import Counter
 from pathlib import Path
 
 import mitsuba as mi
@@ -46,15 +45,14 @@ def _run(options: Namespace) -> int:
         raise CommandError(f"output={str(output)!r} must end in .png or .exr")
     _check_not_replaced(options.image, output)
     check_output(output, ".exr" if is_exr else ".png")
-    twice = [name for name, count in Counter(name for name, _ in options.weights).items() if count > 1]
-    if twice:
-        raise CommandError(f"{twice[0]} has two weights; give it one.")
-    mixed = mix(options.image, dict(options.weights))
+    weights = dict(options.weights)
+    if len(weights) < len(options.weights):
+        raise CommandError(f"a layer of {', '.join(weights)} has two weights; give it one.")
+    mixed = mix(options.image, weights)
     if is_exr:
         write_whole(mixed, output, mi.Bitmap.FileFormat.OpenEXR)
-    of_bands = mixed.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel
-    screen = grey(np.array(mixed)) if of_bands else mixed
-    png = developed(screen, options.exposure)
+    has_bands = mixed.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel
+    png = developed(grey(np.array(mixed)) if has_bands else mixed, options.exposure)
     write_whole(png, output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
     if has_channels(options.image, DENOISED):
         print(

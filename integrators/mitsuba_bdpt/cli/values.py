@@ -55,7 +55,7 @@ def _utf8(text: str) -> str:
 
 
 def weight(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer; ids may have ``=``."""
+    """Parse ``LAYER=X`` or ``LAYER=X,Y,Z``, the weight of a light group or path layer."""
     text = _utf8(text)
     name, equals, values = text.rpartition("=")
     with contextlib.suppress(ValueError):

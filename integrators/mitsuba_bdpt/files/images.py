@@ -112,7 +112,7 @@ def _write_exr(path: Path, channels: Mapping[str, np.ndarray], header: dict[str,
             with OpenEXR.File(header, dict(channels)) as file:
                 file.write(name)
             del channels, file
-            _read_exr(temporary)  # OpenEXR does not report every full disk
+            read_exr(temporary)  # OpenEXR does not report every full disk
         except (CommandError, RuntimeError) as error:
             why = f"could not be written whole ({error.__cause__ or error}); is the disk full?"
             raise OSError(errno.ENOSPC, why, str(path)) from error
@@ -206,7 +206,7 @@ def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, A
 
     ``layers``: prefixes as in `write_layers`. Raises ``CommandError`` for other files.
     """
-    channels, header = _read_exr(path)
+    channels, header = read_exr(path)
     missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
     if missing:
         raise CommandError(f"{str(path)!r} has no channel {missing[0]}; there are {sorted(channels)}")
@@ -214,7 +214,7 @@ def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, A
     return [image.astype(np.float64) for image in images], header
 
 
-def _read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_exr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the channels and the header of an EXR; raises ``CommandError`` for other files."""
     with path.open("rb") as file:  # OpenEXR does not report the cause
         start = file.read(4)
