@@ -25,7 +25,7 @@ MOST = {
     "": 1554,  # top files
 }
 OUTSIDE = {"scripts": 4739, "tests": 43996}
-MOST_WORDS = 31401
+MOST_WORDS = 30312
 
 
 def _lines(files):
