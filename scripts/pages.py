@@ -17,6 +17,7 @@ from functools import cache, partial
 from pathlib import Path
 
 import repository
+from goals import goals_table
 from mitsuba_bdpt.measure.report import PARTS, Report
 from mitsuba_bdpt.measure.tables import replace_part
 
@@ -42,6 +43,7 @@ def _whole() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     **{name: lambda part=part: part(benchmark()) for name, part in PARTS.items()},
+    "goals": lambda: goals_table(benchmark().results),
     "benchmark": _whole,
     "scale": partial(_recorded, "scale", "tables"),
     "scale goals": partial(_recorded, "scale", "goals"),

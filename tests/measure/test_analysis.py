@@ -2,11 +2,11 @@
 
 import json
 import re
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import goals
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 import numpy as np
 import pyarrow as pa
@@ -279,66 +279,33 @@ def test_tables_say_what_the_rows_say(results):
 
 def test_goals_stand_beside_what_is_measured(results):
     """Expected: a row per goal: its bound, its aim, the figure, and whether all numbers meet the bound,
-    of several each its own; without a number, no verdict."""
-    goals = [
-        {
-            "what": "box",
-            "at_least": 1.4,
-            "aim": "2x",
-            "measure": "efficiency",
-            "scene": "box",
-        },
-        {"what": "worst", "at_least": 0.97, "measure": "worst"},
-        {"what": "near", "at_least": 0.96, "measure": "near one", "scene": "box"},
-        {"what": "cost", "at_most": [3, 1.4], "text": "{}x / {}x", "measure": "cost", "scene": "box"},
-        {"what": "alone", "at_least": 1, "measure": "alone", "scene": "box"},
-        {"what": "none", "at_least": 2, "measure": "against none"},
-        {"what": "aimed", "at_least": 2, "measure": "not aimed", "scene": "box"},
-        {"what": "merged", "at_least": 9, "measure": "merging raw", "scene": "box"},
-        {"what": "cold", "at_most": [4, 2], "text": "{} s and {}x", "measure": "coldstart"},
-        {"what": "memory", "at_most": 1, "text": "{} GiB", "measure": "memory"},
-        {"what": "floor", "at_most": 1.35, "measure": "floor"},
-        {"what": "nothing", "at_least": 1},
-        {"what": "dark", "at_least": 1, "measure": "efficiency", "scene": "dark"},
-    ]
-    text = report.goals_table(results, goals)
-    assert cells(text, "box") == ["1.4x", "2x", "0.8x (0.8–0.8)", "**no**"]
+    of several each its own; without a number, no verdict. Every goal of the project gives a text for any
+    data."""
     near = "0.800x, interval 0.800–0.800, 16 pairs"
-    assert report._near(analysis.summary([0.8] * 4)) == "0.800x, range 0.800–0.800, 4 pairs"
-    assert cells(text, "worst") == ["0.97x", "–", f"`box` of 2 scenes: {near}", "**no**"]
-    assert cells(text, "near") == [
-        "0.96x",
-        "–",
-        f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
-        "**no**",
-    ]
-    assert cells(text, "cost") == ["3x / 1.4x at most", "–", "3x (3–3) / 1.5x (1.5–1.5)", "**no**"]
-    assert cells(text, "alone") == [
-        "1x",
-        "–",
-        ", ".join(f"fewer than two renders: seeds = 2 or more at {budget} spp" for budget in (64, 256)),
-        "–",
-    ]
-    assert cells(text, "none") == ["2x", "–", "3x trimmed, 3x raw, 2 of 2 scenes", "yes"]
-    fog = noisy("bdpt", 16) + noisy("bdpt skip=none", 16, seconds=24.0) + noisy("volpath", 16)
-    with_fog = Results(results.rows + [r | {"scene": "fog"} for r in fog], results.references, {})
-    assert (
-        cells(report.goals_table(with_fog, goals), "none")[2]
-        == "6x trimmed, 6x raw, 3 of 3 scenes; without media: 3x trimmed, 3x raw, 2 of 2 scenes"
-    )
-    assert cells(text, "merged") == [
-        "9x",
-        "–",
-        "20x (20–20) over path, 8x (8–8) over path multijitter",
-        "**no**",
-    ]
-    assert cells(text, "aimed") == ["2x", "–", "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"]
-    assert cells(text, "cold") == ["4 s and 2x at most", "–", "4.00 s, 2x (2–2; n = 2) `path`'s", "yes"]
-    assert cells(text, "memory") == ["1 GiB at most", "–", "not measured", "–"]
-    assert cells(text, "floor") == ["1.35x at most", "–", "1.3x (1.2–1.4; n = 3) `box`", "yes"]
-    assert cells(text, "nothing") == ["1x", "–", "not measured yet", "–"]
-    dark = cells(text, "dark")[2]
+    dark = goals.Goal("dark", (1,), goals.over_path, ("dark",)).row(results)[3]
     assert dark.startswith("≥ 0.8x (0.8–0.8); `path`: ") and "% of the energy is missing" in dark
+    for measure, scenes, bounds, text, met in (
+        (goals.over_path, ("box",), (1.4,), "0.8x (0.8–0.8)", "**no**"),
+        (goals.worst, (), (0.97,), f"`box` of 2 scenes: {near}", "**no**"),
+        (
+            goals.near_one,
+            ("box",),
+            (0.96,),
+            f"{near.replace('0.8', '2.0')} over path; {near} over path multijitter",
+            "**no**",
+        ),
+        (goals.costs, ("box",), (2, 1.4), "3x (3–3) / 1.5x (1.5–1.5)", "yes"),
+        (goals.against_none, (), (2,), "3x trimmed, 3x raw, 2 of 2 scenes", "yes"),
+        (goals.merged, ("box",), (9,), "20x (20–20) over path, 8x (8–8) over path multijitter", "**no**"),
+        (goals.unaimed, ("box",), (2,), "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"),
+        (goals.memory, (), (1,), "not measured", "–"),
+        (goals.floor, (), (1.35,), "1.3x (1.2–1.4; n = 3) `box`", "**no**"),
+    ):
+        assert goals.Goal("", bounds, measure, scenes).row(results)[3:] == [text, met]
+    cold = goals.Goal("cold", (4, 2), goals.coldstart, text="{} s and {}x", at_most=True)
+    figure = "4.00 s, 2x (2–2; n = 2) `path`'s"
+    assert cold.row(results) == ["cold", "4 s and 2x at most", "–", figure, "yes"]
+    assert goals.goals_table(results).count("\n") == len(goals.GOALS) + 2
 
 
 def test_slopes_need_an_explanation():
@@ -374,9 +341,9 @@ def test_choices_and_the_cost_of_the_pilot():
     assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
     assert found[1] == "t<=1" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and len(found) == 4
-    assert report.OF_A_SCENE["pilot"](results, "box") == report.Measured("20.0 % at 64 spp", [20.0])
+    assert goals.pilot(results, "box") == goals.Measured("20.0 % at 64 spp", [20.0])
     with pytest.raises(Unavailable, match="cached no pilots"):
-        report.OF_A_SCENE["pilot"](Results([row(seed=1)], {"box": KNOWN}, {}), "box")
+        goals.pilot(Results([row(seed=1)], {"box": KNOWN}, {}), "box")
 
 
 def test_a_bar_in_a_name_ends_no_cell():
@@ -392,11 +359,11 @@ def test_what_path_lacks_may_be_a_known_difference(results):
     `path` lacks nothing."""
     made = dict.fromkeys(("box", "dark"), image_of_two())
     sentence = "see *Differences from path and volpath* (docs/user/differences.md)"
-    assert sentence in report.page(results, made, [], {}, "x")
+    assert sentence in report.page(results, made, {}, "x")
     only = replace(
         results, rows=[row for row in results.rows if row["scene"] == "box" and row["method"] != "ptracer"]
     )
-    assert sentence not in report.page(only, {"box": made["box"]}, [], {}, "x")
+    assert sentence not in report.page(only, {"box": made["box"]}, {}, "x")
 
 
 def test_integrators_are_in_the_order_of_the_preset():
@@ -442,23 +409,9 @@ def test_names_are_those_of_the_preset():
     }
 
 
-def test_the_goals_of_the_project_can_be_measured(results):
-    """Expected: every row of goals.toml names a figure that exists, and gives a text for any data."""
-    file = ROOT / "docs" / "reports" / "benchmark" / "goals.toml"
-    goals = tomllib.loads(file.read_text())["goal"]
-    assert report.goals_table(results, goals).count("\n") == len(goals) + 2
-
-
-def test_a_goal_has_a_bound_for_each_number(results):
-    """Expected: the goal is named that has two bounds for one number."""
-    goal = {"what": "x", "at_least": [1, 2], "text": "{} {}", "measure": "efficiency", "scene": "box"}
-    with pytest.raises(CommandError, match="'x' has 2 bounds for 1 numbers"):
-        report.goals_table(results, [goal])
-
-
 def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
     """Rationale: `bdpt merging` and `ptracer` of somebody's preset were in no table and no figure, since the
-    benchmark has integrators of these names. Expected: all are compared, but those that goals.toml names."""
+    benchmark has integrators of these names. Expected: all are compared, but those that notes.toml names."""
     every = replace(results, aside=())
     assert every.rivals[:2] == ["path", "path multijitter"]
     assert set(every.rivals) == {*every.methods[1:]} and "ptracer" in every.rivals
@@ -560,7 +513,7 @@ def test_other_programs_are_noticed(wall, processor, is_busy):
         assert "`box`: path 1.6–4.6 s (processor 3.2–3.4 s). " in text
         assert 'clock = "processor"' in text and "bdpt" not in text
         assert not report.busy_text(replace(found, aside=("path",)))
-        page = report.page(found, {"box": image_of_two()}, [], {}, "Box")
+        page = report.page(found, {"box": image_of_two()}, {}, "Box")
         assert page.index(text) < page.index("Efficiency is")
 
 
@@ -628,11 +581,10 @@ def test_a_report_is_written(results, tmp_path):
     table = [r | {"reference_sha256": digest(file)} for r in only]
     pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
     (tmp_path / "probes.json").write_text(json.dumps(results.probes))
-    (tmp_path / "goals.toml").write_text('[[goal]]\nwhat = "floor"\nat_least = 1\n')
     (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
     readme.write_text(
-        "".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("goals", "efficiency", "gallery"))
+        "".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("efficiency", "gallery"))
     )
     words = ["report", str(tmp_path), "--readme", str(readme), "--project", str(tmp_path)]
     options = build_parser().parse_args(words)
@@ -642,13 +594,13 @@ def test_a_report_is_written(results, tmp_path):
     (tmp_path / "README.md").unlink()
     assert [report.run(options), report.run(options)] == [0, 0]
     page = (tmp_path / "README.md").read_text()
-    assert "* `box`: why" in page and cells(page, "floor") == ["1x", "–", "not measured yet", "–"]
+    assert "* `box`: why" in page
     assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
     for text, message in (
         (
             "<!-- report: nothing -->\n<!-- end -->\n",
-            "there is no part 'nothing'; there are goals, efficiency",
+            "there is no part 'nothing'; there are efficiency",
         ),
         ("# Mine\n", "TOP.md has no `<!-- report: NAME -->`"),
     ):
@@ -668,4 +620,4 @@ def test_a_report_is_written(results, tmp_path):
         report.run(options)
     (tmp_path / "notes.toml").write_text('nowhere = "why"\n')
     with pytest.raises(ValueError, match="'nowhere' is not among the scenes"):
-        report.page(results, {}, [], {"nowhere": "why"}, "mine")
+        report.page(results, {}, {"nowhere": "why"}, "mine")

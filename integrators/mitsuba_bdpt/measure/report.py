@@ -1,9 +1,9 @@
 """Tables and plots of a sweep.
 
-Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them. Goals
-and explanations are read from goals.toml and notes.toml, if present. Parts of another Markdown file between
-the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``goals``, ``efficiency``,
-``errors``, ``first images`` or ``gallery`` (of images in ../images/gallery).
+Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them.
+Explanations are read from notes.toml, if present. Parts of another Markdown file between the lines
+`<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``efficiency``, ``errors``, ``first
+images`` or ``gallery`` (of images in ../images/gallery).
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -28,24 +27,17 @@ from ..files.whole import check_own, check_writable
 from . import figures
 from .agreement import BiasCheck
 from .analysis import (
-    ALONE,
-    IMPOSSIBLE,
     INDEPENDENT,
     LIGHT_TRACER,
     MEDIA_RIVALS,
-    MERGING,
     NONE,
     RIVALS,
-    UNAIMED,
     Results,
     Summary,
     Unavailable,
     cost,
-    efficiency,
-    geometric_mean,
-    summary,
 )
-from .estimates import FEWEST_WITH_INTERVAL, RelativeError
+from .estimates import RelativeError
 from .metrics import rel_mse_epsilon
 from .project import Project
 from .record import Error, Row
@@ -53,7 +45,6 @@ from .reference import Reference
 from .results import load, missing_of
 from .tables import (
     by_scene,
-    met_text,
     positive,
     ranged,
     ratio,
@@ -294,7 +285,7 @@ def choices_table(results: Results) -> str:
     columns: dict[str, Callable[[str], object]] = {
         "chosen (number of renders)": chosen,
         "left out in the first render": left_out,
-        "share of the pilot in the first render": lambda scene: f"{_pilot_percent(rows(scene)):.1f} %",
+        "share of the pilot in the first render": lambda scene: f"{pilot_percent(rows(scene)):.1f} %",
         "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
         f"the same, {NONE}": lambda scene: _rays_per_sample(results.of(scene, NONE, results.deciding)),
     }
@@ -312,7 +303,7 @@ def _chosen(row: Row) -> str:
     return f"light_paths={light_paths}, connections={last['connections']}"
 
 
-def _pilot_percent(rows: Sequence[Row]) -> float:
+def pilot_percent(rows: Sequence[Row]) -> float:
     """Return the pilots' share of a scene's first render in percent; later ones reuse them."""
     shares: list[float] = []
     for row in rows:
@@ -383,232 +374,6 @@ def stronger(results: Results) -> str:
         )
         return f"the stronger `path`{media}"
     return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
-
-
-Goal = dict[str, Any]
-"""What an entry of goals.toml says, of the repository's own goals."""
-
-# -- goals ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Measured:
-    """What a goal measures: a text, and the numbers that must reach its bound; NaN where one is missing."""
-
-    text: str
-    values: Sequence[float]
-
-
-def _measured(
-    figures: Mapping[str, Callable[[], Summary]],
-    show: Callable[[Summary], str] = ranged,
-    value: Callable[[Summary], float] = attrgetter("median"),
-    join: str = ", ",
-) -> Measured:
-    """Collect named ``figures``, or why there is none; judged by ``value``."""
-    texts: list[str] = []
-    values: list[float] = []
-    for name, figure in figures.items():
-        try:
-            found = figure()
-        except Unavailable as why:
-            texts.append(f"{why} {name}")
-            values.append(np.nan)
-        else:
-            texts.append(f"{show(found)} {name}")
-            values.append(value(found))
-    return Measured(join.join(texts), values)
-
-
-def _scene_goal(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> Measured:
-    """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
-    lacks = results.path_lacks(scene)
-    rival = results.tracer(scene)
-    found = results.against_path(scene, error)
-    return Measured(ranged(found) + (f"; `{rival}`: {lacks}" if lacks else ""), [found.median])
-
-
-# Pairs required near 1, until the interval of their median is this narrow.
-MANY, NARROW = 20, 0.04
-
-
-def _near(found: Summary) -> str:
-    wide = found.count >= MANY and found.high - found.low > NARROW
-    middle = f"{found.bound} {found.median:.3f}x".lstrip()
-    what = "interval" if found.count >= FEWEST_WITH_INTERVAL else "range"
-    text = f"{middle}, {what} {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
-    return text + (f" (not narrower than {NARROW})" if wide else "")
-
-
-def _near_one(results: Results, scene: str) -> Measured:
-    """Efficiency over each of `Results.standard`, judged by the lower end of its interval."""
-    rivals = results.standard_in(scene) or RIVALS
-    figures = {f"over {rival}": partial(results.efficiency, scene, rival) for rival in rivals}
-    return _measured(figures, _near, attrgetter("low"), "; ")
-
-
-def _worst(results: Results) -> Measured:
-    """Smallest efficiency over all scenes."""
-    found: dict[str, Summary] = {}
-    for scene in results.scenes:
-        try:
-            found[scene] = results.against_path(scene)
-        except Unavailable:  # not rendered, or exact
-            continue
-    if not found:
-        raise Unavailable("not rendered")
-    worst = min(found, key=lambda scene: found[scene].median)
-    return Measured(f"`{worst}` of {len(found)} scenes: {_near(found[worst])}", [found[worst].median])
-
-
-def _against_none(results: Results) -> Measured:
-    """Geometric means over all scenes, by which it is judged, and over those without media."""
-    plain = [scene for scene in results.scenes if not any(results.of(scene, name) for name in MEDIA_RIVALS)]
-    every = _mean_over_none(results, results.scenes)
-    if not 0 < len(plain) < len(results.scenes):
-        return every
-    return Measured(f"{every.text}; without media: {_mean_over_none(results, plain).text}", every.values)
-
-
-def _mean_over_none(results: Results, scenes: list[str]) -> Measured:
-    """Geometric means over the scenes, trimmed and raw."""
-    found: dict[str, float] = {}
-    medians: list[float] = []
-    for error, kind in KINDS.items():
-        medians = []
-        for scene in scenes:
-            try:
-                medians.append(results.efficiency(scene, NONE, error).median)
-            except Unavailable:  # not rendered, or exact
-                continue
-        if not medians:
-            raise Unavailable("not rendered")
-        found[kind] = geometric_mean(medians)
-    text = ", ".join(f"{ratio(mean)} {kind}" for kind, mean in found.items())
-    return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", list(found.values()))
-
-
-def _unaimed(results: Results, scene: str) -> Measured:
-    """Efficiency of guided emission, trimmed, by which it is judged, and raw."""
-    found = _measured({kind: partial(results.efficiency, scene, UNAIMED, e) for e, kind in KINDS.items()})
-    return Measured(found.text, found.values[:1])
-
-
-def _merged(results: Results, scene: str) -> Measured:
-    """Raw efficiency of `merging` over each of `Results.standard`, biased or not."""
-    rivals = results.standard_in(scene) or RIVALS
-    over = partial(results.efficiency, scene, error="rel_mse", first=MERGING)
-    return _measured({f"over {rival}": partial(over, rival) for rival in rivals})
-
-
-def _alone(results: Results, scene: str) -> Measured:
-    budgets = (results.deciding, 4 * results.deciding)
-    sides = {n: [results.of(scene, way, n) for way in (ALONE, RIVALS[1])] for n in budgets}
-    return _measured({f"at {n} spp": partial(efficiency, *rows) for n, rows in sides.items()})
-
-
-def _cost(results: Results, scene: str) -> Measured:
-    path, *sides = (results.of(scene, way, results.deciding) for way in (RIVALS[0], NONE, IMPOSSIBLE))
-    found = [cost(side, path) for side in sides]
-    return Measured(" / ".join(map(ranged, found)), [one.median for one in found])
-
-
-def _pilot(results: Results, scene: str) -> Measured:
-    """The pilot's share of renders, judged by the longest."""
-    shares: dict[int, float] = {}
-    for budget in (results.deciding, 4 * results.deciding):
-        if rows := results.of(scene, results.methods[0], budget):
-            shares[budget] = _pilot_percent(rows)
-    if not shares:
-        raise Unavailable(f"no render of {scene}")
-    text = ", ".join(f"{share:.1f} % at {budget} spp" for budget, share in shares.items())
-    return Measured(text, [shares[max(shares)]])
-
-
-def _floor(results: Results) -> Measured:
-    found = {name: summary(v) for name, v in results.probed("floor").items()}
-    text = ", ".join(f"{ranged(one)} `{name}`" for name, one in found.items())
-    return Measured(text, [one.median for one in found.values()])
-
-
-def _coldstart(results: Results) -> Measured:
-    values = results.probed("coldstart")
-    ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
-    seconds = float(np.median(values["bdpt"]))
-    return Measured(f"{seconds:.2f} s, {ranged(ratios)} `path`'s", [seconds, ratios.median])
-
-
-def _memory(results: Results) -> Measured:
-    found = {name: float(np.median(v)) for name, v in results.probed("memory").items()}
-    return Measured(", ".join(f"{v:.2f} GiB for {name}" for name, v in found.items()), [*found.values()])
-
-
-OF_A_SCENE: dict[str, Callable[[Results, str], Measured]] = {
-    "efficiency": _scene_goal,
-    "efficiency raw": partial(_scene_goal, error="rel_mse"),
-    "near one": _near_one,
-    "alone": _alone,
-    "not aimed": _unaimed,
-    "merging raw": _merged,
-    "cost": _cost,
-    "pilot": _pilot,
-}
-OF_ALL: dict[str, Callable[[Results], Measured]] = {
-    "worst": _worst,
-    "against none": _against_none,
-    "floor": _floor,
-    "coldstart": _coldstart,
-    "memory": _memory,
-}
-"""What goals can measure: figures of a scene, and others."""
-
-
-BOUNDS = {"at_least": "", "at_most": " at most"}
-"""Keys of a goal's bound, one of which it has, and what its text ends in."""
-
-
-def _bounds(goal: Goal) -> list[Any]:
-    bound: Any = goal["at_least" if "at_least" in goal else "at_most"]
-    return [*bound] if isinstance(bound, list) else [bound]
-
-
-def _bound_text(goal: Goal) -> str:
-    """Format a goal's bound by its ``text``, which has a `{}` for each number; default: a ratio."""
-    (key,) = (key for key in BOUNDS if key in goal)
-    return goal.get("text", "{}x").format(*_bounds(goal)) + BOUNDS[key]
-
-
-def _met(goal: Goal, values: Sequence[float]) -> str:
-    """Whether all ``values`` meet a goal's bound, or each its own; intervals do not matter."""
-    if not values or any(np.isnan(value) for value in values):
-        return "–"
-    bounds = _bounds(goal)
-    if len(bounds) == 1:
-        bounds *= len(values)
-    if len(bounds) != len(values):
-        raise CommandError(f"goals.toml: {goal['what']!r} has {len(bounds)} bounds for {len(values)} numbers")
-    pairs = zip(values, bounds, strict=True)
-    return met_text(all(value >= bound if "at_least" in goal else value <= bound for value, bound in pairs))
-
-
-def goals_table(results: Results, goals: list[Goal]) -> str:
-    """Table of goals and measurements, and whether they are met, at the default budget of comparisons."""
-    results = replace(results, compared=None)
-
-    def figure(measure: str | None = None, scene: str | None = None, **_) -> Measured:
-        if measure is None:
-            return Measured("not measured yet", [])
-        try:
-            return OF_ALL[measure](results) if scene is None else OF_A_SCENE[measure](results, scene)
-        except Unavailable as why:
-            return Measured(str(why), [])
-
-    lines: list[list[str]] = []
-    for goal in goals:
-        found = figure(**goal)
-        met = _met(goal, found.values)
-        lines.append([goal["what"], _bound_text(goal), goal.get("aim", "–"), found.text, met])
-    return table(["what", "bound", "aim", "measured", "met"], lines)
 
 
 # -- files ------------------------------------------------------------------------------------
@@ -812,7 +577,6 @@ def _by_budget(results: Results) -> str:
 def page(
     results: Results,
     made: dict[str, Reference],
-    goals: list[Goal],
     notes: dict[str, str],
     name: str,
     missing: str = "",
@@ -824,7 +588,7 @@ def page(
     return f"""# {name}
 
 {missing}{busy_text(results)}{apart_text(results)}{_introduction(results)}
-{f"## Goals{chr(10)}{chr(10)}{goals_table(results, goals)}{chr(10)}" if goals else ""}## Efficiency
+## Efficiency
 
 {efficiency_table(results)}
 {_differences(results)}{picture if results.has_efficiency(results.scenes) else ""}
@@ -873,30 +637,29 @@ have in common is left to the package's own tests.
 
 @dataclass(frozen=True)
 class Report:
-    """The results in a folder, with goals and notes."""
+    """The results in a folder, with notes."""
 
     results: Results
     made: dict[str, Reference]
-    goals: list[Goal]
     notes: dict[str, str]
     title: str
     missing: str = ""
 
     @staticmethod
     def of(project: Project, folder: Path, spp: int | None = None) -> Report:
-        """Read a folder; raises ``CommandError`` like `results.load`, or for invalid goals and notes."""
+        """Read a folder; raises ``CommandError`` like `results.load`, or for invalid notes."""
         results, made = load(project, folder)
         results = replace(results, compared=spp)
-        files = {name: folder / f"{name}.toml" for name in ("goals", "notes")}
-        kept = {name: read_toml(file) if file.exists() else {} for name, file in files.items()}
-        for scene, text in kept["notes"].items():
-            text_of(files["notes"], scene, text)
-        goals = kept["goals"].get("goal", [])
-        return Report(results, made, goals, kept["notes"], title(results, folder), missing_text(folder))
+        file = folder / "notes.toml"
+        notes = read_toml(file) if file.exists() else {}
+        notes.pop("aside", None)  # read by `results.load`
+        for scene, text in notes.items():
+            text_of(file, scene, text)
+        return Report(results, made, notes, title(results, folder), missing_text(folder))
 
     def text(self) -> str:
         """Return the page of all tables, as Markdown."""
-        return page(self.results, self.made, self.goals, self.notes, self.title, self.missing)
+        return page(self.results, self.made, self.notes, self.title, self.missing)
 
     def draw(self, folder: Path) -> None:
         """Write the plots that the page shows."""
@@ -929,7 +692,6 @@ def run(options: Namespace) -> int:
 
 
 PARTS: dict[str, Callable[[Report], str]] = {
-    "goals": lambda found: goals_table(found.results, found.goals),
     "efficiency": lambda found: efficiency_table(found.results),
     "errors": lambda found: errors_table(found.results),
     "first images": lambda found: first_images_table(found.results),

@@ -390,7 +390,7 @@ def decisive(rows: list[Row]) -> list[Row]:
 def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
     """Return the results in a folder, and the references of its scenes by name.
 
-    The integrators that goals.toml lists as ``aside`` are not compared. Raises ``CommandError`` if there are
+    The integrators that notes.toml lists as ``aside`` are not compared. Raises ``CommandError`` if there are
     no results, or if errors are against other references than the ``project``'s.
     """
     try:
@@ -418,12 +418,12 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
     file = folder / "probes.json"
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
-    goals = folder / "goals.toml"
-    given = read_toml(goals) if goals.exists() else {}
-    aside = list_of(goals, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
+    notes = folder / "notes.toml"
+    given = read_toml(notes) if notes.exists() else {}
+    aside = list_of(notes, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
     found = analysis.Results(rows, means, measured, tuple(aside))
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
-            f"{goals}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
+            f"{notes}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
         )
     return found, made
