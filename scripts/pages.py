@@ -62,7 +62,7 @@ def filled(text: str) -> str:
 
 def main(arguments=None) -> int:
     """Print a page."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="Print a page with its tables.")
     parser.add_argument("page", type=Path)
     print(filled(parser.parse_args(arguments).page.read_text()))
     return 0

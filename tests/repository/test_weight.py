@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7687,
+    "measure": 7449,
     "transport merging guided_emission": 5752,
     "planning": 2154,
     "emitters": 2680,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 4739, "tests": 43996}
+OUTSIDE = {"scripts": 4739, "tests": 43948}
 MOST_WORDS = 30312
 
 
