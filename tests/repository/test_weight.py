@@ -24,8 +24,8 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 4739, "tests": 43948}
-MOST_WORDS = 30312
+OUTSIDE = {"scripts": 5056, "tests": 43948}
+MOST_WORDS = 30313
 
 
 def _lines(files):
