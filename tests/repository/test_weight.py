@@ -25,7 +25,7 @@ MOST = {
     "": 1554,  # top files
 }
 OUTSIDE = {"scripts": 5056, "tests": 43948}
-MOST_WORDS = 30313
+MOST_WORDS = 30297
 
 
 def _lines(files):
