@@ -44,7 +44,10 @@ def why_not(sensor: mi.Sensor, media: bool) -> str:
 
 
 class Passes:
-    """Vertex merging in one render of ``pixels`` pixels; ``near_specular``: the scene has such lobes."""
+    """Vertex merging in one render of ``pixels`` pixels; ``near_specular``: the scene has such lobes.
+
+    ``best_pass``: samples per pixel of a pass.
+    """
 
     def __init__(
         self,
@@ -55,17 +58,12 @@ class Passes:
         pixels: int,
         near_specular: bool,
     ):
-        many = near_specular or settings.light_paths == 0
-        self._pass = _SHORT_PASS if many else _PASS
+        per_pixel = _SHORT_PASS if near_specular or settings.light_paths == 0 else _PASS
+        self.best_pass = max(per_pixel, _LEAST_SAMPLES // pixels)
         self._footprints = Footprints.of(scene, sensor)
         # Densities decide where the light of an even sky is merged.
         self._aim = replace(aim, no_sky=False)
         self._radius, self._pixels = settings.internals.merging_radius, pixels
-
-    @property
-    def best_pass(self) -> int:
-        """Samples per pixel of a pass."""
-        return max(self._pass, _LEAST_SAMPLES // self._pixels)
 
     def trace(
         self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None

@@ -58,9 +58,7 @@ class Undersampled(Unsampled):
         """Adds the merge to the sums, at the path's only vertex that is not near-specular."""
         expected = self.expected(kernel, merging, z, found)
         active = found.active & ~is_narrow(found.f)
-        kind = mi.UInt32(0)
-        for bound in KINDS[:-1]:
-            kind += dr.select(expected > 0 if bound == 0 else expected >= bound, mi.UInt32(1), 0)
+        kind = dr.select(expected > 0, mi.UInt32(1), 0) + dr.select(expected >= FEWEST, mi.UInt32(1), 0)
         size = mi.Float64(dr.sum(mi.unpolarized_spectrum(found.value)))
         dr.scatter_add(self.sums, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
         return active & ~(expected >= FEWEST)  # NaN counts

@@ -53,7 +53,7 @@ def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
     else:
         connectible = state.is_connectible(False, newest)
     possible = has_lobe(kernel, vertex) & ~connectible
-    return possible if state is None or state.isolated is None else possible & state.isolated
+    return possible if state is None else possible & state.isolated
 
 
 def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
