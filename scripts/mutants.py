@@ -1579,7 +1579,7 @@ MUTANTS = (
         "merging/passes.py",
         "order = dr.argsort(key |",
         "order = dr.argsort(mi.UInt64(bucket) |",
-        ("tests/images/test_merging.py::test_photons_are_in_the_same_order_on_any_number_of_threads",),
+        ("tests/images/test_merging.py::test_photons_are_the_same_in_any_order",),
     ),
     Mutant(
         "merging: paths an edge longer than max_depth",
