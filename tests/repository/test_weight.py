@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7449,
-    "transport merging guided_emission": 5752,
+    "transport merging guided_emission": 5748,
     "planning": 2154,
     "emitters": 2680,
     "cli": 1810,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 5056, "tests": 43948}
+OUTSIDE = {"scripts": 5056, "tests": 43949}
 MOST_WORDS = 30297
 
 
