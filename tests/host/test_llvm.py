@@ -7,8 +7,8 @@ count. Tests of the real thing, what ``import mitsuba_bdpt`` does to a process, 
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,60 +28,36 @@ def library(tmp_path):
     return make
 
 
-BARE = llvm.Machine(env={}, wheel=(), system=())
+@pytest.fixture(autouse=True)
+def no_cuda(monkeypatch):
+    monkeypatch.setattr(llvm, "cuda_driver", lambda: False)
 
 
-def test_variable_wins_over_everything_and_is_not_judged(library):
+def test_variable_wins_over_everything_and_is_not_judged(library, monkeypatch):
     """A user may know that LLVM 15 works on this machine."""
-    named, wheel = library("libLLVM-15.so.1"), library("env/libLLVM.so.23.1")
-    machine = llvm.Machine({llvm.VARIABLE: str(named)}, (wheel,), (wheel,))
-    choice = llvm.choose(machine)
-    assert (choice.path, choice.origin, choice.version) == (named, "variable", 15)
+    path = library("libLLVM-15.so.1")
+    monkeypatch.setenv(llvm.VARIABLE, str(path))
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    assert llvm.prepare() == llvm.Choice(path, llvm.NAMED, 15)
 
 
-def test_variable_that_names_no_file_is_refused_in_words():
-    with pytest.raises(llvm.LLVMNotFoundError, match=r"DRJIT_LIBLLVM_PATH='/no/such.so'.*Unset"):
-        llvm.choose(replace(BARE, env={llvm.VARIABLE: "/no/such.so"}))
+def test_the_newest_known_library_of_the_environment_wins_over_the_system(library):
+    """Expected: libraries of untested and old versions are passed over."""
+    environment = [library(f"env/{name}") for name in ("libLLVM-19.so", "libLLVM.so.22.1", "libLLVM.so.24.1")]
+    system = [library(f"usr/{name}") for name in ("libLLVM-15.so.1", "libLLVM.so.23.1", "libLLVM-19.so")]
+    for own, path, version in ((environment, environment[1], 22), (environment[2:], system[1], 23)):
+        choice = llvm.choose(own, system)
+        assert (choice.path, choice.version) == (path, version)
 
 
-def test_empty_variable_counts_as_unset(library):
-    wheel = library("libLLVM.so.23.1")
-    machine = llvm.Machine({llvm.VARIABLE: ""}, (wheel,), ())
-    assert llvm.choose(machine).origin == "wheel"
-
-
-def test_wheel_wins_over_the_system(library):
-    wheel, system = library("env/libLLVM.so.22.1"), library("usr/libLLVM.so.23.1")
-    choice = llvm.choose(replace(BARE, wheel=(wheel,), system=(system,)))
-    assert (choice.path, choice.origin, choice.version) == (wheel, "wheel", 22)
-
-
-def test_newest_known_system_library_is_taken(library):
-    names = ["libLLVM-15.so.1", "libLLVM-19.so", "libLLVM.so.22.1", "libLLVM.so.24.1"]
-    paths = [library(name) for name in names]
-    choice = llvm.choose(replace(BARE, system=tuple(paths)))
-    assert (choice.path, choice.origin, choice.version) == (paths[2], "system", 22)
-
-
-def test_wheel_of_an_untested_version_is_passed_over(library):
-    wheel, system = library("env/libLLVM.so.24.1"), library("usr/libLLVM-19.so")
-    assert llvm.choose(replace(BARE, wheel=(wheel,), system=(system,))).path == system
-
-
-@pytest.mark.parametrize("version", [14, 15, 16, 17, 18])
-def test_old_libraries_are_named_and_not_taken(library, version):
-    old = library(f"libLLVM-{version}.so.1")
+def test_old_and_unknown_libraries_are_named_and_not_taken(library):
+    """Expected: the error lists what was found, and how to try it."""
+    paths = [library(name) for name in ("libLLVM-14.so.1", "libLLVM-18.so", "libLLVM-21.so", "libLLVM.so")]
     with pytest.raises(llvm.LLVMNotFoundError) as caught:
-        llvm.choose(replace(BARE, system=(old,)))
-    assert f"{old} (LLVM {version}, too old)" in str(caught.value)
-
-
-def test_untested_and_unknown_versions_are_named_with_the_way_to_try_them(library):
-    paths = (library("libLLVM-21.so"), library("libLLVM.so"))
-    with pytest.raises(llvm.LLVMNotFoundError) as caught:
-        llvm.choose(replace(BARE, system=paths))
-    assert f"{paths[0]} (LLVM 21, untested; to try it, set {llvm.VARIABLE})" in str(caught.value)
-    assert f"{paths[1]} (version unknown; to try it, set {llvm.VARIABLE})" in str(caught.value)
+        llvm.choose(paths[:2], paths[2:])
+    for path, version in zip(paths, (14, 18, 21, "of unknown version"), strict=True):
+        assert f"{path} (LLVM {version})" in str(caught.value)
+    assert f"set {llvm.VARIABLE}" in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -93,10 +69,11 @@ def test_untested_and_unknown_versions_are_named_with_the_way_to_try_them(librar
         ("Windows", "AMD64", "set DRJIT_LIBLLVM_PATH"),
     ],
 )
-def test_error_names_the_command_for_the_platform(system, architecture, command):
-    machine = replace(BARE, system_name=system, architecture=architecture)
+def test_error_names_the_command_for_the_platform(monkeypatch, system, architecture, command):
+    monkeypatch.setattr("platform.system", lambda: system)
+    monkeypatch.setattr("platform.machine", lambda: architecture)
     with pytest.raises(llvm.LLVMNotFoundError) as caught:
-        llvm.choose(machine)
+        llvm.choose([], [])
     assert "none was found" in str(caught.value) and command in str(caught.value)
 
 
@@ -123,23 +100,26 @@ def test_major_version_of_a_link_is_that_of_its_target(library, tmp_path):
     assert llvm.major_version(link) == 23
 
 
-def test_search_finds_libraries_once_and_nothing_else(library, tmp_path):
-    real = library("libLLVM-19.so.1")
-    (tmp_path / "libLLVM-19.so").symlink_to(real.name)
-    library("libLLVMSupport.so.19")
-    library("libLLVM-19.a")
-    assert llvm.system_libraries([tmp_path, tmp_path / "missing", tmp_path]) == [real]
+def test_search_finds_libraries_once_and_nothing_else(library, tmp_path, monkeypatch):
+    """Expected: those of the wheel, also beside another prefix (``pip install --user``), of the prefix (where
+    installers omit the wheel's list of files), and of the system; no links to them, no other libraries."""
+    real = library("usr/lib/llvm-19/lib/libLLVM-19.so.1")
+    (tmp_path / "usr/lib/libLLVM-19.so").symlink_to(real)
+    for name in ("libLLVMSupport.so.19", "libLLVM-19.a"):
+        library(f"usr/lib/{name}")
+    own, listed = library("env/lib/libLLVM.so.22.1"), library("user/lib/libLLVM.so.23.1")
 
+    class Listed:
+        name = listed.name
 
-def test_wheel_is_found_where_its_list_of_files_is_missing(library, monkeypatch):
-    """Some installers drop the list; others never made one."""
-    wheel = library("lib/libLLVM.so.23.1")
+        def locate(self):
+            return listed
 
-    class Distribution:
-        files = None
-
-    monkeypatch.setattr("importlib.metadata.distribution", lambda name: Distribution())
-    assert llvm.wheel_libraries(wheel.parents[1]) == [wheel]
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "env"))
+    for files, expected in (([Listed()], [listed, own]), (None, [own])):
+        wheels = [SimpleNamespace(files=files)]
+        monkeypatch.setattr("importlib.metadata.distributions", lambda name, wheels=wheels: wheels)
+        assert llvm.libraries(tmp_path) == (expected, [real])
 
 
 @pytest.mark.parametrize(
@@ -157,46 +137,24 @@ def test_a_wheel_installed_by_this_process_is_finished(monkeypatch, files, start
             return "" if name in files else None
 
     started = []
-    monkeypatch.setattr("importlib.metadata.distribution", lambda name: Distribution())
+    monkeypatch.setattr("importlib.metadata.distributions", lambda name: [Distribution()])
     monkeypatch.setattr(subprocess, "run", lambda command, **_: started.append(command[0]))
     llvm.finish_installation()
     assert started == [sys.executable] * starts
 
 
-def test_no_wheel_no_libraries(monkeypatch, tmp_path):
-    monkeypatch.setattr(llvm, "WHEEL", "surely-not-an-installed-distribution")
-    assert llvm.wheel_libraries(tmp_path) == []
-
-
-@pytest.mark.parametrize("version", [(14, 0, 6), (15, 0, 7), (16, 0, 0), (18, 1, 8)])
-def test_old_llvm_of_an_imported_drjit_is_refused(version):
-    number = ".".join(map(str, version))
-    with pytest.raises(llvm.LLVMNotFoundError, match=f"LLVM {number}.*Import mitsuba_bdpt before"):
-        llvm.check_loaded(version, BARE)
-
-
-def test_imported_drjit_without_llvm_is_refused():
-    with pytest.raises(llvm.LLVMNotFoundError, match="found no usable LLVM"):
-        llvm.check_loaded((-1, -1, -1), BARE)
-
-
-@pytest.mark.parametrize("env", [{}, {llvm.VARIABLE: "old"}])
-def test_old_llvm_of_an_imported_drjit_is_answered_with_the_library_to_take(library, env):
-    """Expected: the library that would have been chosen, the variable apart, which named the old one."""
-    new, old = library("libLLVM.so.23.1"), library("old")
-    machine = llvm.Machine({name: str(old) for name in env}, (new,), ())
-    with pytest.raises(llvm.LLVMNotFoundError) as caught:
-        llvm.check_loaded((15, 0, 7), machine)
-    assert f"set {llvm.VARIABLE}={new} before Python starts" in str(caught.value)
-    assert "import mitsuba_bdpt  # isort: skip" in str(caught.value)
-    with pytest.raises(llvm.LLVMNotFoundError, match="install a newer one"):
-        llvm.check_loaded((15, 0, 7), replace(machine, wheel=()))
-
-
-@pytest.mark.parametrize("major", [19, 21, 23])
-def test_new_llvm_of_an_imported_drjit_is_accepted(major):
-    choice = llvm.check_loaded((major, 1, 0), BARE)
-    assert (choice.path, choice.origin, choice.version) == (None, "drjit", major)
+def test_an_imported_drjit_is_checked():
+    """Expected: old versions and none are errors with the remedy, newer versions are accepted."""
+    for version, words in (
+        ((14, 0, 6), "loaded LLVM 14.0.6.*Import mitsuba_bdpt before"),
+        ((18, 1, 8), f"loaded LLVM 18.1.8.*set {llvm.VARIABLE} to the path"),
+        ((-1, -1, -1), "found no usable LLVM"),
+    ):
+        with pytest.raises(llvm.LLVMNotFoundError, match=words):
+            llvm.check_loaded(version)
+    for major in (19, 21, 23):
+        choice = llvm.check_loaded((major, 1, 0))
+        assert (choice.path, choice.version) == (None, major)
 
 
 def run(code, *arguments, **env):
@@ -238,22 +196,21 @@ def test_import_after_drjit_with_an_old_llvm_fails():
     assert "LLVMNotFoundError: drjit was imported first and loaded LLVM 15.0.7" in done.stderr
 
 
-def test_a_machine_with_cuda_needs_no_llvm(library):
+def test_a_machine_with_cuda_needs_no_llvm(library, monkeypatch):
     """Expected: with a driver of CUDA the choice is none, whatever unusable there is, also in a process that
     inherits the choice of its parent, and where Dr.Jit came first; a usable library is chosen nevertheless.
     """
-    cuda = replace(BARE, has_cuda=lambda: True)
-    old = replace(cuda, system=(library("libLLVM-15.so.1"),))
-    choice = llvm.choose(old)
-    assert (choice.path, choice.origin) == (None, "none")
-    assert "only variants of CUDA" in str(choice) and "LLVM 15, too old" in str(choice)
-    assert llvm.choose(replace(old, env={llvm.VARIABLE: os.devnull})).origin == "none"
-    assert llvm.check_loaded((-1, 0, 0), cuda).origin == "none"
-    with pytest.raises(llvm.LLVMNotFoundError, match="too old"):
-        llvm.check_loaded((15, 0, 7), old)
     with pytest.raises(llvm.LLVMNotFoundError, match="names no file"):
-        llvm.choose(replace(BARE, env={llvm.VARIABLE: os.devnull}))
-    assert llvm.choose(replace(old, system=(library("libLLVM.so.22.1"),))).origin == "system"
+        llvm.named(os.devnull)
+    monkeypatch.setattr(llvm, "cuda_driver", lambda: True)
+    old, new = library("libLLVM-15.so.1"), library("libLLVM.so.22.1")
+    choice = llvm.choose([], [old])
+    assert choice.path is choice.version is None
+    assert "only variants of CUDA" in str(choice) and "LLVM 15" in str(choice)
+    assert llvm.named(os.devnull).path is llvm.check_loaded((-1, 0, 0)).path is None
+    with pytest.raises(llvm.LLVMNotFoundError, match="loaded LLVM 15"):
+        llvm.check_loaded((15, 0, 7))
+    assert llvm.choose([], [old, new]).path == new
 
 
 @pytest.mark.parametrize("found, named", [((), None), (("libLLVM-15.so.1",), os.devnull)])
@@ -261,12 +218,13 @@ def test_unusable_libraries_are_kept_from_drjit(library, monkeypatch, found, nam
     """Rationale: Dr.Jit looks for a library by itself, and old ones abort the process. Expected: where there
     are only such, the variable names an empty file; where there is none, it is left as it was.
     """
-    machine = replace(BARE, system=tuple(map(library, found)), has_cuda=lambda: True)
-    monkeypatch.setattr(llvm.Machine, "here", lambda: machine)
+    paths = list(map(library, found))
+    monkeypatch.setattr(llvm, "cuda_driver", lambda: True)
+    monkeypatch.setattr(llvm, "libraries", lambda: ([], paths))
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
-    monkeypatch.delenv(llvm.VARIABLE, raising=False)
-    assert llvm.prepare().origin == "none"
-    assert os.environ.get(llvm.VARIABLE) == named
+    monkeypatch.setenv(llvm.VARIABLE, "")  # counts as unset
+    assert llvm.prepare().path is None
+    assert (os.environ.get(llvm.VARIABLE) or None) == named
 
 
 def test_import_after_drjit_does_not_ask_for_llvm_on_a_cuda_variant():
@@ -280,7 +238,7 @@ spec = importlib.util.spec_from_file_location("llvm", PATH)
 llvm = importlib.util.module_from_spec(spec)
 sys.modules["llvm"] = llvm
 spec.loader.exec_module(llvm)
-assert llvm.prepare().origin == "none"
+assert llvm.prepare().path is None
 """
     done = run(FAKE_DRJIT + code.replace("PATH", repr(str(Path(llvm.__file__)))))
     assert done.returncode == 0, done.stderr

@@ -97,7 +97,7 @@ def llvm_library() -> Finding:
     if failure is not None or choice is None:
         subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
         return Finding("FAIL", subject, str(failure))
-    if choice.version in llvm.KNOWN_GOOD or choice.origin == "none":
+    if choice.version in llvm.KNOWN_GOOD or not (choice.path or choice.version):
         return Finding("ok", "LLVM", str(choice))
     known = ", ".join(map(str, llvm.KNOWN_GOOD))
     return Finding("note", "LLVM", f"{choice}; versions known to work: {known}")
@@ -189,7 +189,7 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
 
 def crash_remedy() -> str:
     """Return the remedy after a crash: another LLVM."""
-    named, choice = os.environ.get(llvm.VARIABLE), mitsuba_bdpt.llvm_choice
-    if named and choice is not None and choice.origin == "variable":
-        return f"Unset {llvm.VARIABLE}; it names {named!r}."
-    return llvm.remedy(llvm.Machine.here())
+    choice = mitsuba_bdpt.llvm_choice
+    if choice is not None and choice.why == llvm.NAMED:
+        return f"Unset {llvm.VARIABLE}; it names {str(choice.path)!r}."
+    return llvm.remedy()

@@ -1,14 +1,12 @@
 """Choice of the LLVM library that Dr.Jit loads.
 
 Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once, on its first import. Mitsuba 3.9 rejects LLVM 14, and LLVM 15
-and 16 abort the process on machines with AVX-512, so this module chooses before ``drjit`` is imported:
+and 16 abort the process on machines with AVX-512, so `prepare` chooses before ``drjit`` is imported:
 
 1. the library that the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
-2. the library of the installed wheel ``karellen-llvm-core``;
-3. the newest library on the system whose version is known to work;
-4. none if there is a CUDA driver, whose variants need no LLVM.
-
-``choose`` is a pure function of a `Machine`; only `prepare` changes the process.
+2. the newest library of the Python environment whose version is known to work (the wheel
+   ``karellen-llvm-core``, conda), else of the system;
+3. none if there is a CUDA driver, whose variants need no LLVM.
 
 `quick_compilation` has LLVM compile kernels without its optional passes for a while.
 """
@@ -24,23 +22,31 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
+NAMED = f"named by {VARIABLE}"
 WHEEL = "karellen-llvm-core"
 KNOWN_GOOD = (19, 22, 23)
 """Major versions that passed this package's tests."""
+
+# Where Linux distributions and Homebrew install libLLVM, within the root directory.
+SYSTEM = (
+    *("usr/lib/x86_64-linux-gnu", "usr/lib/aarch64-linux-gnu", "usr/lib64", "usr/lib", "usr/local/lib"),
+    *("usr/lib/llvm*/lib", "usr/lib64/llvm*/lib*", "usr/lib/llvm/*/lib*"),
+    *("opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib"),
+)
+
+_LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 
 # Whether `quick_compilation` is in effect.
 _quick: ContextVar[bool] = ContextVar("quick", default=False)
 
 # Value of LLVM's option opt-bisect-limit that limits nothing.
 _ALL_PASSES = 2**31 - 1
-
-_LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 
 
 class LLVMNotFoundError(ImportError):
@@ -49,12 +55,14 @@ class LLVMNotFoundError(ImportError):
 
 @dataclass(frozen=True)
 class Choice:
-    """The LLVM library in use; `version` is its major version, None if unknown."""
+    """The LLVM library in use; ``version`` is its major version, None if unknown.
+
+    ``path`` is None where Dr.Jit was imported first, or LLVM is not used (``version`` None).
+    """
 
     path: Path | None
-    origin: str
     why: str
-    version: int | None
+    version: int | None = None
 
     def __str__(self) -> str:
         if self.path is None and self.version is None:
@@ -63,101 +71,77 @@ class Choice:
         return f"{version}, {self.path or 'loaded before'} ({self.why})"
 
 
-@dataclass(frozen=True)
-class Machine:
-    env: Mapping[str, str]
-    wheel: tuple[Path, ...]
-    """Libraries of the installed wheel."""
-    system: tuple[Path, ...]
-    """Other LLVM libraries that exist."""
-    system_name: str = "Linux"
-    architecture: str = "x86_64"
-    has_cuda: Callable[[], bool] = lambda: False
-    """Whether a driver of CUDA can be loaded; called only where no LLVM is found, since it is slow."""
-
-    @classmethod
-    def here(cls) -> Machine:
-        return cls(
-            env=os.environ,
-            wheel=tuple(wheel_libraries(Path(sys.prefix))),
-            system=tuple(system_libraries(library_directories(Path(sys.prefix)))),
-            system_name=platform.system(),
-            architecture=platform.machine(),
-            has_cuda=cuda_driver,
-        )
+def prepare() -> Choice:
+    """Choose a library and set ``DRJIT_LIBLLVM_PATH``, or check an imported Dr.Jit."""
+    if (drjit := sys.modules.get("drjit")) is not None:
+        mitsuba = sys.modules.get("mitsuba")
+        if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
+            return Choice(None, "the current variant runs on CUDA")
+        return check_loaded(drjit.detail.llvm_version())
+    finish_installation()
+    if name := os.environ.get(VARIABLE):
+        return named(name)
+    found = libraries()
+    choice = choose(*found)
+    if choice.path or any(found):
+        # Keeps Dr.Jit from loading an unusable library by itself.
+        os.environ[VARIABLE] = str(choice.path or os.devnull)
+    return choice
 
 
-def choose(machine: Machine) -> Choice:
-    """Return the library to load on `machine`, or raise `LLVMNotFoundError`."""
-    named = machine.env.get(VARIABLE)
-    if named and not (named == os.devnull and machine.has_cuda()):
-        path = Path(named)
-        if not path.is_file():
-            raise LLVMNotFoundError(
-                f"{VARIABLE}={named!r} names no file. Unset {VARIABLE} to let mitsuba_bdpt choose, "
-                "or set it to the path of a libLLVM shared library."
-            )
-        return Choice(path, "variable", f"named by {VARIABLE}", major_version(path))
-    if named:
-        return _without_llvm(f"{VARIABLE}={named} asks for none")
-    for path in machine.wheel:
-        if major_version(path) in KNOWN_GOOD:
-            return Choice(path, "wheel", f"installed by {WHEEL}", major_version(path))
-    usable = [path for path in machine.system if major_version(path) in KNOWN_GOOD]
-    if usable:
-        # max() keeps the search order on ties.
-        path = max(usable, key=lambda path: major_version(path) or 0)
-        return Choice(path, "system", "found on the system, known to work", major_version(path))
-    found = _describe(machine.wheel + machine.system)
-    if machine.has_cuda():
-        return _without_llvm(found)
+def named(name: str) -> Choice:
+    """Return the library that `VARIABLE` names; none if it is ``os.devnull``, see `prepare`."""
+    path = Path(name)
+    if path.is_file():
+        return Choice(path, NAMED, major_version(path))
+    if name == os.devnull and cuda_driver():
+        return _without_llvm(f"{VARIABLE}={name} asks for none")
     raise LLVMNotFoundError(
-        f"No usable LLVM library: {found}. Versions known to work: {_versions()}. {remedy(machine)}"
+        f"{VARIABLE}={name!r} names no file. Unset {VARIABLE} to let mitsuba_bdpt choose, "
+        "or set it to the path of a libLLVM shared library."
     )
 
 
+def choose(environment: list[Path], system: list[Path]) -> Choice:
+    """Return the library to load of those found, see `libraries`, or raise `LLVMNotFoundError`."""
+    for paths, where in ((environment, "Python environment"), (system, "system")):
+        # max() keeps the search order on ties.
+        path = max(paths, key=_known_version, default=None)
+        if path is not None and _known_version(path):
+            return Choice(path, f"found in the {where}, known to work", major_version(path))
+    found = _describe([*environment, *system])
+    if cuda_driver():
+        return _without_llvm(found)
+    known = ", ".join(map(str, KNOWN_GOOD))
+    raise LLVMNotFoundError(f"No usable LLVM library: {found}. Versions known to work: {known}. {remedy()}")
+
+
+def _known_version(path: Path) -> int:
+    """Return the major version of a library if it is known to work, else 0."""
+    version = major_version(path) or 0
+    return version if version in KNOWN_GOOD else 0
+
+
 def _without_llvm(found: str) -> Choice:
-    why = f"no usable LLVM ({found}): only variants of CUDA can be used"
-    return Choice(None, "none", why, None)
+    return Choice(None, f"no usable LLVM ({found}): only variants of CUDA can be used")
 
 
-def check_loaded(version: tuple[int, ...], machine: Machine) -> Choice:
+def check_loaded(version: tuple[int, ...]) -> Choice:
     """Check the LLVM `version` of a Dr.Jit that was imported before this package.
 
     `version`: result of ``drjit.detail.llvm_version()``, negative if there is none.
     """
-    how = (
-        "Import mitsuba_bdpt before drjit and mitsuba (where an import sorter puts it below them: "
-        f"`import mitsuba_bdpt  # isort: skip`), or {_before_start(machine)} (later it has no effect)."
-    )
-    if version[0] < 0 and machine.has_cuda():
+    if version[0] >= min(KNOWN_GOOD):
+        return Choice(None, "loaded by drjit, which was imported first", version[0])
+    if version[0] < 0 and cuda_driver():
         return _without_llvm("drjit was imported first and found none")
-    if version[0] < 0:
-        raise LLVMNotFoundError(f"drjit was imported first and found no usable LLVM. {how}")
-    if version[0] < min(KNOWN_GOOD):
-        number = ".".join(map(str, version))
-        raise LLVMNotFoundError(
-            f"drjit was imported first and loaded LLVM {number}, which is too old: versions below "
-            f"{min(KNOWN_GOOD)} can abort the process. {how}"
-        )
-    return Choice(None, "drjit", "loaded by drjit, which was imported first", version[0])
-
-
-def prepare() -> Choice:
-    """Choose a library and set ``DRJIT_LIBLLVM_PATH``, or check an imported Dr.Jit."""
-    drjit = sys.modules.get("drjit")
-    if drjit is None:
-        finish_installation()
-        machine = Machine.here()
-        choice = choose(machine)
-        if choice.path or machine.wheel or machine.system:
-            # Keeps Dr.Jit from loading an unusable library by itself.
-            os.environ[VARIABLE] = str(choice.path or os.devnull)
-        return choice
-    mitsuba = sys.modules.get("mitsuba")
-    if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
-        return Choice(None, "none", "the current variant runs on CUDA", None)
-    return check_loaded(drjit.detail.llvm_version(), Machine.here())
+    number = ".".join(map(str, version))
+    what = "found no usable LLVM" if version[0] < 0 else f"loaded LLVM {number}, which can abort the process"
+    raise LLVMNotFoundError(
+        f"drjit was imported first and {what}. Import mitsuba_bdpt before drjit and mitsuba (where an import "
+        f"sorter puts it below them: `import mitsuba_bdpt  # isort: skip`), or set {VARIABLE} to the path of "
+        "a newer one before Python starts (later it has no effect)."
+    )
 
 
 def finish_installation() -> None:
@@ -166,14 +150,11 @@ def finish_installation() -> None:
     The wheel's links, without which its libLLVM finds no libc++, are made by wheel-axle when Python starts.
     A process that has installed the wheel itself, such as a notebook's, started before.
     """
-    try:
-        wheel = importlib.metadata.distribution(WHEEL)
-    except importlib.metadata.PackageNotFoundError:
-        return
-    pending = wheel.read_text("axle.lck") is not None and wheel.read_text("axle.done") is None
-    if pending and sys.executable:
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            subprocess.run([sys.executable, "-c", ""], timeout=60)
+    for wheel in importlib.metadata.distributions(name=WHEEL):
+        pending = wheel.read_text("axle.lck") is not None and wheel.read_text("axle.done") is None
+        if pending and sys.executable:
+            with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+                subprocess.run([sys.executable, "-c", ""], timeout=60)
 
 
 @contextlib.contextmanager
@@ -200,14 +181,11 @@ def quick_compilation():
 @functools.cache
 def _option_setter() -> Callable[..., None] | None:
     """Return what sets options of the LLVM library in use; None if that is unknown or untested."""
-    drjit = sys.modules["drjit"]
-    path = os.environ.get(VARIABLE, "")
-    version = major_version(Path(path)) if path else None
-    if version not in KNOWN_GOOD or drjit.detail.llvm_version()[0] != version:
+    path = Path(os.environ.get(VARIABLE, ""))
+    if not _known_version(path) or sys.modules["drjit"].detail.llvm_version()[0] != major_version(path):
         return None
     try:
-        library = ctypes.CDLL(path)  # the copy that Dr.Jit has opened
-        parse = library.LLVMParseCommandLineOptions
+        parse = ctypes.CDLL(str(path)).LLVMParseCommandLineOptions  # of the copy that Dr.Jit has opened
     except (OSError, AttributeError):
         return None
 
@@ -219,20 +197,12 @@ def _option_setter() -> Callable[..., None] | None:
 
 
 def cuda_driver() -> bool:
+    """Whether a driver of CUDA can be loaded; slow."""
     try:
         ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
     except OSError:
         return False
     return True
-
-
-def _before_start(machine: Machine) -> str:
-    """Return what to do before Python starts so that Dr.Jit loads a usable LLVM."""
-    try:
-        path = choose(replace(machine, env={}, has_cuda=lambda: False)).path
-    except LLVMNotFoundError:
-        return f"install a newer one and set {VARIABLE} to its path before Python starts"
-    return f"set {VARIABLE}={path} before Python starts"
 
 
 def major_version(path: Path) -> int | None:
@@ -245,68 +215,37 @@ def major_version(path: Path) -> int | None:
     return None
 
 
-def wheel_libraries(prefix: Path) -> list[Path]:
-    """Return the wheel's existing libLLVM files."""
-    try:
-        files = importlib.metadata.distribution(WHEEL).files or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    listed = [Path(str(file.locate())) for file in files if _LIBRARY.fullmatch(file.name)]
-    # Some installers omit the list of files.
-    return _existing([*listed, *sorted((prefix / "lib").glob("libLLVM.so.*"))])
+def libraries(root: Path = Path("/")) -> tuple[list[Path], list[Path]]:
+    """Return the libLLVM files of the Python environment, and of the system in ``root``, each once."""
+    wheel = (file for found in importlib.metadata.distributions(name=WHEEL) for file in found.files or ())
+    own = [Path(str(file.locate())).parent for file in wheel if _LIBRARY.fullmatch(file.name)]
+    folders = (folder for pattern in SYSTEM for folder in sorted(root.glob(pattern)))
+    return _libraries_in([*own, Path(sys.prefix) / "lib"]), _libraries_in(folders)
 
 
-def system_libraries(directories: Iterable[Path]) -> list[Path]:
-    """Return the libLLVM files in `directories`, without duplicates."""
-    found: list[Path] = []
-    for directory in directories:
-        names = sorted(directory.glob("libLLVM*")) if directory.is_dir() else []
-        found += [path for path in names if _LIBRARY.fullmatch(path.name)]
-    return _existing(found)
+def _libraries_in(folders: Iterable[Path]) -> list[Path]:
+    files = (file for folder in folders for file in sorted(folder.glob("libLLVM*")))
+    return list(dict.fromkeys(f.resolve() for f in files if f.is_file() and _LIBRARY.fullmatch(f.name)))
 
 
-def library_directories(prefix: Path) -> list[Path]:
-    """Directories where Linux distributions, conda and Homebrew install libLLVM."""
-    fixed = [prefix / "lib"]
-    fixed += [Path(f"/usr/lib/{machine}-linux-gnu") for machine in ("x86_64", "aarch64")]
-    fixed += [Path("/usr/lib64"), Path("/usr/lib"), Path("/usr/local/lib")]
-    patterns = ["usr/lib/llvm*/lib", "usr/lib64/llvm*/lib*", "usr/lib/llvm/*/lib*"]
-    patterns += ["opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib"]
-    globbed = [path for pattern in patterns for path in sorted(Path("/").glob(pattern))]
-    return fixed + globbed
-
-
-def remedy(machine: Machine) -> str:
-    """Return the command that installs a usable LLVM on `machine`."""
-    if machine.system_name == "Linux" and machine.architecture == "x86_64":
+def remedy() -> str:
+    """Return the command that installs a usable LLVM on this machine."""
+    system, architecture = platform.system(), platform.machine()
+    if system == "Linux" and architecture == "x86_64":
         command = f"python -m pip install '{WHEEL}==23.1.*'"
-    elif machine.system_name == "Darwin":
+    elif system == "Darwin":
         command = "brew install llvm@19"
-    elif machine.system_name == "Linux":
+    elif system == "Linux":
         command = "apt install libllvm19"
     else:
         return f"Install LLVM 19 and set {VARIABLE} to the path of its shared library."
     return f"Mend it with: {command}"
 
 
-def _existing(paths: Iterable[Path]) -> list[Path]:
-    """Return the existing files among `paths`, resolved and without duplicates."""
-    return list(dict.fromkeys(path.resolve() for path in paths if path.is_file()))
-
-
-def _versions() -> str:
-    return ", ".join(map(str, KNOWN_GOOD))
-
-
 def _describe(paths: Iterable[Path]) -> str:
-    """List the libraries found and the reason why each is rejected."""
-    texts: list[str] = []
-    for path in paths:
-        version = major_version(path)
-        if version is None:
-            texts.append(f"{path} (version unknown; to try it, set {VARIABLE})")
-        elif version < min(KNOWN_GOOD):
-            texts.append(f"{path} (LLVM {version}, too old)")
-        else:
-            texts.append(f"{path} (LLVM {version}, untested; to try it, set {VARIABLE})")
-    return "found only " + "; ".join(texts) if texts else "none was found"
+    """List the libraries found, which are rejected for their versions."""
+    versions = ((path, major_version(path) or "of unknown version") for path in paths)
+    texts = [f"{path} (LLVM {version})" for path, version in versions]
+    return (
+        f"found only {'; '.join(texts)} (to try a newer one, set {VARIABLE})" if texts else "none was found"
+    )
