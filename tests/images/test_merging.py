@@ -44,6 +44,7 @@ from sds_scenes import (
     rendered,
     spark,
     strategy_images,
+    sun,
     transform,
     under_glass,
 )
@@ -62,10 +63,6 @@ MERGED = {"merging": True, "merging_radius": 0.25}
 
 def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 6, **parameters})
-
-
-def sun():
-    return {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0}
 
 
 # -- known answers -------------------------------------------------------------------------------------

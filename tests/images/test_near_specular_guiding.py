@@ -124,9 +124,8 @@ def lit_metal(**more):
     """A floor of rough metal, lit by a small lamp in an ideal glass shell, seen through an ideal pane."""
     film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
     look_at = transform().look_at
-    radiance = {"type": "rgb", "value": 2500.0}
-    lamp = {"type": "sphere", "radius": 0.02, "center": [0, 0, 2], "emitter": {"type": "area"}}
-    lamp["emitter"]["radiance"] = radiance
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 2500.0}}
+    lamp = {"type": "sphere", "radius": 0.02, "center": [0, 0, 2], "emitter": emitter}
     pane = {"type": "rectangle", "bsdf": {"type": "thindielectric"}}
     pane["to_world"] = look_at([0, -2.5, 2], [0, -4, 2.8], [0, 0, 1]).scale(3)
     eye = {"type": "perspective", "fov": 12, "to_world": look_at([0, -4, 3], [0, -1.6, 0], [0, 0, 1])}
@@ -142,12 +141,8 @@ def lit_metal(**more):
 
 
 def polished():
-    return {
-        "type": "sphere",
-        "radius": 0.1,
-        "center": [-3, 3, 0.4],
-        "bsdf": {"type": "roughconductor", "alpha": 0.02},
-    }
+    metal = {"type": "roughconductor", "alpha": 0.02}
+    return {"type": "sphere", "radius": 0.1, "center": [-3, 3, 0.4], "bsdf": metal}
 
 
 def test_paths_of_near_specular_events_alone():

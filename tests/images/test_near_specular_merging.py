@@ -30,6 +30,7 @@ from sds_scenes import (
     point,
     rough,
     strategy_images,
+    sun,
     transform,
     under_glass,
     without_photons,
@@ -81,7 +82,7 @@ LIGHTS = {
         "cutoff_angle": 40.0,
         "to_world": transform().look_at(origin=[0.5, 0, 4.5], target=[0, 0, 0], up=[0, 1, 0]),
     },
-    "sun": {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0},
+    "sun": sun(),
     "ball": ball(),
     "sky": {"type": "constant", "radiance": 1.0},
 }

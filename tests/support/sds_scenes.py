@@ -29,6 +29,10 @@ def point():
     return {"type": "point", "position": list(LAMP), "intensity": INTENSITY}
 
 
+def sun():
+    return {"type": "directional", "direction": [0.3, 0.1, -1.0], "irradiance": 5.0}
+
+
 def ball(radius=0.5):
     return {
         "type": "sphere",
