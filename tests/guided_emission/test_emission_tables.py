@@ -6,6 +6,7 @@ each carries, and so nothing on the mean.
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -49,10 +50,15 @@ def emissions(emitters, name="", seed=11):
     return e
 
 
-def column(x):
+def column(x, count=COUNT):
     x = np.array(x, dtype=np.float64)
-    shape = (COUNT,) if x.ndim < 2 else (x.shape[0], COUNT)
-    return np.array(np.broadcast_to(x, shape))
+    return np.broadcast_to(x, (*x.shape[:-1], count)).copy()
+
+
+def passing(e, center, radius):
+    """Mask: emissions that pass a ball."""
+    d, away = column(e.d), column(e.si.p) - np.array(center)[:, None]
+    return np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < radius
 
 
 def guidable():
@@ -158,14 +164,9 @@ def test_details_beside_tables(size, more, only_sun):
     asked = column(guided.direction_density(e, e.si.p + e.d, e.d, mi.Bool(True)))
     infinite = column(dr.select(e.infinite, 1.0, 0.0)) > 0
     assert np.mean(np.abs(asked - stated)[infinite] > 1e-3 * stated[infinite]) < 2e-3
-    thing = np.array([[6.0], [4.0], [DETAILS[size]]])
-    away = column(e.si.p) - thing
-    d = column(e.d)
-    hits = np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < DETAILS[size]
-    plain = emissions(emitters, seed=12)
-    away, d = column(plain.si.p) - thing, column(plain.d)
-    before = np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < DETAILS[size]
-    light = [np.where(mask, column(x.weight)[0], 0) for mask, x in ((hits, e), (before, plain))]
+    ball = [6.0, 4.0, DETAILS[size]], DETAILS[size]
+    both = e, emissions(emitters, seed=12)
+    light = [np.where(passing(x, *ball), column(x.weight)[0], 0) for x in both]
     error = np.sqrt(sum(x.var() for x in light) / COUNT)
     assert abs(light[0].mean() - light[1].mean()) < 5 * error
 
@@ -214,10 +215,7 @@ def test_next_event_estimation_and_hits_state_the_same(name):
     guided = tables.guided(emitters)
     at, direct = lit_from(name, guided)
     _, plain = lit_from(name, emitters)
-    wide = len(np.array(at.p).T)
-
-    def values(x):
-        return np.broadcast_to(np.array(x, dtype=np.float64), wide)
+    values = partial(column, count=dr.width(at))
 
     def changed(after, before):
         with np.errstate(all="ignore"):  # where nothing is emitted
@@ -265,17 +263,10 @@ def test_frames_do_not_depend_on_who_asks(n):
 
 def test_what_is_flat():
     """Expected: rectangles, disks and meshes of one normal; not balls, cubes, and bent planes."""
-    shapes = {
-        "rectangle": ({"type": "rectangle"}, True),
-        "disk": ({"type": "disk"}, True),
-        "sphere": ({"type": "sphere"}, False),
-        "cube": ({"type": "cube"}, False),
-        "cylinder": ({"type": "cylinder"}, False),
-    }
-    for name, (shape, flat) in shapes.items():
-        assert is_flat(mi.load_dict(shape)) == flat, name
+    for kind in ("rectangle", "disk", "sphere", "cube", "cylinder"):
+        assert is_flat(mi.load_dict({"type": kind})) == (kind in ("rectangle", "disk")), kind
     for name in ("flat mesh", "smooth mesh"):  # of many faces, without and with normals at vertices
-        scene = scene_of(name)
+        scene = scene_of(name)  # holds the shape
         assert not is_flat(scene.emitters()[0].get_shape()), name
     plane = mi.Mesh("plane", 4, 2, has_vertex_normals=False)
     params = mi.traverse(plane)
@@ -308,10 +299,7 @@ def test_details_smaller_than_a_cell_keep_their_disk(radius, kept):
     emitters = Emitters(mi.load_dict({"type": "scene", "ground": ground, "thing": thing, "sun": sun}))
     assert emitters.disks.details is not None
     e = emissions(random_tables(emitters).guided(emitters))
-    d = column(e.d)
-    away = column(e.si.p) - np.array([[3], [2], [radius]])
-    near = np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < 1.8 * radius
-    assert (0.4 < near.mean() < 0.6) == kept
+    assert (0.4 < passing(e, [3, 2, radius], 1.8 * radius).mean() < 0.6) == kept
 
 
 # -- tables ---------------------------------------------------------------------------------------------
