@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1554,  # top files
 }
-OUTSIDE = {"scripts": 5056, "tests": 43904}
+OUTSIDE = {"scripts": 5056, "tests": 43892}
 MOST_WORDS = 30297
 
 
