@@ -168,21 +168,20 @@ class Settings:
         "",
         (),
         "a text with commas between, such as 'variance,denoised'",
-        """Adds other layers to the image, a text with commas between: ``variance`` (of each pixel),
-        ``denoised`` (by Intel's Open Image Denoise), ``stokes`` (Stokes vectors), ``strategies`` (an image of
-        each).""",
+        """Adds layers to the image, separated by commas: ``variance`` (of each pixel), ``denoised`` (by
+        Intel's Open Image Denoise), ``stokes`` (Stokes vectors), ``strategies`` (an image of each).""",
     )
     light_groups: str = _parameter(
         "",
         "a string such as 'key: lamp1, lamp2; sky: envmap', or 'auto'",
-        """Adds layers of the light of single emitters or groups of them, whose sum is the image:
-        ``key: lamp1, lamp2; sky: envmap`` by ids of emitters or their shapes (``*`` for any characters),
-        ``auto`` each emitter by itself, from the ninth on together.""",
+        """Adds a layer of the light of each group of emitters; their sum is the image. Groups are given by
+        ids of emitters or their shapes, ``key: lamp1, lamp2; sky: envmap`` (``*`` for any characters), or
+        ``auto``: one per emitter, from the ninth on together.""",
     )
     path_layers: bool = _parameter(
         False,
         "true or false",
-        """Adds layers of the light by its path, whose sum is the image: ``emission`` (visible emitters),
+        """Adds four layers of the light by its path; their sum is the image: ``emission`` (visible emitters),
         ``direct``, ``indirect``, and ``caustic`` (direct light by way of specular surfaces).""",
     )
     target_error: float = _parameter(

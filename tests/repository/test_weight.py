@@ -22,10 +22,10 @@ MOST = {
     "scene sampling": 777,
     "host": 1015,
     "sensors": 939,
-    "": 1554,  # top files
+    "": 1553,  # top files
 }
 OUTSIDE = {"scripts": 5056, "tests": 43892}
-MOST_WORDS = 30297
+MOST_WORDS = 30049
 
 
 def _lines(files):
