@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pkgutil
 import re
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,7 +14,7 @@ import mitsuba as mi
 from ..errors import CommandError, did_you_mean, listed
 from ..host.jit import two_threads
 from ..image import features
-from ..settings import NONE, PARAMETERS
+from ..settings import NONE
 from .whole import from_utf8, utf8
 
 _Made = TypeVar("_Made")
@@ -45,9 +44,6 @@ METERS = {"irradiancemeter": "IrradianceMeter", "radiancemeter": "RadianceMeter"
 AROUND = ("aov", "stokes", *NOT_CARRIED)
 """Mitsuba's integrators around another one."""
 
-_MISSING = re.compile(r"undefined parameter: \$(\w+)")
-"""Mitsuba's error about a parameter without value."""
-
 LISTED = 8
 """Names that a message lists, at most."""
 
@@ -68,24 +64,24 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
 
 
 def parsed(
-    scene: Path, definitions: Mapping[str, object], strict: bool = True
+    scene: Path, definitions: Mapping[str, object]
 ) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    """Parse a ``scene`` file by Mitsuba's parser, see `parse_upgraded`.
-
-    ``definitions``: values of its parameters; if ``strict``, unused and missing ones are errors.
-    """
+    """Parse a ``scene`` file, see `parse_upgraded`; ``definitions``: values of its parameters."""
     config = mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
-    if strict:
-        return config, parse_upgraded(config, scene, definitions)
-    config.unused_parameters = mi.LogLevel.Debug
+    return config, parse_upgraded(config, scene, definitions)
+
+
+def parsed_undefined(scene: Path) -> mi.parser.ParserState:
+    """Parse a ``scene`` file whose parameters without value are 1."""
+    definitions: dict[str, str] = {}
     while True:
         try:
-            return config, parse_upgraded(config, scene, definitions)
+            return parsed(scene, definitions)[1]
         except RuntimeError as error:
-            missing = _MISSING.search(str(error))
+            missing = re.search(r"undefined parameter: \$(\w+)", str(error))
             if missing is None:
                 raise
-            definitions = {**definitions, missing[1]: "1"}
+            definitions[missing[1]] = "1"
 
 
 def parse_upgraded(
@@ -161,14 +157,7 @@ def load(options: Namespace) -> Loaded:
             )
     set_variant(options.variant)
     with searching(options.scene, options.append):
-        try:
-            return unless_incompatible(lambda merges: _load(options, merges))
-        except RuntimeError as error:
-            better = _in_words(str(error), options) or str(error)
-            better = re.sub(r"mi\.set_variant\('(\w+)'\)", r"-m \1", better)
-            if better == str(error):
-                raise
-            raise CommandError(better) from error
+        return unless_incompatible(lambda merges: _load(options, merges))
 
 
 def set_variant(name: str) -> None:
@@ -206,8 +195,6 @@ def _load(options: Namespace, merges: bool) -> Loaded:
     if options.time is not None:
         overrides["timeout"] = options.time
     asked = None if options.integrator == SCENES_OWN else options.integrator
-    if asked is not None:
-        _check_kind(asked)
     defines = in_proportion(options.scene, dict(options.defines))
     config, state = parsed(options.scene, defines)
     config.merge_meshes = merges
@@ -244,7 +231,9 @@ def _load(options: Namespace, merges: bool) -> Loaded:
         return Loaded(scene, scene.integrator(), said)
     made = mi.load_dict({"type": used, **overrides})
     if not isinstance(made, mi.Integrator):
-        raise CommandError(_no_integrator(used, f"of class {made.class_name()}"))
+        raise CommandError(
+            f"integrator={used!r} is a plugin of class {made.class_name()}, no integrator; use bdpt"
+        )
     return Loaded(scene, made, said)
 
 
@@ -263,20 +252,6 @@ def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: 
         f"{used} in place of the scene file's {own}{values and f', with its {values}'}; "
         f"--integrator {SCENES_OWN} renders with {own}"
     )
-
-
-def _check_kind(name: str) -> None:
-    """Raise ``CommandError`` if the plugin ``name`` is known not to be an integrator.
-
-    Plugins in Python, and unknown names, are checked when they are instantiated.
-    """
-    kind = mi.PluginManager.instance().plugin_type(name)
-    if kind not in (mi.ObjectType.Integrator, mi.ObjectType.Unknown):
-        raise CommandError(_no_integrator(name, f"of type {kind.name.lower()}"))
-
-
-def _no_integrator(name: str, what: str) -> str:
-    return f"integrator={name!r} is a plugin {what}, no integrator; use for example bdpt"
 
 
 def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
@@ -359,89 +334,13 @@ def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequenc
 
 
 def check_file(scene: Path) -> None:
-    """Raise ``CommandError`` if the ``scene`` file does not exist."""
+    """Raise ``CommandError`` if the ``scene`` file does not exist, with the files that do."""
     if not scene.is_file():
-        raise CommandError(f"scene={str(scene)!r} is not a file; {_scenes_near(scene)}")
-
-
-def _scenes_near(scene: Path) -> str:
-    """Suggest files in place of a ``scene`` file that does not exist."""
-    folder = scene if scene.is_dir() else scene.parent
-    if not folder.is_dir():
-        return f"there is no folder {str(folder)!r}"
-    there = sorted(path.name for path in folder.iterdir() if path.suffix.lower() == ".xml")
-    if not there:
-        return f"the folder {str(folder)!r} has no scene files (.xml)"
-    found = f"the folder {str(folder)!r} has the scene files {listed(there, LISTED)}"
-    return f"{found}; {did_you_mean(scene.name, there)}".rstrip("; ")
-
-
-def _in_words(error: str, options: Namespace) -> str | None:
-    """Return a message with a suggestion for Mitsuba's ``error`` about a name.
-
-    None for other errors.
-    """
-    if "unused parameters" in error:
-        known = parameters(options.scene, dict(options.defines))
-        unused = [name for name, _ in options.defines if name not in known]
-        named = ", ".join(f"{key}={default}" if default else key for key, default in known.items())
-        text = f"-D {', '.join(unused)}: no parameter of the scene; it has {named or 'none'}; "
-        return (text + "".join(did_you_mean(name, known) for name in unused)).rstrip("; ")
-    if re.search("could not parse|is out of", error):
-        given = [
-            f"-D {k}={text}" for k, text in options.defines if f'"{text}"' in error or f" {text} " in error
-        ]
-        return f"{error}; give {' or '.join(given)} another value" if given else None
-    missing = _MISSING.search(error)
-    if missing:
-        return f"{error}; give it a value: -D {missing[1]}=VALUE"
-    if ours := _of_the_command(error, options):
-        return ours
-    strange = re.search(r'in integrator plugin of type "([^"]*)":((\n  - \w+ "[^"]*": .*)+)', error)
-    given = [f"-P {key}" for key, _ in options.properties if strange and f' "{key}": ' in strange[2]]
-    if strange and given:
-        ours = all(key in PARAMETERS for key, _ in options.properties)
-        other = " or use --integrator bdpt" if ours and strange[1] != "bdpt" else ""
-        return f"{', '.join(given)}: no parameter of the integrator {strange[1]}; leave it out{other}"
-    other = re.search(r'plugin "([^"]*)" is of type "(\w+)", which does not match', error)
-    if other and other[1] == options.integrator:
-        return _no_integrator(other[1], f"of type {other[2]}")
-    missing = re.search(r'Plugin "([^"]*)" not found', error)
-    if not missing or missing[1] != options.integrator:
-        return None
-    question = did_you_mean(missing[1], plugins()) or "use for example bdpt"
-    return f"integrator={missing[1]!r} is not a plugin; {question}".rstrip()
-
-
-def _of_the_command(error: str, options: Namespace) -> str | None:
-    """Return `bdpt`'s ``error`` about an option of the command line, without its place in the scene file.
-
-    None for other errors.
-    """
-    found = re.search(r'integrator plugin of type "bdpt": .*\b\w+Error: bdpt: ((\w+)\b.*)', error, re.DOTALL)
-    if found and found[1].startswith("the variant "):
-        return found[1]
-    return f"-P {found[1]}" if found and found[2] in dict(options.properties) else None
-
-
-def parameters(scene: Path, definitions: Mapping[str, object]) -> dict[str, str]:
-    """Return the parameters that a scene file uses, or one that it includes, with their defaults.
-
-    A missing default is empty.
-    """
-    with searching(scene):
-        state = parsed(scene, definitions, strict=False)[1]
-    text = "".join(from_utf8(str(file)).read_text(encoding="utf-8", errors="replace") for file in state.files)
-    text = re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-    defaults = dict(reversed(re.findall(r'<default\s+name="(\w+)"\s+value="([^"]*)"', text)))
-    return {name: defaults.get(name, "") for name in re.findall(r"\$(\w+)", text)}
-
-
-def plugins() -> list[str]:
-    """Return the names of plugins of Mitsuba and of this package."""
-    modules = [module.name for module in pkgutil.iter_modules(mi.ad.integrators.__path__)]
-    files = (Path(mi.__file__).parent / "plugins").iterdir()
-    return ["bdpt", *modules, *sorted(path.stem for path in files)]
+        folder = scene if scene.is_dir() else scene.parent
+        there = sorted(path.name for path in folder.glob("*.xml"))
+        found = f"the folder {str(folder)!r} has {listed(there, LISTED) or 'no scene files (.xml)'}"
+        question = did_you_mean(scene.name, there)
+        raise CommandError(f"scene={str(scene)!r} is not a file; {question}{found}")
 
 
 def replace_integrator(

@@ -19,7 +19,7 @@ from ..files.loading import (
     choose_sensor,
     named_files,
     parse_upgraded,
-    parsed,
+    parsed_undefined,
     searching,
     spectra,
     unless_incompatible,
@@ -128,7 +128,7 @@ class SceneFile(MeasuredScene):
     @property
     def sha256(self) -> str:
         with searching(self.file):
-            state = parsed(self.file, {}, strict=False)[1]
+            state = parsed_undefined(self.file)
             content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
         return hashlib.sha256(b"".join(content)).hexdigest()
 
