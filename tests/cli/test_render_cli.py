@@ -647,7 +647,7 @@ def test_missing_scene_is_reported(scene, capsys, name, words):
             ["--integrator", "diffuse"],
             'plugin "diffuse" is of type "bsdf", which does not match the expected',
         ),
-        (["-Dlight=abc"], 'plain.xml (line 18, col 24): could not parse RGB value "abc"'),
+        (["-Dlight=abc"], 'plain.xml (line 17, col 31): could not parse RGB value "abc"'),
         (["--integrator", ""], "integrator='' names no integrator"),
         (["-Dlihgt=1"], "Found unused parameters: - $lihgt=1"),
     ],
@@ -760,7 +760,7 @@ def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys
 def test_a_parameter_without_a_value_is_reported(scene, capsys):
     scene.write_text(SCENE.replace('<default name="light" value="2"/>', ""))
     assert main(["render", str(scene)]) == 2
-    assert "plain.xml (line 16, col 24): undefined parameter: $light" in capsys.readouterr().err
+    assert "plain.xml (line 17, col 31): undefined parameter: $light" in capsys.readouterr().err
 
 
 def test_scene_without_sensor_is_reported(scene, capsys):
