@@ -89,7 +89,6 @@ def product(rows, seeds=slice(None)) -> np.ndarray:
 
 def named(way: Configuration) -> str:
     """Light subpaths per camera subpath, connections, kappa of t <= 1 (without light subpaths of s = 1)."""
-    way = CANDIDATES[way.number]
     if not way.light_paths:
         return f"0, {way.kappa_direct:g}"
     lane = f", {way.joined} per lane" if way.joined > 1 else ""

@@ -334,8 +334,8 @@ MUTANTS = (
     Mutant(
         "pilots of an edited scene",
         "planning/findings.py",
-        "(self._state, key), compiled_quickly",
-        "key, compiled_quickly",
+        "        key = self._state, key\n",
+        "",
         ("tests/host/test_edits.py::test_edits_are_seen",),
     ),
     Mutant(
@@ -731,8 +731,8 @@ MUTANTS = (
     Mutant(
         "pilots: all connections are with one light subpath",
         "planning/moments.py",
-        "found[:, candidate] -= (1 - several",
-        "found[:, candidate] -= 0 * (1 - several",
+        "found[:, [candidate]] -= (1 - several",
+        "found[:, [candidate]] -= 0 * (1 - several",
         ("tests/planning/test_pilot.py::test_predicted_variance[cornell-four per lane]",),
     ),
     Mutant(
@@ -745,15 +745,15 @@ MUTANTS = (
     Mutant(
         "pilots: a typical render lacks no light",
         "planning/moments.py",
-        "typical=variance - hidden + missing",
-        "typical=variance - hidden",
+        "whole - hidden + spp * np.mean(missed**2)",
+        "whole - hidden",
         ("tests/planning/test_pilot.py::test_predicted_error_of_a_typical_render",),
     ),
     Mutant(
         "pilots: the mean error alone decides",
         "planning/choice.py",
-        "(v * t) ** 0.5",
-        "v",
+        "float(left.prod()) ** 0.5",
+        "float(left[0])",
         ("tests/planning/test_pilot.py::test_both_errors_count_alike",),
     ),
     Mutant(
@@ -787,15 +787,15 @@ MUTANTS = (
     Mutant(
         "pilot: a variance below 0 is believed",
         "planning/choice.py",
-        "np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)",
-        "variances[:, [candidate.number for candidate in candidates]]",
+        "np.maximum(moments.errors[:, :, CANDIDATES.index(way)], 0)",
+        "moments.errors[:, :, CANDIDATES.index(way)]",
         ("tests/planning/test_pilot.py::test_no_group_has_less_than_no_variance",),
     ),
     Mutant(
         "pilot: rays of light subpaths by camera samples",
         "planning/pilot.py",
-        "count / (self._lanes if name in _OF_LIGHT else len(rows))",
-        "count / len(rows)",
+        "count / (lanes if name in of_light else size)",
+        "count / size",
         ("tests/planning/test_pilot.py::test_rays_of_light_subpaths_are_counted_for_each",),
     ),
     Mutant(
@@ -1742,7 +1742,7 @@ MUTANTS = (
     Mutant(
         "guided emission: splats teach as if each light subpath had a camera sample",
         "planning/pilot.py",
-        "self._add_emission(c, size * np.sqrt(self._weight), c.position, c.active)",
+        "self._add_emission(c, size * np.sqrt(self.batch.size / lanes), c.position, c.active)",
         "self._add_emission(c, size, c.position, c.active)",
         ("tests/images/test_guided_emission.py::test_what_a_pilot_accumulates",),
     ),

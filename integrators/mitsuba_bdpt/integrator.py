@@ -211,9 +211,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
             render = render.decided()
         planner, missing = render.planner, render.missing() if spp else None
         about = f"{missing.cause}; {missing.remedy}" if missing else ""
-        if render.plan.merging:
-            about = f"merging: {render.why_merged}"
-        text = explain(render.prepared, self.settings, planner, render.table, about)
+        text = explain(planner, f"merging: {render.why_merged}" if render.plan.merging else about)
         if render.light_groups is not None:
             text = "\n".join([text, *render.light_groups.explained()])
         if spp is None:
@@ -221,7 +219,8 @@ class BDPTIntegrator(metaclass=ABCMeta):
                 f"{text}\nno spp given: this is the plan before the pilot; with spp=..., it may become "
                 "another, with guided emission or merging, and unsampled light is estimated"
             )
-        return text if render.table else f"{text}\n{planner.why_no_pilot()}"
+        no_pilot = planner.decided.no_pilot or planner.settled()[0]
+        return text if planner.table else f"{text}\nno pilot: {no_pilot}"
 
     @_without_gradients
     def decide(self, scene: mi.Scene, sensor: int | mi.Sensor = 0, seed: int = 0, spp: int = 0) -> list[dict]:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from mitsuba_bdpt.cli import cluster
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.loading import load
-from mitsuba_bdpt.planning.moments import Moments
+from mitsuba_bdpt.planning import pilot
 from mitsuba_bdpt.workers import connected, results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
@@ -117,7 +118,8 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
     """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
     values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
     pilot that the client asked; with decisions by hand there are none."""
-    monkeypatch.setattr(Moments, "non_finite", 7)
+    measure = pilot.measure
+    monkeypatch.setattr(pilot, "measure", lambda *a: replace(measure(*a), non_finite=7))
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
     statistics = rendered.image(tmp_path / "a.exr", "RGB")[1]
     seconds = statistics["seconds"]

@@ -343,11 +343,10 @@ def test_tables_count_in_the_choice():
     """Expected: what tables leave of the variance is in the predictions of light subpaths, less of it where
     these are not connected, and they are traced by the tables; without tables nothing changes."""
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
-    ones = np.ones((GROUPS, len(CANDIDATES)))
-    found = Moments(ones, ones, guidable=(0.0, 0.0), mean=1.0, rays=rays, lanes=4096)
+    found = Moments(np.ones((2, GROUPS, len(CANDIDATES))), (0.0, 0.0), mean=1.0, rays=rays)
     tables = EmissionTables.of(np.ones((1, 4, 4)), 0.5)
     for learnt in (learning.Learnt(tables, 0.4, 0.5), learning.Learnt(None, 0.4, 0.5)):
-        rows = choice.choose(found, choice.Alternatives(list(CANDIDATES), learnt=learnt))
+        rows = choice.choose(found, list(CANDIDATES), learnt=learnt)
         assert len(rows) == len(CANDIDATES)
         for row in rows:
             way, left = row.candidate, 0.5 if learnt.tables else 1.0

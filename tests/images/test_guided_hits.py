@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import welch as st
 from mitsuba_bdpt.planning import choice, pilot, unsampled_light
-from mitsuba_bdpt.planning.choice import Alternatives
 from mitsuba_bdpt.planning.configuration import CANDIDATES
 from mitsuba_bdpt.planning.moments import FINE, GROUPS, GuidableLight, Moments
 from mitsuba_bdpt.planning.planner import Planner
@@ -286,9 +285,9 @@ def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
     def parts(guidable, light):
         plan, seed = replace(render.plan, guidable=guidable), mi.UInt32(1)
         found = pilot.measure(render.prepared, plan, render.settings, seed, 1 << 14, guidable=light)
-        return np.count_nonzero(found.variance[:, 0])
+        return np.count_nonzero(found.errors[0, :, 0])
 
-    light = GuidableLight(second=np.ones(FINE**2), fourth=np.ones(FINE**2))
+    light = GuidableLight(*np.ones((4, FINE**2)))
     assert max(parts(True, light), parts(True, None)) <= parts(False, None) / 2
 
 
@@ -298,14 +297,13 @@ def test_guiding_has_to_pay(mean, typical, chosen):
     else, guiding for 3.5 times the cost removes SDS paths of a variance of 9, which gains 10 / 3.5, or 99 in
     outliers alone, sqrt(100) / 3.5, but not 9 in outliers, in words; nor what was not measured.
     """
-    ones = np.ones((GROUPS, len(CANDIDATES)))
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1"), 1.0) | {"guidable": 0.36}
-    moments = Moments(ones, ones, (mean, typical), mean=1.0, rays=rays, lanes=4096)
+    moments = Moments(np.ones((2, GROUPS, len(CANDIDATES))), (mean, typical), mean=1.0, rays=rays)
     possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]
-    table = choice.choose(moments, Alternatives(possible))
+    table = choice.choose(moments, possible)
     assert table[0].candidate.guided == (GUIDED if chosen else 0)
     assert bool(choice.left_out(table)) == (not chosen)
-    unmeasured = choice.choose(replace(moments, guidable=(0.0, 0.0)), Alternatives(possible))
+    unmeasured = choice.choose(replace(moments, guidable=(0.0, 0.0)), possible)
     assert not any(row.candidate.guided for row in unmeasured)
 
 

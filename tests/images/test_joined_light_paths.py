@@ -268,7 +268,7 @@ def test_what_is_joined(change, joined):
     """
     given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "space": None, "many": False} | change
     asked = SimpleNamespace(
-        _prepared=SimpleNamespace(
+        prepared=SimpleNamespace(
             traits=SimpleNamespace(
                 transmits=given["transmits"], dispatch=SimpleNamespace(many=given["many"], count=40)
             ),
@@ -277,8 +277,9 @@ def test_what_is_joined(change, joined):
         ),
         full=SimpleNamespace(merging=False),
         _pixels=given["pixels"],
+        _samples=given["samples"],
     )
-    assert planner.Planner._is_worth_joining(asked, given["samples"]) == joined
+    assert planner.Planner._is_worth_joining(asked) == joined
 
 
 def test_what_is_counted():

@@ -23,14 +23,29 @@ POINT = {"type": "point", "position": [0.3, 0.2, 2], "intensity": 10.0}
 MEAN = 0.3
 
 
+GLASS = {"type": "dielectric", "int_ior": 1.5}
+FLOOR = {"type": "rectangle", "to_world": T().scale(1.5)}
+PLATE = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])}
+
+# Polished, out of view.
+BALL = {
+    "type": "sphere",
+    "center": [0, 0, -9],
+    "radius": 0.5,
+    "bsdf": {"type": "roughconductor", "alpha": 0.01},
+}
+
+
+def camera(origin=(0, -0.5, 3.2), size=32, **keys):
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    to_world = T().look_at(origin, [0, 0, 0], [0, 1, 0])
+    return {"type": "perspective", "fov": 50, "to_world": to_world, "film": film} | keys
+
+
 def slab(bsdf, lamp=POINT, size=32, optimize=False, **more):
     """A floor seen through a slab, lit through it."""
-    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    eye = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, -0.5, 3.2], [0, 0, 0], [0, 1, 0])}
-    plate = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05]), "bsdf": bsdf}
-    floor = {"type": "rectangle", "to_world": T().scale(1.5)}
-    scene = {"type": "scene", "eye": eye | {"film": film}, "floor": floor, "slab": plate, "lamp": lamp}
-    return mi.load_dict(scene | more, optimize=optimize)
+    scene = {"type": "scene", "eye": camera(size=size), "floor": FLOOR, "slab": PLATE | {"bsdf": bsdf}}
+    return mi.load_dict(scene | {"lamp": lamp} | more, optimize=optimize)
 
 
 def frosted(alpha):
@@ -40,6 +55,12 @@ def frosted(alpha):
 def principled(roughness, **keys):
     white = {"type": "rgb", "value": 1.0}
     return {"type": "principled", "roughness": roughness, "spec_trans": 1.0, "base_color": white, **keys}
+
+
+def sphere(radius):
+    """As bright as the point light, from afar."""
+    emitter = {"type": "area", "radiance": 10 / (np.pi * radius**2)}
+    return {"type": "sphere", "center": POINT["position"], "radius": radius, "emitter": emitter}
 
 
 def bdpt(**parameters):
@@ -97,7 +118,7 @@ def test_a_word_about_a_rough_slab(bsdf, warned):
 def test_nearly_smooth_glass_lacks_what_smooth_glass_lacks():
     """Rationale: `dielectric` is the limit of alpha to 0. Expected: at alpha 1e-3 all of the light that is
     lost with `dielectric`, within 10 % (noise of 2^13 subpaths: 3 %), but none of it never sampled."""
-    delta, rough = lost_in(slab({"type": "dielectric", "int_ior": 1.5})), lost_in(slab(frosted(1e-3)))
+    delta, rough = lost_in(slab(GLASS)), lost_in(slab(frosted(1e-3)))
     assert share_of(rough) == pytest.approx(share_of(delta), rel=0.1)
     assert delta.never == 1 and rough.never == 0
 
@@ -106,12 +127,9 @@ def test_delta_lobes_beside_near_specular_ones_are_never_sampled():
     """Rationale: scenes with near-specular lobes have an estimate of their own. Expected: under a slab of
     `dielectric` beside a polished ball that is out of view the same light is lost as without the ball
     (within 10 %: other random numbers), and the old words say so."""
-    glass = {"type": "dielectric", "int_ior": 1.5}
-    metal = {"type": "roughconductor", "alpha": 0.01}
-    ball = {"type": "sphere", "center": [0, 0, -9], "radius": 0.5, "bsdf": metal}
-    beside = slab(glass, ball=ball)
+    beside = slab(GLASS, ball=BALL)
     lost = lost_in(beside)
-    assert share_of(lost) == pytest.approx(share_of(lost_in(slab(glass))), rel=0.1)
+    assert share_of(lost) == pytest.approx(share_of(lost_in(slab(GLASS))), rel=0.1)
     assert lost.never > 0.99
     assert "not sampled" in said(beside) and "off shape 'slab' (no ray hits" in said(beside)
 
@@ -143,9 +161,7 @@ def test_light_that_next_event_estimation_finds_is_not_missing():
 
 def test_light_that_light_tracing_finds_is_not_missing():
     """Expected: nothing is missing to a camera beneath the slab, and without light subpaths all of it is."""
-    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
-    to_world = T().look_at([0, -0.3, 0.8], [0, 0, 0], [0, 1, 0])
-    scene = slab(frosted(0.005), eye={"type": "perspective", "fov": 80, "to_world": to_world, "film": film})
+    scene = slab(frosted(0.005), eye=camera((0, -0.3, 0.8), fov=80))
     assert share_of(lost_in(scene)) < 0.005
     assert share_of(lost_in(scene, light_paths=0)) == pytest.approx(0.35, rel=0.1)
     assert "leave light_paths" in said(scene, light_paths=0)
@@ -157,10 +173,8 @@ def test_what_a_pilot_chose_is_no_remedy():
     render = render_of(slab(frosted(0.01)))
     plan = PATH_TRACING.plan(render.plan)
     lost = unsampled_light.estimate(render.prepared, plan, render.settings)
-    assert (
-        "light_paths"
-        not in unsampled_light.missing(render.prepared, plan, lost, lost.shares(MEAN), 64).remedy
-    )
+    missing = unsampled_light.missing(render.prepared, plan, lost, lost.shares(MEAN), 64)
+    assert "light_paths" not in missing.remedy
 
 
 def test_the_aim_of_photons_changes_nothing(monkeypatch):
@@ -192,7 +206,7 @@ def test_in_fog_it_is_missing_too():
     fog = {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}
     scene = slab(frosted(0.005), fog=fog)
     lost = share_of(lost_in(scene))
-    assert lost == pytest.approx(share_of(lost_in(slab({"type": "dielectric"}, fog=fog))), rel=0.1)
+    assert lost == pytest.approx(share_of(lost_in(slab(GLASS, fog=fog))), rel=0.1)
     assert 0.3 < lost / share_of(lost_in(slab(frosted(0.005)))) < 0.7
     assert "small area" in said(scene) and "merging" not in said(scene)
 
@@ -207,23 +221,17 @@ def test_in_other_variants(variant):
     assert share_of(lost_in(slab(frosted(0.03)))) == pytest.approx(expected, rel=0.2)
 
 
-PLATE = {"type": "cube", "to_world": T().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])}
-
-
 def test_names_of_objects():
     """Expected: the slab alone, not a polished ball that is out of view; a plate without id, and two that
     Mitsuba has merged into a mesh without id, are named by their BSDF."""
-    metal = {"type": "roughconductor", "alpha": 0.01}
-    ball = {"type": "sphere", "center": [0, 0, -9], "radius": 0.5, "bsdf": metal}
-    assert lost_in(slab(frosted(0.01), ball=ball)).objects == ("shape 'slab'",)
-    satin = frosted(0.01) | {"id": "satin"}
-    assert lost_in(slab(satin, slab=PLATE | {"id": "", "bsdf": satin})).objects == (
-        "shape without id with BSDF 'satin'",
-    )
-    one = {"type": "ref", "id": "satin"}
+    satin, one = frosted(0.01) | {"id": "satin"}, {"type": "ref", "id": "satin"}
     other = {"type": "cube", "to_world": T().translate([0, 0, -9]), "bsdf": one}
-    merged = slab(one, optimize=True, satin=frosted(0.01), other=other)
-    assert lost_in(merged).objects == ("shape without id with BSDF 'satin'",)
+    for scene, name in (
+        (slab(frosted(0.01), ball=BALL), "shape 'slab'"),
+        (slab(satin, slab=PLATE | {"id": "", "bsdf": satin}), "shape without id with BSDF 'satin'"),
+        (slab(one, optimize=True, satin=frosted(0.01), other=other), "shape without id with BSDF 'satin'"),
+    ):
+        assert lost_in(scene).objects == (name,)
 
 
 @pytest.mark.parametrize("alpha, spp, lowest, highest", [(0.01, 64, 50, 99), (0.03, 4096, 0, 1)])
@@ -238,8 +246,7 @@ def test_explain_has_the_share(alpha, spp, lowest, highest):
 def test_a_path_is_merged_once():
     """Rationale: each vertex with a near-specular lobe stores photons. Expected: of a polished floor next to
     nothing counts (1e-13; 0.17 if paths that are near-specular everywhere did)."""
-    floor = {"type": "rectangle", "to_world": T().scale(1.5)}
-    scene = slab(frosted(0.001), floor=floor | {"bsdf": {"type": "roughconductor", "alpha": 0.001}})
+    scene = slab(frosted(0.001), floor=FLOOR | {"bsdf": {"type": "roughconductor", "alpha": 0.001}})
     assert share_of(lost_in(scene)) < 0.05
 
 
@@ -264,13 +271,12 @@ def test_light_off_a_metal_ceiling(metal, warned):
     """Rationale: metal, not glass alone. Expected: a ceiling that a spot lights and a camera sees from below
     lights and shows the floor: a warning about it where it is polished (the mean is without the spot's
     reflection)."""
-    up = {"to_world": T().look_at([0, 0, 1.2], [0.2, 0, 2], [0, 1, 0])}
-    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
+    up = T().look_at([0, 0, 1.2], [0.2, 0, 2], [0, 1, 0])
     ceiling = {"type": "rectangle", "to_world": T().translate([0, 0, 2]).rotate([1, 0, 0], 180).scale(3)}
     scene = {
         "type": "scene",
-        "eye": {"type": "perspective", "fov": 50, "film": film, **up},
-        "lamp": {"type": "spot", "cutoff_angle": 35, "intensity": 10.0, **up},
+        "eye": camera(to_world=up),
+        "lamp": {"type": "spot", "cutoff_angle": 35, "intensity": 10.0, "to_world": up},
         "floor": {"type": "rectangle", "to_world": T().scale(3)},
         "ceiling": ceiling | {"bsdf": metal},
     }
@@ -279,29 +285,21 @@ def test_light_off_a_metal_ceiling(metal, warned):
 
 
 @pytest.mark.parametrize(
-    "scene",
+    "bsdf, lamp",
     [
-        lambda: slab({"type": "null"}),
-        lambda: slab(frosted(0.4)),
-        lambda: slab(principled(0.7)),
-        lambda: slab({"type": "thindielectric"}),
-        lambda: slab(frosted(0.01), lamp=sphere(0.5)),
-        lambda: slab(frosted(0.01), lamp={"type": "constant"}),
+        *(
+            (bsdf, POINT)
+            for bsdf in ({"type": "null"}, frosted(0.4), principled(0.7), {"type": "thindielectric"})
+        ),
+        *((frosted(0.01), lamp) for lamp in (sphere(0.5), {"type": "constant"})),
     ],
     ids=["null", "rough", "principled", "thin", "large lamp", "sky"],
 )
-def test_no_near_specular_estimate_of_other_scenes(scene):
-    """Rationale: the estimate takes longer than a small preview. Expected: scenes without near-specular lobes
-    have the estimate of before, and so do those in which none is narrow enough to leave light undersampled,
-    or all emitters are large."""
-    render = render_of(scene())
+def test_no_near_specular_estimate_of_other_scenes(bsdf, lamp):
+    """Rationale: the estimate takes longer than a small preview. Expected: none of scenes without
+    near-specular lobes narrow enough to leave light undersampled, or of large emitters alone."""
+    render = render_of(slab(bsdf, lamp=lamp))
     assert not unsampled_light.is_undersampling_possible(render.prepared, render.plan, render.settings)
-
-
-def sphere(radius):
-    """As bright as the point light, from afar."""
-    emitter = {"type": "area", "radiance": 10 / (np.pi * radius**2)}
-    return {"type": "sphere", "center": POINT["position"], "radius": radius, "emitter": emitter}
 
 
 def test_small_lamps_are_hit_too_rarely():
@@ -321,37 +319,22 @@ def test_small_lamps_behind_smooth_glass():
     """Rationale: s = 0 hits a small lamp through glass too rarely; renders were black without a word.
     Expected: behind a slab of `dielectric` a sphere of radius .002 lacks what the point light does (within
     15 %: other random numbers), one of radius .3 nothing, and none does where photons guide s = 0."""
-    small, large = (slab({"type": "dielectric"}, lamp=sphere(radius)) for radius in (0.002, 0.3))
-    point = share_of(lost_in(slab({"type": "dielectric"})))
+    small, large = (slab(GLASS, lamp=sphere(radius)) for radius in (0.002, 0.3))
+    point = share_of(lost_in(slab(GLASS)))
     assert share_of(lost_in(small)) == pytest.approx(point, rel=0.15)
     assert share_of(lost_in(large)) == share_of(lost_in(small, guiding="always")) == 0
 
 
-@pytest.mark.parametrize(
-    "size, bsdf", [(0.03, {"type": "dielectric"}), (0.003, {"type": "dielectric"}), (0.02, frosted(0.005))]
-)
+@pytest.mark.parametrize("size, bsdf", [(0.03, GLASS), (0.003, GLASS), (0.02, frosted(0.005))])
 def test_a_lens_is_hit_too_rarely(size, bsdf):
     """Rationale: t = 0 samples SDS paths of a camera with a lens, but a small lens is hit by next to no light
     subpath: the image was black without a word. Expected: what is missing to a pinhole, which has no t = 0
     (within 10 %: other random numbers), and nothing in a render of very many samples."""
-    to_world = T().look_at([0, -0.5, 3.2], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 32, "height": 32, "rfilter": {"type": "box"}}
-    lens = {"type": "thinlens", "fov": 50, "aperture_radius": size, "focus_distance": 3.2}
-    scene, pinhole = slab(bsdf, eye=lens | {"to_world": to_world, "film": film}), slab(bsdf)
+    lens = camera(type="thinlens", aperture_radius=size, focus_distance=3.2)
+    scene, pinhole = slab(bsdf, eye=lens), slab(bsdf)
     assert share_of(lost_in(scene)) == pytest.approx(share_of(lost_in(pinhole)), rel=0.1)
     assert "undersampled" in said(scene) and "through or off shape 'slab'" in said(scene)
     assert lost_in(scene, 1 << 40) is None
-
-
-def test_a_sky_is_not_undersampled():
-    """Expected: nothing is missing of a sky through frosted glass."""
-    assert share_of(lost_in(slab(frosted(0.01), lamp={"type": "constant"}))) == 0
-
-
-def test_merging_finds_it():
-    """Expected: nothing is missing with merging."""
-    ball = {"type": "sphere", "bsdf": frosted(0.01)}
-    assert render_of(slab({"type": "dielectric"}, ball=ball), merging=True)._unsampled() is None
 
 
 def test_a_timeout_bounds_the_samples(monkeypatch):
@@ -370,16 +353,13 @@ def test_a_timeout_bounds_the_samples(monkeypatch):
 
 def test_it_is_said_before_the_first_pass(monkeypatch):
     """Expected: one warning, by a pilot, whose mean has none of the light of which there are few samples; the
-    share is within a fifth of that in a converged image (0.22 of 0.30)."""
+    share is within a fifth of that in a converged image (0.22 of 0.30). A first image that has no sample of
+    some light, neither of 99 times as much, lacks a hundredth."""
+    lost = unsampled_light.UnsampledLight({0: np.ones(3)}, never=0.0, few=99.0)
+    assert lost.shares(0.5) == {0: 0.01}
     scene, begun, trace = slab(frosted(0.01), size=64), [], Render._pass
     with Warned() as warnings, monkeypatch.context() as patch:
         patch.setattr(Render, "_pass", lambda self, step: begun.append(len(warnings)) or trace(self, step))
         bdpt().render(scene, spp=64)
     assert begun == [1] and len(warnings) == 1
     assert float(re.search("about ([0-9]+) %", warnings[0])[1]) == pytest.approx(75, rel=0.3)
-
-
-def test_light_of_few_samples_is_in_the_image():
-    """Expected: a first image that has no sample of it, neither of 99 times as much, lacks a hundredth."""
-    lost = unsampled_light.UnsampledLight({0: np.ones(3)}, never=0.0, few=99.0)
-    assert lost.shares(0.5) == {0: 0.01}

@@ -11,7 +11,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 7449,
     "transport merging guided_emission": 5748,
-    "planning": 2154,
+    "planning": 1732,
     "emitters": 2680,
     "cli": 1810,
     "media": 1349,

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.bsdf import Traits
 from ..transport.plan import Plan
 
 # The pilot's share of a render's samples, bounds of the pilot's samples, and bounds of the render's samples:
@@ -57,23 +56,13 @@ def focuses(prepared: PreparedScene) -> bool:
 def least_samples(prepared: PreparedScene) -> int:
     """Least number of samples of a render that runs a pilot."""
     least = FOCUSED_SAMPLES if focuses(prepared) else LEAST_SAMPLES
-    return max(least, samples_of_kernel(prepared.traits))
+    return max(least, samples_of_kernel(prepared))
 
 
-def samples_of_kernel(traits: Traits) -> int:
+def samples_of_kernel(prepared: PreparedScene) -> int:
     """Compilation and recording of a pilot's kernel in samples; 0 without many BSDFs."""
-    dispatch = traits.dispatch
+    dispatch = prepared.traits.dispatch
     return SAMPLES_PER_KIND * dispatch.kinds + SAMPLES_PER_BSDF * dispatch.count if dispatch.many else 0
-
-
-def predicts_guiding(prepared: PreparedScene, samples: int) -> bool:
-    """Whether a pilot predicts the gain of photon-guided BSDF sampling."""
-    return not prepared.traits.dispatch.many or samples >= GUIDING_TIMES * least_samples(prepared)
-
-
-def lanes(samples: int) -> int:
-    """Number of pilot samples for a render of ``samples`` samples."""
-    return min(max(int(samples * PILOT_SHARE), LEAST_LANES), MOST_LANES)
 
 
 def first_plan(full: Plan, prepared: PreparedScene, settings: Settings, pixels: int, joined: int) -> Plan:

@@ -1,7 +1,6 @@
 """Chooses the most efficient configuration from a pilot's statistics.
 
-Minimises cost times error. The error is the geometric mean of that of the mean render and of a typical one
-(`Moments.variance`, `Moments.typical`): most renders lack the rarest outliers.
+Minimises cost times the geometric mean of both `Moments.errors`: most renders lack the rarest outliers.
 Costs are counted, not timed (see `COSTS`): equal seeds give equal decisions on all machines.
 """
 
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..transport.plan import GUIDED
-from .configuration import PATH_TRACING, Configuration, Decision, not_worth
+from .configuration import CANDIDATES, PATH_TRACING, Configuration, not_worth
 from .moments import GROUPS, Moments
 
 if TYPE_CHECKING:
@@ -39,10 +38,7 @@ FIXED = {"start": 180e3, "light": 250e3, "guided": 600e3}
 
 
 def cost(candidate: Configuration, rays: Mapping[str, float], samples: float = math.inf) -> float:
-    """Cost of a sample in a render of ``samples`` samples; path tracing alone costs 1.
-
-    Includes `FIXED`. ``rays`` per sample of the pilot, see `moments.Moments`.
-    """
+    """Cost of a sample in a render of ``samples``; path tracing alone costs 1. ``rays``: see `Moments`."""
     total = camera = rays["camera"] + rays["shadow_s1"] + FIXED["start"] / samples
     if candidate.light_paths:
         total += FIXED["light"] / samples
@@ -76,23 +72,10 @@ LEAST_VARIANCE = 1e-4
 
 
 @dataclass(frozen=True)
-class Alternatives:
-    """The ``candidates`` for a render with ``samples`` samples still to come.
-
-    ``learnt``: tables of emission, with which light subpaths are traced.
-    """
-
-    candidates: list[Configuration]
-    samples: float = math.inf
-    learnt: Any = None  # a `guided_emission.Learnt`
-
-
-@dataclass(frozen=True)
 class Prediction:
-    """The predicted efficiency of a candidate, guided emission included.
+    """Predicted ``cost`` of a sample and ``error`` of a candidate (path tracing alone: 1).
 
-    ``cost`` of a sample and ``error`` (path tracing alone: 1); ``variance``: relMSE per sample, without
-    SDS paths where s = 0 can be guided.
+    ``variance``: relMSE per sample, without SDS paths where s = 0 can be guided.
     """
 
     candidate: Configuration
@@ -105,87 +88,62 @@ class Prediction:
         """Time to a given error (path tracing alone: 1)."""
         return self.cost * self.error
 
-    @property
-    def score(self) -> float:
-        """The quantity that the choice minimises: `time`, but for `PATH_TRACING` times `REQUIRED_GAIN`."""
-        return self.time * (REQUIRED_GAIN if self.candidate != PATH_TRACING else 1)
 
-    def decided(self, mean: float) -> Decision:
-        """The candidate's decision; ``mean`` of the image."""
-        return Decision.of(self.candidate, cost=self.cost, variance=self.variance, mean=mean)
+def choose(
+    moments: Moments,
+    candidates: list[Configuration],
+    samples: float = math.inf,
+    learnt: Learnt | None = None,
+) -> list[Prediction]:
+    """Predictions for a render of ``samples`` samples with the tables ``learnt``, the best first.
 
-
-def choose(moments: Moments, alternatives: Alternatives) -> list[Prediction]:
-    """Predictions for the candidates of finite variance, the best first.
-
-    Those with light subpaths with photon-guided BSDF sampling too, whose samples hardly add an error; path
-    tracing alone would guide more vertices than were counted.
+    Of candidates of finite variance; of those with light subpaths with photon-guided BSDF sampling too, whose
+    samples hardly add an error. Path tracing alone would guide more vertices than were counted.
     """
-    candidates, learnt = alternatives.candidates, alternatives.learnt
-    both = (
-        np.maximum(_by_group(values, candidates, learnt).mean(axis=0), LEAST_VARIANCE)
-        for values in (moments.variance, moments.typical)
-    )
     rows: list[Prediction] = []
-    mean, typical = moments.guidable
-    for candidate, v, t in zip(candidates, *(values.tolist() for values in both), strict=True):
-        if not math.isfinite(v):
+    guidable = any(moments.guidable)
+    for way in candidates:
+        # At least 0: an estimate may be negative, and one such group would make a candidate the best.
+        of_groups = np.maximum(moments.errors[:, :, CANDIDATES.index(way)], 0)
+        light = way.light_paths > 0
+        if light and learnt and learnt.tables:
+            of_groups = of_groups * learnt.whole ** (1 if way.connections != "none" else TABLES_ALONE)
+        errors = np.maximum(of_groups.mean(axis=1), LEAST_VARIANCE)
+        if not math.isfinite(errors[0]):
             continue
-        candidate = _with_tables(candidate, learnt)
-        each = cost(candidate, moments.rays, alternatives.samples)
-        rows.append(Prediction(candidate, each, ((v + mean) * (t + typical)) ** 0.5, v))
-        if mean and candidate.light_paths:
-            candidate = replace(candidate, guided=GUIDED)
-            each = cost(candidate, moments.rays, alternatives.samples)
-            rows.append(Prediction(candidate, each, (v * t) ** 0.5, v))
+        for guided in (0, GUIDED) if guidable and light else (0,):
+            emission = learnt.tables if learnt and light else None
+            candidate = replace(way, guided=guided, emission=emission)
+            each = cost(candidate, moments.rays, samples)
+            left = errors if guided else errors + moments.guidable
+            rows.append(Prediction(candidate, each, float(left.prod()) ** 0.5, float(errors[0])))
     alone = [row.error for row in rows if not row.candidate.light_paths]
     unit = min(alone or [row.error for row in rows], default=1.0)
-    return sorted((replace(row, error=row.error / unit) for row in rows), key=lambda row: row.score)
+    rows = [replace(row, error=row.error / unit) for row in rows]
+    return sorted(rows, key=lambda row: row.time * (REQUIRED_GAIN if row.candidate != PATH_TRACING else 1))
 
 
-def _with_tables(candidate: Configuration, learnt: Learnt | None) -> Configuration:
-    """The candidate with tables of emission, if there are any and it has light subpaths."""
-    return replace(candidate, emission=learnt.tables) if learnt and candidate.light_paths else candidate
-
-
-def _by_group(variances: np.ndarray, candidates: list[Configuration], learnt: Learnt | None) -> np.ndarray:
-    """Those of ``candidates`` of all ``variances`` by group of the pilot, shape (`GROUPS`, candidates).
-
-    At least 0: an estimate may be negative, and one such group would make a candidate the best. Times what
-    tables of emission leave.
-    """
-    found = np.maximum(variances[:, [candidate.number for candidate in candidates]], 0)
-    if learnt is None or learnt.tables is None:
-        return found
-    powers = [(1 if c.connections != "none" else TABLES_ALONE) if c.light_paths else 0 for c in candidates]
-    return found * learnt.whole ** np.array(powers)
-
-
-def confidence(moments: Moments, alternatives: Alternatives) -> float:
-    """Confidence in the choice, from bootstrap resamplings of the pilot's groups.
+def confidence(moments: Moments, candidates: list[Configuration], *others: Any) -> float:
+    """Confidence in the choice, from bootstrap resamplings of the pilot's groups; arguments as in `choose`.
 
     Share of `RESAMPLINGS` in which the candidate that `choose` puts first is within `NEAR` of the best.
     """
-    best = choose(moments, alternatives)[0].candidate
-    random = np.random.default_rng(len(alternatives.candidates))
+    best = choose(moments, candidates, *others)[0].candidate
+    random = np.random.default_rng(len(candidates))
     agree = 0
     for _ in range(RESAMPLINGS):
-        table = choose(moments.of(random.integers(0, GROUPS, GROUPS)), alternatives)
-        times = {row.candidate: row.time for row in table}
+        resampled = replace(moments, errors=moments.errors[:, random.integers(0, GROUPS, GROUPS)])
+        times = {row.candidate: row.time for row in choose(resampled, candidates, *others)}
         agree += times.get(best, math.inf) <= NEAR * min(times.values())
     return agree / RESAMPLINGS
 
 
 def why_not(row: Prediction, chosen: Prediction) -> str:
-    """Why ``row`` of the table of `choose` is not ``chosen``.
-
-    Empty if it would not take less time.
-    """
+    """Why ``row`` of the table of `choose` is not ``chosen``, though it takes less time; else empty."""
     gain = chosen.time / row.time
-    if gain <= 1:
-        return ""
     what = "light subpaths" if row.candidate.light_paths else "other weights"
-    return f"{what} have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
+    why = f"{what} have to gain {REQUIRED_GAIN:g}x over path tracing alone, and gain {gain:.2f}x"
+    return why if gain > 1 else ""
 
 
 def left_out(table: list[Prediction], guided: str = "guided s=0") -> list[dict[str, str]]:
@@ -194,17 +152,16 @@ def left_out(table: list[Prediction], guided: str = "guided s=0") -> list[dict[s
     ``guided``: the class of strategies that the candidates with guided samples have.
     """
     skipped: list[dict[str, str]] = []
-    without: dict[str, Callable[[Configuration], bool]] = {
-        "t<=1": lambda c: not c.light_paths,
-        "inner": lambda c: c.connections == "none",
-        guided: lambda c: not c.guided,
+    uses: dict[str, Callable[[Configuration], bool]] = {
+        "t<=1": lambda c: c.light_paths > 0,
+        "inner": lambda c: c.connections != "none",
+        guided: lambda c: c.guided > 0,
     }
-    for name, lacks in without.items():
-        others = [row for row in table if not lacks(row.candidate)]
-        if others and lacks(table[0].candidate):
+    for name, has in uses.items():
+        others = [row for row in table if has(row.candidate)]
+        if others and not has(table[0].candidate):
             best = min(others, key=lambda row: row.time)
             ratio = best.time / table[0].time
             why = f"in the pilot, renders with it take at least {ratio:.2f} times as long for the same error"
-            why = why_not(best, table[0]) or why
-            skipped.append(not_worth(name, why))
+            skipped.append(not_worth(name, why_not(best, table[0]) or why))
     return skipped

@@ -1,20 +1,16 @@
-"""Configurations of a render: light subpaths, connections, coefficients.
-
-A pilot estimates the variance of each of `CANDIDATES`; `without_pilot` decides under a uniform environment.
-A `Decision` is a configuration in use with its predictions; it has a JSON form.
-"""
+"""Configurations of a render, among which a pilot chooses, and decisions for one of them."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from .. import components
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import JOINED, Plan
-from .budget import CHEAP_SAMPLES, EVEN
+from . import budget
 from .possible import unsampled_paths
 
 
@@ -55,11 +51,6 @@ class Configuration:
         """
         return {"hit": 1.0, "direct": 1.0, "light": self.light_paths, "inner": math.sqrt(self.joined)}
 
-    @property
-    def number(self) -> int:
-        """Index of the candidate that this is, whatever was decided beside it."""
-        return CANDIDATES.index(replace(self, guided=0, emission=None))
-
     def plan(self, full: Plan) -> Plan:
         """``full`` restricted to this configuration."""
         light = self.light_paths > 0
@@ -74,10 +65,10 @@ class Configuration:
             guided=max(self.guided, full.guided) if full.guidable and not full.merging else 0,
             merging=full.merging and (self.guided > 0 or not full.guidable),
         )
-        if not adopted.light:
-            return replace(adopted, camera_paths_per_light_path=1, joined=1, emission=None)
-        shared, joined = round(1 / self.light_paths), self.joined if adopted.connections == "one" else 1
-        return replace(adopted, camera_paths_per_light_path=shared, joined=joined, emission=self.emission)
+        joined = self.joined if adopted.connections == "one" else 1
+        shared = round(1 / self.light_paths) if adopted.light else 1
+        emission = self.emission if adopted.light else None
+        return replace(adopted, camera_paths_per_light_path=shared, joined=joined, emission=emission)
 
 
 PATH_TRACING = Configuration(0.0, "none", 1.0, 1.0)
@@ -105,7 +96,7 @@ NOT_WORTH = "not worth its cost here"
 
 
 def not_worth(name: str, why: str) -> dict[str, str]:
-    """Entry of ``statistics["skipped"]`` of a class of strategies that does not pay."""
+    """Entry of ``statistics["skipped"]``."""
     return {"class": name, "level": NOT_WORTH, "why": why}
 
 
@@ -116,25 +107,17 @@ MOST_ROULETTE, ROULETTE_PER_VARIANCE = 0.1, 0.2
 
 @dataclass(frozen=True)
 class Decision(Configuration):
-    """The configuration of a render, with its predictions.
-
-    ``cost`` of a sample (path tracing alone: 1); ``variance`` as in `choice.Prediction`; ``mean`` of the
-    image, the scale of roulette.
-    """
+    """The configuration of a render, with the `choice.Prediction` and the ``mean`` of the image."""
 
     cost: float
     variance: float
     mean: float
 
     @classmethod
-    def of(cls, chosen: Configuration, *, cost: float, variance: float, mean: float) -> Decision:
-        """Return the decision for a configuration with these predictions.
-
-        Rounds them to six digits: further digits depend on the order of a pilot's atomic additions.
-        """
-        cost, variance, mean = (float(f"{number:.6g}") for number in (cost, variance, mean))
-        what = {f.name: getattr(chosen, f.name) for f in fields(Configuration)}
-        return cls(**what, cost=cost, variance=variance, mean=mean)
+    def of(cls, chosen: Configuration, **predictions: Any) -> Decision:
+        """Round the predictions to six digits: others depend on the order of a pilot's atomic additions."""
+        rounded: dict[str, Any] = {name: float(f"{x:.6g}") for name, x in predictions.items()}
+        return cls(**vars(chosen), **rounded)
 
     @property
     def threshold(self) -> float:
@@ -143,7 +126,7 @@ class Decision(Configuration):
 
     def record(self) -> dict[str, Any]:
         """Entry of ``statistics["decisions"]``."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = dict(vars(self))
         values["coefficients"] = {"t<=1": values.pop("kappa_light"), "s=1": values.pop("kappa_direct")}
         return values | {"emission": None if self.emission is None else self.emission.record()}
 
@@ -151,8 +134,8 @@ class Decision(Configuration):
     def read(record: dict[str, Any]) -> Decision:
         """Inverse of `record`."""
         values = dict(record)
-        emission, coefficients = values.pop("emission", None), values.pop("coefficients")
-        if emission is not None:
+        coefficients = values.pop("coefficients")
+        if emission := values.get("emission"):
             values["emission"] = components.guided_emission.EmissionTables(**emission)
         return Decision(kappa_light=coefficients["t<=1"], kappa_direct=coefficients["s=1"], **values)
 
@@ -184,17 +167,15 @@ def candidates(prepared: PreparedScene, full: Plan, settings: Settings) -> list[
     ]
 
 
-def without_pilot(
-    prepared: PreparedScene, full: Plan, settings: Settings, samples: int, of_kernel: int
-) -> Decision | None:
+def without_pilot(prepared: PreparedScene, full: Plan, settings: Settings, samples: int) -> Decision | None:
     """Path tracing alone under a uniform environment, if ``samples`` are too few for a pilot; else None.
 
-    A pilot's kernel takes as long as ``of_kernel`` samples. Camera subpaths hit the environment wherever its
-    light enters, caustics included, and light subpaths rarely find the way in.
+    Camera subpaths hit the environment wherever its light enters, caustics included, and light subpaths
+    rarely find the way in.
     """
-    contrast = prepared.emitters.contrast
-    most = max(UNIFORM_TIMES * of_kernel, UNIFORM_SAMPLES if contrast <= UNIFORM else CHEAP_SAMPLES)
-    if samples >= most or not contrast <= EVEN:  # also if it is NaN
+    contrast, of_kernel = prepared.emitters.contrast, budget.samples_of_kernel(prepared)
+    most = max(UNIFORM_TIMES * of_kernel, UNIFORM_SAMPLES if contrast <= UNIFORM else budget.CHEAP_SAMPLES)
+    if samples >= most or not contrast <= budget.EVEN:  # also if it is NaN
         return None
     if all(candidate.light_paths for candidate in candidates(prepared, full, settings)):
         return None

@@ -5,26 +5,15 @@ from __future__ import annotations
 from fractions import Fraction
 
 from ..scene.diagnostics import spoilt
-from ..scene.prepared import PreparedScene
-from ..settings import Settings
-from .choice import NEAR, Prediction, why_not
+from .choice import NEAR, confidence, why_not
 from .configuration import Configuration
 from .planner import Planner
 from .possible import unsampled_paths
 
 
-def explain(
-    prepared: PreparedScene,
-    settings: Settings,
-    planner: Planner,
-    table: list[Prediction],
-    not_sampled: str = "",
-) -> str:
-    """Describe the strategies in use and those skipped.
-
-    ``table``: predictions of the planner's pilot, if one ran; ``not_sampled``: about unsampled light.
-    """
-    p, decided = planner.plan, planner.decided
+def explain(planner: Planner, not_sampled: str = "") -> str:
+    """Describe the strategies in use and those skipped; ``not_sampled``: about unsampled light."""
+    p, decided, prepared, settings = planner.plan, planner.decided, planner.prepared, planner.settings
     light = "no light subpaths"
     if p.light:
         light = f"camera subpaths per light subpath: {p.camera_paths_per_light_path}, "
@@ -57,7 +46,7 @@ def explain(
         lines.append("slow: a timed_sunsky lives, here or in another scene: no kernel records its calls")
     if decided.non_finite:
         lines.append(f"invalid samples (NaN or infinite): {decided.non_finite} of the pilot")
-    return "\n".join(lines + (_pilot(settings, table, planner.confidence()) if table else []))
+    return "\n".join(lines + (_pilot(planner) if planner.table else []))
 
 
 def _named(candidate: Configuration) -> str:
@@ -70,8 +59,9 @@ def _named(candidate: Configuration) -> str:
     return f"{light}{guided}{lane}, coefficient of t<=1: {candidate.kappa_light:g}"
 
 
-def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> list[str]:
+def _pilot(planner: Planner) -> list[str]:
     """Describe the predictions; the last line is the choice and its confidence."""
+    table, heuristic = planner.table, planner.settings.heuristic
     lines = [
         "pilot: the chosen configuration first; cost and relMSE relative to path tracing alone",
         "  relative time  cost per sample     error  configuration",
@@ -80,10 +70,10 @@ def _pilot(settings: Settings, table: list[Prediction], confidence: float) -> li
         why = why_not(row, table[0])
         figures = f"{row.time / table[0].time:15.2f}  {row.cost:15.2f}  {row.error:8.3g}"
         lines.append(f"{figures}  {_named(row.candidate)}" + (f"; not chosen: {why}" if why else ""))
-    if settings.heuristic != "balance":
-        lines.append(f"  the figures are those of the balance heuristic, not of {settings.heuristic}")
-    lines.append(
-        f"chosen: {_named(table[0].candidate)} (confidence: in {confidence:.0%} of bootstrap resamples of "
-        f"the pilot it is within {NEAR:g}x of the best)"
-    )
-    return lines
+    if heuristic != "balance":
+        lines.append(f"  the figures are those of the balance heuristic, not of {heuristic}")
+    sure = f"{confidence(*planner.measured):.0%} of bootstrap resamples of the pilot"
+    return [
+        *lines,
+        f"chosen: {_named(table[0].candidate)} (confidence: in {sure} it is within {NEAR:g}x of the best)",
+    ]

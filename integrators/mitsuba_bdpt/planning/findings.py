@@ -1,4 +1,4 @@
-"""Cached results of earlier renders of a scene, valid until it is edited."""
+"""Cache of results of earlier renders of a scene."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Found = TypeVar("Found")
 
 
 class SceneCache:
-    """Cached results for the scene of one render, by kind and key.
+    """Cached results for the scene of one render, by kind and key, valid until it is edited.
 
     Reads the parameters of scene and sensor once (up to 8 ms), and again after `expire`.
     """
@@ -29,12 +29,8 @@ class SceneCache:
         if self._state is None:  # detects edits
             state = State.of([self._prepared.scene, self._sensor])
             self._state = state, self._prepared.camera.region.border
-
-        def compiled_quickly():
-            with quick_compilation():
-                return look()
-
-        return cached(self._prepared.scene, self._sensor, kind, (self._state, key), compiled_quickly)
+        key = self._state, key
+        return cached(self._prepared.scene, self._sensor, kind, key, quick_compilation()(look))
 
     def expire(self):
         """Read the parameters again before the next lookup: they may have been edited."""

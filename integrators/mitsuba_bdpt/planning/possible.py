@@ -6,7 +6,6 @@ import mitsuba as mi
 import numpy as np
 
 from .. import components
-from ..emitters.emitters import Emitters
 from ..geometry.boxes import scene_box
 from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
@@ -46,45 +45,6 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     for name, why in emitters.left_out:
         possible(name, why)
 
-    light_paths, connections = _defaults(settings)
-    contradiction = prepared.light_media.contradiction if prepared.light_media else ""
-    traced = possible(_ALL_LIGHT, "" if light_paths else "light_paths=0", BY_HAND)
-    traced = traced and possible(_ALL_LIGHT, contradiction)
-    splat, endpoints, arrival, inner = (each and traced for each in (splat, endpoints, arrival, inner))
-    if inner and connections == "none":
-        inner = possible("inner", "connections=none", BY_HAND)
-    light = splat or endpoints or arrival or inner
-    teachable = light and possible("guided emission", *_why_not_guided_emission(emitters, settings))
-    return Plan(
-        hit=hit,
-        direct=direct,
-        splat=splat,
-        endpoints=endpoints,
-        arrival=arrival,
-        connections=connections if inner else "none",
-        camera_paths_per_light_path=round(1 / light_paths) if light else 1,
-        kappa_light=1.0 if settings.skip == "none" else 0.25,
-        kappa_direct=1.0,
-        roulette=settings.skip != "none" and not settings.strategy_images,
-        hide_emitters=settings.hide_emitters,
-        skipped=tuple(skipped),
-        merging=merging,
-        guided=GUIDED if guidable and not merging and settings.guiding == "always" else 0,
-        guidable=guidable,
-        teachable=teachable,
-    )
-
-
-def _why_not_guided_emission(emitters: Emitters, settings: Settings) -> tuple[str, str]:
-    """Why emission cannot be guided, empty if it can, and the level of the reason."""
-    if settings.guiding in ("photons", "never"):
-        return f"guiding={settings.guiding}", BY_HAND
-    why = components.why_absent("guided_emission") or components.guided_emission.why_not(emitters)
-    return why or "", "impossible"
-
-
-def _defaults(settings: Settings) -> tuple[float, str]:
-    """``light_paths`` and ``connections`` in effect: set by hand, or by ``skip``."""
     everything = settings.skip == "none"
     light_paths, connections = settings.light_paths, settings.connections
     if isinstance(light_paths, str):  # "auto"
@@ -93,7 +53,36 @@ def _defaults(settings: Settings) -> tuple[float, str]:
         connections = "all" if everything else "one"
     if settings.strategy_images and connections == "one":
         connections = "all"  # a drawn connection does not estimate each strategy
-    return light_paths, connections
+    contradiction = prepared.light_media.contradiction if prepared.light_media else ""
+    traced = possible(_ALL_LIGHT, "" if light_paths else "light_paths=0", BY_HAND)
+    traced = traced and possible(_ALL_LIGHT, contradiction)
+    splat, endpoints, arrival, inner = (each and traced for each in (splat, endpoints, arrival, inner))
+    if inner and connections == "none":
+        inner = possible("inner", "connections=none", BY_HAND)
+    light = teachable = splat or endpoints or arrival or inner
+    if light and settings.guiding in ("photons", "never"):
+        teachable = possible("guided emission", f"guiding={settings.guiding}", BY_HAND)
+    elif light:
+        why = components.why_absent("guided_emission") or components.guided_emission.why_not(emitters)
+        teachable = possible("guided emission", why or "")
+    return Plan(
+        hit=hit,
+        direct=direct,
+        splat=splat,
+        endpoints=endpoints,
+        arrival=arrival,
+        connections=connections if inner else "none",
+        camera_paths_per_light_path=round(1 / light_paths) if light else 1,
+        kappa_light=1.0 if everything else 0.25,
+        kappa_direct=1.0,
+        roulette=not everything and not settings.strategy_images,
+        hide_emitters=settings.hide_emitters,
+        skipped=tuple(skipped),
+        merging=merging,
+        guided=GUIDED if guidable and not merging and settings.guiding == "always" else 0,
+        guidable=guidable,
+        teachable=teachable,
+    )
 
 
 _UNTRACED = "no light subpath can start from the emitters"

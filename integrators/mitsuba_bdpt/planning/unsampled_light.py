@@ -1,9 +1,7 @@
 """Estimates the share of an image's light on SDS paths that no strategy samples, or hardly ever.
 
-Such a path leaves a delta emitter, passes delta surfaces, one diffuse or glossy surface and delta surfaces,
-and reaches the sensor; no two neighbouring vertices can be connected. Through near-specular lobes a few
-samples find such light: it is *undersampled* if a render expects too few, see `merging.undersampled`. The
-estimate merges camera subpaths with as many photons, see `merging.unsampled`.
+Through near-specular lobes a few samples find such light: it is *undersampled* if a render expects too few,
+see `merging.undersampled`. The estimate merges camera subpaths with as many photons, see `merging.unsampled`.
 """
 
 from __future__ import annotations
@@ -130,9 +128,8 @@ def missing(
         why = "no ray hits an emitter without area"
     else:
         why = prepared.camera.reason or "the render does without light tracing (t=1)"
-    through = ""
-    if prepared.delta or prepared.near_specular:
-        through = f", through or off {listed(light.objects, NAMED) or 'specular surfaces'}"
+    specular = listed(light.objects, NAMED) or "specular surfaces"
+    through = f", through or off {specular}" if prepared.delta or prepared.near_specular else ""
     cause = (
         f"{'undersampled' if undersampled else 'not sampled'}, about {min(100 * whole, 99):.2g} % of the "
         f"image's light: that of {_called(lamps)}{through} ({why})"
@@ -152,9 +149,8 @@ def _called(emitters: Iterable[mi.Emitter]) -> str:
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
     media = prepared.light_media
-    if media is not None and media.contradiction:  # light subpaths would see another scene
-        return False
-    if plan.merging or components.why_absent("merging") or not prepared.emitters.traced:
+    contradictory = media is not None and media.contradiction  # light subpaths would see another scene
+    if plan.merging or components.why_absent("merging") or not prepared.emitters.traced or contradictory:
         return False
     beams = prepared.emitters.beams and not plan.splat
     never = not plan.arrival and (_has_sds_paths(prepared) or beams)
@@ -176,11 +172,7 @@ def _has_sds_paths(prepared: PreparedScene) -> bool:
 def estimate(
     prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW
 ) -> UnsampledLight:
-    """Estimate the light that a render of ``samples`` per pixel lacks.
-
-    Skips emitters whose estimate or photons are non-finite and warns; the render itself may not meet that
-    value.
-    """
+    """Estimate the light that a render of ``samples`` per pixel lacks; warns of non-finite emitters."""
     policy = components.merging.Unsampled()
     if is_undersampling_possible(prepared, plan, settings):
         policy = components.merging.Undersampled.of(max(samples, PREVIEW))
@@ -194,11 +186,9 @@ def estimate(
     finite = np.isfinite(total).all(axis=1)
     if not finite.all():
         lamps = _called(prepared.emitters.objects[i] for i in np.flatnonzero(~finite))
-        text = (
-            f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or "
-            "infinite; look for such numbers, or very large ones, in the emitter and in the BSDFs that its "
-            "light meets"
-        )
+        where = "in the emitter and in the BSDFs that its light meets"
+        text = f"bdpt: how much light of {lamps} is not sampled is unknown, since its estimate is NaN or "
+        text += f"infinite; look for such numbers, or very large ones, {where}"
         warn_once(prepared.scene, prepared.camera.sensor, text)
     total = np.where(finite[:, None], total, 0)
     colours = {int(i): total[i] for i in np.flatnonzero(total.any(axis=1))}
@@ -206,10 +196,8 @@ def estimate(
     never, rare, few = np.array(policy.sums)
     size = max(never + rare, np.finfo(np.float32).tiny)
     if never < rare:
-        meant = {id(bsdf) for bsdf in prepared.near_specular}
-        seen, others = (
-            [s for s in of if id(s.bsdf()) in meant] for of in (shapes, all_shapes(prepared.scene))
-        )
+        meant, everything = {id(bsdf) for bsdf in prepared.near_specular}, all_shapes(prepared.scene)
+        seen, others = ([s for s in of if id(s.bsdf()) in meant] for of in (shapes, everything))
         shapes = seen or (shapes if _has_sds_paths(prepared) else others)
     objects = tuple(dict.fromkeys(f"shape {named(shape)}" for shape in shapes))
     return UnsampledLight(colours, objects, float(never / size), float(few / size))
@@ -221,40 +209,30 @@ def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, 
     rarest = fewest / int(prepared.camera.region.size.prod())
     policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)
     _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, policy)
-    *of_light, vertices = np.array(policy.sums).reshape(-1, len(names)).T / lanes
-    return GuidableLight(*of_light, float(vertices.sum()))
+    return GuidableLight(*np.array(policy.sums).reshape(-1, len(names)).T / lanes)
 
 
 def _merged(
     prepared: PreparedScene, plan: Plan, settings: Settings, samples: int, policy: Unsampled
 ) -> tuple[Estimate, int]:
-    """Merge subpaths; returns the sums, and over how many camera samples they go."""
-    pixels, count = int(prepared.camera.region.size.prod()), _subpaths(prepared, samples)
+    """Merge subpaths; returns the sums, and over how many camera samples they go.
+
+    The kernel computes no weights; its partial sums, of coefficients 1, are numbers of samples.
+    """
+    pixels = int(prepared.camera.region.size.prod())
+    of_render = 1 << (samples * pixels // SAMPLES_OF_ONE).bit_length()
+    count = max(SUBPATHS, min(of_render, MOST_SUBPATHS))
     chosen = min(count, pixels)
     batch = Batch(0, chosen, 0, count // chosen, spread=pixels)
     sharp = policy.only_specular < math.inf
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
-        kernel = _kernel(prepared, plan, settings, sharp)
+        plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
+        kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
+        traits = prepared.traits if sharp else prepared.traits.of_delta_lobes()
+        kernel = kernel.replaced(traits=traits, last_merged=kernel.max_depth)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if sharp else ())
         drawn = (Points(kind, dr.opaque(mi.UInt32, SEED)) for kind in ("sobol", "independent"))
         return components.merging.estimate(kernel, batch, count, *drawn, aim, policy), batch.size
-
-
-def _subpaths(prepared: PreparedScene, samples: int) -> int:
-    """Number of subpaths from either end, for a render of ``samples`` per pixel: a power of 2."""
-    whole = samples * int(prepared.camera.region.size.prod())
-    return max(SUBPATHS, min(1 << (whole // SAMPLES_OF_ONE).bit_length(), MOST_SUBPATHS))
-
-
-def _kernel(prepared: PreparedScene, plan: Plan, settings: Settings, sharp: bool) -> Kernel:
-    """A kernel that computes no weights; its partial sums, of coefficients 1, are numbers of samples.
-
-    Its subpaths sample delta lobes only, or all with ``sharp`` ones.
-    """
-    plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
-    kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
-    traits = prepared.traits if sharp else prepared.traits.of_delta_lobes()
-    return kernel.replaced(traits=traits, last_merged=kernel.max_depth)
 
 
 def _brightest(shapes: np.ndarray, found: np.ndarray) -> list[mi.Shape]:

@@ -127,8 +127,6 @@ class Render:
         parts = Parts(strip_count(longest), min(longest, spp), names)
         self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
-        # Predictions of the pilot, see `decide`.
-        self.table: list[Prediction] = []
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
         # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette.
@@ -229,9 +227,9 @@ class Render:
         """
         if self.planner.begin():
             with self.meter.pilot():
-                self.table = self.planner.run_pilot()
+                self.planner.run_pilot()
         self._use_plan()
-        return self.table
+        return self.planner.table
 
     def _use_plan(self):
         if self.kernel.plan is not self.plan:
