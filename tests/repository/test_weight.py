@@ -24,7 +24,7 @@ MOST = {
     "sensors": 939,
     "": 1553,  # top files
 }
-OUTSIDE = {"scripts": 5056, "tests": 43867}
+OUTSIDE = {"scripts": 5055, "tests": 43645}
 MOST_WORDS = 30049
 
 
