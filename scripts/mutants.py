@@ -422,22 +422,22 @@ MUTANTS = (
     Mutant(
         "weights: the newest alternative is forgotten",
         "transport/mis.py",
-        "older = alternatives(heuristic, partial, coefficient, step.pdf_rev_w)",
-        "older = alternatives(heuristic, partial, 0, step.pdf_rev_w)",
+        "older = alternatives(h, partial, coefficient, step.pdf_rev_w)",
+        "older = alternatives(h, partial, 0, step.pdf_rev_w)",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[odd-balance]",),
     ),
     Mutant(
         "weights: no squared distance in the area measure",
         "transport/mis.py",
-        "heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr))",
-        "heuristic.scale(partial.d_vcm, dr.rcp(cos))",
+        "h.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr))",
+        "h.scale(partial.d_vcm, dr.rcp(cos))",
         ("tests/transport/test_oracle.py::test_kernel_agrees_with_explicit_densities[pinhole-balance-odd]",),
     ),
     Mutant(
         "weights: delta events keep a density",
         "transport/mis.py",
-        "dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w)))",
-        "heuristic.start(dr.rcp(step.pdf_fwd_w))",
+        "dr.select(step.delta, 0.0, h.start(dr.rcp(step.pdf_fwd_w)))",
+        "h.start(dr.rcp(step.pdf_fwd_w))",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[odd-balance]",),
     ),
     Mutant(
@@ -717,8 +717,8 @@ MUTANTS = (
     Mutant(
         "weights: of the edge's cosine not",
         "transport/mis.py",
-        "heuristic.scale(older, step.cos_out / step.pdf_fwd_w)",
-        "heuristic.scale(older, dr.rcp(step.pdf_fwd_w))",
+        "h.scale(older, step.cos_out / step.pdf_fwd_w)",
+        "h.scale(older, dr.rcp(step.pdf_fwd_w))",
         ("tests/transport/test_oracle.py::test_recursion_agrees_with_explicit_densities[n1c1-balance]",),
     ),
     Mutant(
@@ -1359,8 +1359,8 @@ MUTANTS = (
     Mutant(
         "guiding: delta events leave d_vm as it is",
         "transport/mis.py",
-        "_folded(heuristic, step, partial.d_vm, total)",
-        "_folded(heuristic, step, partial.d_vm / step.cos_out, total)",
+        "_folded(h, step, partial.d_vm, total)",
+        "_folded(h, step, partial.d_vm / step.cos_out, total)",
         ("tests/transport/test_oracle.py::test_sums_of_guiding_pass_delta_events",),
     ),
     Mutant(
@@ -1422,8 +1422,8 @@ MUTANTS = (
     Mutant(
         "merging: merges without their coefficient in the sums of subpaths",
         "transport/walk.py",
-        "ratio = strategy.ratio(vertex.si.p)",
-        "ratio = strategy.ratio(vertex.si.p) / strategy.kappa",
+        "ratio = side.sds.ratio(vertex.si.p)",
+        "ratio = side.sds.ratio(vertex.si.p) / side.sds.kappa",
         ("tests/transport/test_oracle.py::test_kernel_with_merges[balance-odd-True-1.0]",),
     ),
     Mutant(

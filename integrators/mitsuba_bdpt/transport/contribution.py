@@ -149,10 +149,7 @@ def seen(kernel: Kernel, c: Contribution) -> Contribution:
 
 
 def drop_non_finite(c: Contribution) -> Contribution:
-    """Deactivate and count non-finite contributions, which count as zero.
-
-    Densities from which no weight follows make the value NaN.
-    """
+    """Deactivate and count non-finite contributions, as densities from which no weight follows make them."""
     lost = c.active & ~spectra.is_finite(c.value * c.weight)
     return replace(c, active=c.active & ~lost, counted=c.counted + Counters(non_finite=one(lost)))
 
@@ -160,10 +157,7 @@ def drop_non_finite(c: Contribution) -> Contribution:
 def roulette(
     kernel: Kernel, value: mi.Spectrum, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.Bool, mi.Float, Counters]:
-    """Unbiased roulette on a weighted contribution before its shadow ray.
-
-    Returns the survival mask, its probability, and `Counters`.
-    """
+    """Roulette on a weighted contribution; returns the survival mask, its probability, and `Counters`."""
     if not kernel.plan.roulette:
         return active, mi.Float(1), Counters()
     size = size_of(value)

@@ -31,10 +31,9 @@ KEPT = 64
 
 @dataclass
 class Coefficients:
-    """kappa of each class of strategies in all weights, see `plan.Plan`.
+    """kappa of each class of strategies in all weights, the Python number 0 for classes that are not in use.
 
-    The Python number 0 for classes that are not in use. ``splat_count``: ``splat`` without
-    `Plan.kappa_light`.
+    ``splat_count``: ``splat`` without `Plan.kappa_light`.
     """
 
     hit: mi.Float | mi.Vector4f | int
@@ -64,9 +63,8 @@ class Shared:
 class Observer:
     """Observes the subpaths of a lane during recording, for tools; does nothing.
 
-    See `kernel.trace`. Arguments are Dr.Jit arrays and must not be changed. In recorded loops they have no
-    values yet; disable `SymbolicLoops` and `SymbolicConditionals` to read them. Lanes whose subpath has ended
-    keep the values of their last step, with ``active`` false.
+    See `kernel.trace`. Arguments must not be changed. In recorded loops they have no values yet; disable
+    `SymbolicLoops` and `SymbolicConditionals` to read them.
     """
 
     def emitted(self, emission):
@@ -128,11 +126,9 @@ class Kernel:
         self.sds = PhotonStrategy()  # of a pass
         # Whether photons guide through near-specular events too.
         self.near_specular = bool(prepared.near_specular)
-        # Light groups, which contributions store (`Contribution.light_group`); None without such layers.
+        # What contributions store: light group, path layer, in a pilot the cell of the emission.
         self.light_groups: LightGroups | None = None
-        # Whether they store their path layer (`Contribution.path_layer`).
         self.path_layers = False
-        # Cells of emissions, which contributions store (`Contribution.emission`) in a pilot; else None.
         self.cells: Cells | None = None
 
     def replaced(self, **changes) -> Kernel:
@@ -144,8 +140,7 @@ class Kernel:
     def bound(self, points: Points, count_light: float = 1.0, observer: Observer | None = None) -> Kernel:
         """The kernel for one batch with its ``points``.
 
-        ``count_light``: exact number of light subpaths per camera subpath in the batch, the divisor of
-        estimates of t <= 1 (weights use the nominal number).
+        ``count_light``: exact number of light subpaths per camera subpath; divides estimates of t <= 1.
         """
         count = dr.opaque(mi.Float, count_light)
         return self.replaced(points=points, count_light=count, observer=observer or Observer())

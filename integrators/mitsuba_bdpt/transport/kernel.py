@@ -50,10 +50,7 @@ from .walk import random_walk
 
 @dataclass
 class Lane:
-    """What a lane's camera subpaths share.
-
-    ``emission``, in a pilot: see `Contribution.emission`.
-    """
+    """What a lane's camera subpaths share; ``emission``, in a pilot: see `Contribution.emission`."""
 
     place: Places
     shared: Shared
@@ -95,10 +92,7 @@ def trace(
 
 
 def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
-    """Which camera samples of a batch share a light subpath; none in a pilot.
-
-    Some light subpaths of a pilot have no camera sample.
-    """
+    """Which camera samples of a batch share a light subpath; none in a pilot."""
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
     return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths, points.seed)
@@ -138,10 +132,7 @@ def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path)
 
 
 def _light_subpath(kernel: Kernel, sink, stream, shared, path):
-    """Trace a light subpath: its splats, (1,1) included, and its stored vertices.
-
-    Returns the stored vertices, the counters, and in a pilot the emission.
-    """
+    """Trace a light subpath; returns the stored vertices, the counters, and in a pilot the emission."""
     plan = kernel.plan
     e = subpaths.emission(kernel, stream, shared)
     emitted = kernel.cells and kernel.cells.at(e.index, e.si.p, e.d, e.cos, mi.Bool(True))

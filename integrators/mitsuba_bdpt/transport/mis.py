@@ -88,7 +88,7 @@ def choose(mask: mi.Bool, a: Any, b: Any) -> Any:
 class Heuristic:
     """Combination of alternatives by ``name``: ``balance`` or ``power`` (exponent 2), see `settings`."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: str = "balance"):
         self.name = name
 
     def scale(self, x: PartialSum, factor: PartialSum) -> PartialSum:
@@ -141,11 +141,8 @@ class Heuristic:
             camera_side = self.combine(camera_side, dr.select(exceeds(merges, others), merges, 0))
         return self._weigh(coefficient, light_side, camera_side)
 
-    def _weigh(
-        self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
-    ) -> tuple[mi.Float, mi.Vector4f | None]:
-        # The stubs have wrong types for arithmetic and sums of entries.
-        return self.weight(coefficient, light_side, camera_side), None  # pyright: ignore[reportReturnType]
+    def _weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum) -> tuple:
+        return self.weight(coefficient, light_side, camera_side), None
 
     def weight(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum):
         """Weight in [0, 1] of a strategy with a positive ``coefficient``.
@@ -166,23 +163,18 @@ class ByClass(Heuristic):
     Coefficients are one-hot vectors, which assign every term to its class.
     """
 
-    def __init__(self):
-        super().__init__("balance")
-
     def zero(self) -> mi.Vector4f:
         return mi.Vector4f(0)
 
-    def _weigh(
-        self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum
-    ) -> tuple[mi.Float, mi.Vector4f | None]:
+    def _weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum) -> tuple:
         # The strategy's weight, and the share of each class in the sum of all strategies.
         total = self.combine(self.combine(light_side, camera_side), coefficient)
         shares = total / dr.sum(total)
-        return dr.sum(coefficient) / dr.sum(total), shares  # pyright: ignore[reportReturnType]
+        return dr.sum(coefficient) / dr.sum(total), shares
 
 
 def to_area(
-    heuristic: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float, tr: mi.Float | None = None
+    h: Heuristic, partial: Partial, dist2: mi.Float, cos: mi.Float, tr: mi.Float | None = None
 ) -> Partial:
     """Convert to the area measure at a new vertex (known part of eqs. 31, 32, 34, 35).
 
@@ -190,45 +182,40 @@ def to_area(
     it, and of a parallel sensor; ``cos``: absolute geometric cosine at the new vertex; ``tr``: T~ of the
     edge, None without media.
     """
-    return Partial(
-        d_vcm=heuristic.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr)),
-        d_vc=heuristic.scale(partial.d_vc, dr.rcp(cos)),
-        d_vm=heuristic.scale(partial.d_vm, dr.rcp(cos)),
-        d_vm_newest=heuristic.scale(partial.d_vm_newest, dr.rcp(cos)),
-    )
+    newest = h.scale(partial.d_vcm, dist2 / (cos if tr is None else cos * tr))
+    older = partial.d_vc, partial.d_vm, partial.d_vm_newest
+    return Partial(newest, *(h.scale(x, dr.rcp(cos)) for x in older))
 
 
-def scatter(heuristic: Heuristic, partial: Partial, coefficient: Coefficient, step: Step) -> Partial:
+def scatter(h: Heuristic, partial: Partial, coefficient: Coefficient, step: Step) -> Partial:
     """Fold the newest alternative and sample a direction (eqs. 34, 35; delta: 53, 54).
 
     ``coefficient`` of the newest alternative's class; ``step`` with ``pdf_fwd_w`` and ``pdf_rev_w`` (solid
     angle), ``cos_out`` (geometric) and the mask ``delta``.
     """
-    older = alternatives(heuristic, partial, coefficient, step.pdf_rev_w)
-    newest = dr.select(step.delta, 0.0, heuristic.start(dr.rcp(step.pdf_fwd_w)))
-    return Partial(newest, _folded(heuristic, step, partial.d_vc, older))
+    older = alternatives(h, partial, coefficient, step.pdf_rev_w)
+    newest = dr.select(step.delta, 0.0, h.start(dr.rcp(step.pdf_fwd_w)))
+    return Partial(newest, _folded(h, step, partial.d_vc, older))
 
 
-def _folded(heuristic: Heuristic, step: Step, before: PartialSum, older: PartialSum):
+def _folded(h: Heuristic, step: Step, before: PartialSum, older: PartialSum):
     """A partial sum after an event: ``older`` alternatives; ``before`` the event if that is delta."""
     # A delta event cannot be made by a connection at this vertex (eqs. 53, 54); its probabilities from either
     # side are equal for Mitsuba's BSDFs and left out. So is the ratio of the solid angles on the two sides of
     # a refraction, (eta_l/eta_c)^2 cos_l/cos_c: all strategies leave it out, so that weights sum to 1. They
     # are the balance heuristic's for reflections and where these ratios multiply to 1.
-    passed = heuristic.scale(before, step.cos_out)
-    return choose(step.delta, passed, heuristic.scale(older, step.cos_out / step.pdf_fwd_w))
+    passed = h.scale(before, step.cos_out)
+    return choose(step.delta, passed, h.scale(older, step.cos_out / step.pdf_fwd_w))
 
 
-def scattered_guided(
-    heuristic: Heuristic, partial: Partial, step: Step, guided: PartialSum, isolated: mi.Bool
-) -> PartialSum:
+def scattered_guided(h: Heuristic, partial: Partial, step: Step, guided: PartialSum, isolated: mi.Bool):
     """``d_vm`` after an event on SDS paths: guided s = 0 at earlier vertices, and at this one unless delta.
 
     ``guided``: its partial sum at this vertex; ``isolated``: no edge up to the event is connected by a
     strategy in use.
     """
-    total = heuristic.combine(heuristic.scale(partial.d_vm, step.pdf_rev_w), guided)
-    return dr.select(isolated, _folded(heuristic, step, partial.d_vm, total), 0)
+    total = h.combine(h.scale(partial.d_vm, step.pdf_rev_w), guided)
+    return dr.select(isolated, _folded(h, step, partial.d_vm, total), 0)
 
 
 def exceeds(merges: PartialSum, others: PartialSum):

@@ -1,8 +1,7 @@
 """Path layers: a partition of paths by their events, the same whichever strategy samples a path.
 
 An event is *specular* if a delta lobe was sampled, or if it is near-specular by its densities from both
-sides (`near_specular.is_narrow`), of whatever BSDF and in whatever scene; other events, and those in media,
-are *rough*. Null events, which pass straight on, are none. Of a path with
+sides (`near_specular.is_narrow`); others are *rough*. Null events are none. Of a path with
 
 * no rough event: ``emission`` (an emitter seen directly, in mirrors or through glass);
 * one rough event, and no event between it and the emitter: ``direct``;

@@ -22,10 +22,7 @@ from .walk import Side, Walk, not_finite
 
 @dataclass
 class CameraSample:
-    """A camera sample: start, random numbers, lens sample.
-
-    ``covered``: it exists; ``strip``: index of the sum to which it is added, see `Places.strip`.
-    """
+    """A camera sample; ``covered``: it exists; ``strip``: see `Places.strip`."""
 
     start: CameraStart
     stream: Stream

@@ -45,9 +45,8 @@ class Vacuum:
     def arrive(self, kernel, side, walk, /) -> tuple[mi.SurfaceInteraction3f, mi.Ray3f, mi.Bool, Any, Any]:
         """Follow the edge of a ``walk`` to its end, a surface or a point without normal in a volume.
 
-        Returns the interaction, the last segment's ray, the mask of volumes (without media a literal, so that
-        Dr.Jit leaves out what only media need), the throughput, and the state of the edge (a
-        `media.flight.Edge`), None without media.
+        Returns the interaction, the last segment's ray, the mask of volumes (here a literal, so that Dr.Jit
+        leaves out what only media need), the throughput, and the edge (a `media.flight.Edge`).
         """
         ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
         si = kernel.hits.at(walk.pi, ray, walk.active)

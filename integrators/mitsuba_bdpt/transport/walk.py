@@ -35,8 +35,7 @@ class Walk:
       edge; ``eta``: product of relative indices of refraction (1 if nothing refracts).
     * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
       ``edge``: its state along an edge, None without media.
-    * ``sds``: see `sds.State`, None without a further strategy for SDS paths.
-    * ``layer``: number of its events in `path_layers`, None without such layers.
+    * ``sds``: None without a further strategy for SDS paths; ``layer``: see `path_layers`, None without.
 
     Constants along a subpath are in `Side`: Dr.Jit records a loop twice if its state contains them.
     """
@@ -184,10 +183,7 @@ class Side:
 
 
 def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3f) -> mi.Bool:
-    """Mask: active subpaths that end with a non-finite ``throughput`` or direction.
-
-    Densities from which no weight follows make the throughput NaN (`bsdf._step`, `_vertex`).
-    """
+    """Mask: active subpaths that end with a non-finite ``throughput`` or direction."""
     finite = spectra.is_finite(throughput)
     for direction in directions:
         finite &= dr.isfinite(dr.sum(direction))
@@ -272,37 +268,31 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
         vertex.endpoint_active = target.active
     u1 = points.draw_1d(side.name, side.stream, Purpose.LOBE, walk.event)
     u2 = points.draw_2d(side.name, side.stream, Purpose.BSDF, walk.event)
-    sampled = _is_sampled(kernel, side, walk, vertex)
+    sampled = _is_sampled(kernel, side, vertex)
     step, vertex.f = scattering.sample(kernel, vertex, side.adjoint, u1, u2, sampled, target)
     vertex.advice = side.sds.advise(kernel, side.adjoint, vertex, walk, step)
     return step
 
 
-def _is_sampled(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
-    """Whether to sample at this vertex.
-
-    `path` samples at the last vertex too: alpha is 1 unless that event is null. With media null events are no
-    edges, so that subpaths go on after them; `volpath` has alpha 1 where a medium may scatter again.
-    """
+def _is_sampled(kernel: Kernel, side: Side, vertex: Vertex):
+    """Mask: a direction is sampled at ``vertex``; at the last one as in `path` and `volpath`, for alpha."""
+    # With media null events are no edges, so that subpaths go on after them.
     at_last = ~vertex.volume if side.alpha or kernel.has_media else mi.Bool(False)
-    return vertex.hit & (at_last | (walk.edges < side.last_edge))
+    return vertex.hit & (at_last | (vertex.edges < side.last_edge))
 
 
 def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first: mi.Float) -> Walk:
-    """Take the sampled ``step``, play roulette and trace the next edge.
-
-    ``first``: brightest colour of the throughput of the first edge.
-    """
+    """Take the ``step``, play roulette and trace the next edge; ``first``: size of the first throughput."""
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
     h, si = kernel.heuristic, vertex.si
-    sampled = _is_sampled(kernel, side, walk, vertex)
+    sampled = _is_sampled(kernel, side, vertex)
     # Null events are no edges, with media.
     passes = step.null & sampled if kernel.has_media else mi.Bool(False)
     active = vertex.hit & (walk.edges < side.last_edge) | passes
     coefficient = newest_coefficient(kernel, vertex, side.adjoint)
     partial = mis.scatter(h, vertex.partial, coefficient, step)
-    sds, partial.d_vm, partial.d_vm_newest = _sds(kernel, side, walk, vertex, coefficient, step)
+    sds, partial.d_vm, partial.d_vm_newest = _sds(kernel, side, vertex, coefficient, step)
     partial = mis.choose(passes, walk.partial, partial)
 
     throughput = polarization.extended(vertex.throughput, step.weight, side.adjoint)
@@ -345,8 +335,8 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first
 def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, useful):
     """Russian roulette of a subpath: its throughput, and whether it goes on.
 
-    With probability ``survive``, from ``rr_depth`` on as in `path`, in scenes with media as in `volpath`;
-    ``useful``: times this probability or None, see `PhotonStrategy.survival`. Weights ignore it.
+    With probability ``survive``, from ``rr_depth`` on as in `path`, with media as in `volpath`; ``useful``:
+    times `PhotonStrategy.survival`, or None. Weights ignore it.
     """
     u = kernel.points.draw_1d(side.name, side.stream, Purpose.ROULETTE, walk.event)
     playing = walk.edges > kernel.rr_depth if kernel.has_media else walk.edges >= kernel.rr_depth
@@ -355,15 +345,15 @@ def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Fl
     return dr.select(playing, throughput / survive, throughput), ~playing | (u < survive)
 
 
-def _sds(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, coefficient: mis.Coefficient, step):
+def _sds(kernel: Kernel, side: Side, vertex: Vertex, coefficient: mis.Coefficient, step):
     """`Walk.sds`, and the partial sums ``d_vm`` and ``d_vm_newest``, after the event at ``vertex``.
 
     ``coefficient``: that of the class that connects the edge to it.
     """
-    state, strategy, h = walk.sds, side.sds, kernel.heuristic
-    if strategy.merges:
+    state, h = vertex.sds, kernel.heuristic
+    if side.sds.merges:
         rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
-        ratio = strategy.ratio(vertex.si.p)
+        ratio = side.sds.ratio(vertex.si.p)
         return state, *mis.scattered_merges(h, vertex.partial, step, ratio, rival)
     if state is None:
         return None, 0, 0
