@@ -1160,8 +1160,8 @@ def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
 
 def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
     """Expected: a scene that is complete takes no share, what one leaves goes to the next, and what is left
-    at the end to those that still lack renders, until nothing more fits. Advised is what these need, and a
-    quarter more."""
+    at the end to those that still lack renders, until nothing more fits. The message advises
+    the time that these need, and a quarter more."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
     made = sweep.Sweep(REPOSITORY, read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
     made._todo[1], clock, shares = [], [0.0], []
