@@ -25,7 +25,7 @@ MOST = {
     "": 1552,  # top files
 }
 OUTSIDE = {"scripts": 5055, "tests": 43645}
-MOST_WORDS = 28906
+MOST_WORDS = 28905
 
 
 def _lines(files):
