@@ -15,7 +15,6 @@ import mitsuba as mi
 from .emitters.kinds import third_party_elsewhere
 from .emitters.light_groups import parsed
 from .errors import UnsupportedError, UsageTypeError, did_you_mean
-from .host import tracebacks
 from .image.layers import film_layers
 from .planning.explain import explain
 from .properties import check_variant, integer, read_settings
@@ -97,7 +96,6 @@ class BDPTIntegrator(metaclass=ABCMeta):
     merging goes on from theirs, so that the average converges."""
 
     def __init__(self, props: mi.Properties):
-        tracebacks.install()
         check_variant()
         settings = read_settings(props)
         mi.SamplingIntegrator.__init__(self, props)

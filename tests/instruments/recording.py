@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.geometry import polarization
-from mitsuba_bdpt.host.jit import evaluated_mode, float64, gc_paused
+from mitsuba_bdpt.host.jit import evaluated_mode, gc_paused
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.planning import planner
 from mitsuba_bdpt.run import rendering
@@ -33,6 +33,12 @@ CAPACITY, COLUMNS = 1 << 16, 8
 
 # All of it is kept in single precision, in which whole numbers are exact up to here.
 MOST_LANES = 1 << 24
+
+
+def float64(x) -> np.ndarray:
+    """Convert to double precision, without NumPy warnings for NaN in masked lanes."""
+    with np.errstate(invalid="ignore"):
+        return np.array(x, dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -25,14 +25,13 @@ from mitsuba_bdpt.transport.batch import Batch
 
 import mitsuba as mi  # isort: skip
 
-from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer
 
 from instruments.endpoints import Camera, disks_of, dot, lamps_of, length2
 from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
-from instruments.recording import stepwise
+from instruments.recording import float64, stepwise
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.

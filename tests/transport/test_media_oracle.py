@@ -17,7 +17,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import settings
-from mitsuba_bdpt.host.jit import float64
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import kernel
@@ -101,7 +100,7 @@ class SensorPoints:
 
     @staticmethod
     def _numbers(p):
-        return float64(p + dr.zeros(mi.Point3f, LANES))
+        return recording.float64(p + dr.zeros(mi.Point3f, LANES))
 
     def completed(self, path, lane: int):
         """``path`` with its point on the sensor."""

@@ -22,7 +22,7 @@ from ..host.introspection import (
     inverse_of,
     is_instance,
     matrix_of,
-    registry_index,
+    registry_id,
     shape_groups,
     shapes_in,
 )
@@ -75,10 +75,10 @@ class HitTables:
         names = [about("group", partial(_group_of, instance), instance) for instance in instances]
         if not first_of.keys() >= set(names):
             return None
-        targets = {registry_index(shape): place for place, shape in enumerate(_targets(scene))}
-        rows = {registry_index(shape): row for row, shape in enumerate([*instances, *spheres])}
+        targets = {registry_id(shape): place for place, shape in enumerate(_targets(scene))}
+        rows = {registry_id(shape): row for row, shape in enumerate([*instances, *spheres])}
         places = targets | {index: first_of[name] for index, name in zip(rows, names, strict=False)}
-        sides = {registry_index(s): -1.0 if s.has_flipped_normals() else 1.0 for s in spheres}
+        sides = {registry_id(s): -1.0 if s.has_flipped_normals() else 1.0 for s in spheres}
         indices = range(max(*places, *rows) + 1)
         frames = np.array([about("frame", partial(_frame_of, one), one) for one in [*instances, *spheres]])
         made = HitTables(

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import mitsuba as mi
 
-from ..host.introspection import all_shapes, named, registry_index
+from ..host.introspection import all_shapes, named, registry_id
 from ..host.notices import State, cached, notes
 from .flaws import Flaw
 from .hits import HitTables
@@ -49,7 +49,7 @@ class ShapeFacts:
         Marks have everything that facts depend on; registry indices are part of the key, since facts are
         looked up by them: the cache may belong to another scene, see `notices.notes`.
         """
-        marks = {registry_index(shape): _mark(shape) for shape in all_shapes(scene)}
+        marks = {registry_id(shape): _mark(shape) for shape in all_shapes(scene)}
         before = next(iter(notes(scene, sensor).get("shapes", {}).values()), None)
         return cached(
             scene, sensor, "shapes", tuple(marks.items()), lambda: cls(scene, marks, before), most=1
@@ -63,7 +63,7 @@ class ShapeFacts:
         It must depend on the own parameters of these and on ``state`` alone, of which the latest is cached;
         errors are not.
         """
-        key = kind, *(None if shape is None else registry_index(shape) for shape in shapes)
+        key = kind, *(None if shape is None else registry_id(shape) for shape in shapes)
         known = self._found.get(key)
         if known is None or known[0] != state:
             known = self._found[key] = state, find()

@@ -57,11 +57,6 @@ def shapes_in(group: mi.Shape) -> list[mi.Shape]:
     return [shape for shape in children(group).values() if isinstance(shape, mi.Shape)]
 
 
-def registry_index(shape: mi.Shape) -> int:
-    """Index of a shape in Dr.Jit's registry."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
-
-
 def grouped_shapes(scene: mi.Scene) -> list[mi.Shape]:
     """Return the shapes in the scene's shape groups, which are hit by instances only."""
     if not any(map(is_instance, scene.shapes())):
@@ -190,10 +185,11 @@ def _sides(shape: mi.Shape) -> tuple:
     return shape.interior_medium(), shape.exterior_medium()
 
 
-def registry_id(plugin: mi.Medium | mi.BSDF) -> int:
-    """Index of a medium or BSDF in Dr.Jit's registry."""
-    pointer = mi.MediumPtr(plugin) if isinstance(plugin, mi.Medium) else mi.BSDFPtr(plugin)
-    return int(dr.reinterpret_array(mi.UInt32, pointer)[0])
+def registry_id(plugin: mi.Medium | mi.BSDF | mi.Shape) -> int:
+    """Index of an object in Dr.Jit's registry."""
+    kinds = {mi.Medium: mi.MediumPtr, mi.BSDF: mi.BSDFPtr, mi.Shape: mi.ShapePtr}
+    pointer = next(pointer for kind, pointer in kinds.items() if isinstance(plugin, kind))
+    return int(dr.reinterpret_array(mi.UInt32, pointer(plugin))[0])
 
 
 def versions() -> dict[str, str]:

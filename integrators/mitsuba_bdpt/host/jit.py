@@ -8,7 +8,6 @@ import threading
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .introspection import own_parameters
 
@@ -17,12 +16,6 @@ _GAP = 64
 
 # Numbers of threads before each of the calls that are within `two_threads`.
 _before, _lock = [], threading.Lock()
-
-
-def float64(x) -> np.ndarray:
-    """Convert to double precision, without NumPy warnings for NaN in masked lanes."""
-    with np.errstate(invalid="ignore"):
-        return np.array(x, dtype=np.float64)
 
 
 def registered_emitters() -> list[str]:
