@@ -205,7 +205,7 @@ def test_many_files_of_a_scene(monkeypatch):
         Path(name).write_text("a mesh")
     shapes = "".join(f'<shape type="ply"><string name="filename" value="{name}"/></shape>' for name in names)
     Path("scene.xml").write_text(f'<scene version="3.0.0">{shapes}{shapes}</scene>')
-    state = parsed(Path("scene.xml"), {})[1]
+    state = parsed(Path("scene.xml"), {})
     compared, original = [], PurePath.__eq__
     with searching(Path("scene.xml")), monkeypatch.context() as patch:
         patch.setattr(PurePath, "__eq__", lambda a, b: compared.append(a) or original(a, b))
@@ -227,7 +227,7 @@ def test_encodings_of_a_scene_file(encoding):
     text = f'<?xml version="1.0" encoding="{encoding}"?>\n<scene version="3.0.0"><!-- a -- b -->{{}}</scene>'
     Path("names.xml").write_bytes(text.format(shape).encode(encoding))
     with searching(Path("names.xml")):
-        found = named_files(parsed(Path("names.xml"), {})[1])
+        found = named_files(parsed(Path("names.xml"), {}))
     assert [path.name for path in found] == ["names.xml", name]
     box = SCENE.read_text().partition("<scene")[2].partition(">")[2].rpartition("</scene>")[0]
     Path("box.xml").write_bytes(text.format(box).encode(encoding))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..errors import CommandError
 from ..files.images import attribute
-from ..files.loading import named_files, parsed, searching, spectra
+from ..files.loading import named_files, parsed_anyway, searching, spectra
 from ..files.whole import check_writable, replacing
 from ..host.introspection import versions
 from ..run.snapshot import Snapshot, read
@@ -35,7 +35,7 @@ def digest(options: Namespace) -> str:
     film = [options.size, options.crop] if options.size or options.crop else []
     found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor, *film]).encode())
     with searching(options.scene, options.append):
-        state = parsed(options.scene, dict(options.defines), strict=False)[1]
+        state = parsed_anyway(options.scene, dict(options.defines))
         files = named_files(state)
     for path in files:
         found.update(hashlib.sha256(path.read_bytes()).digest())

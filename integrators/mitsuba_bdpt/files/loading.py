@@ -30,18 +30,13 @@ _ADJOINT = ("prb", "prb_basic", "prb_projective", "prbvolpath")
 DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
 """``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
 
-NOT_CARRIED = {
-    "moment": "second moments, which bdpt does not have (its layers=variance is the variance of each pixel)",
-}
-"""Integrators around another whose layers `bdpt` cannot have."""
-
 CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
 """Parameters of a film's crop window."""
 
 METERS = {"irradiancemeter": "IrradianceMeter", "radiancemeter": "RadianceMeter"}
 """Sensors whose films `--size` and `--crop` leave alone: plugins and classes."""
 
-AROUND = ("aov", "stokes", *NOT_CARRIED)
+AROUND = ("aov", "stokes", "moment")
 """Mitsuba's integrators around another one."""
 
 LISTED = 8
@@ -64,33 +59,30 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
 
 
 def parsed(
-    scene: Path, definitions: Mapping[str, object]
-) -> tuple[mi.parser.ParserConfig, mi.parser.ParserState]:
-    """Parse a ``scene`` file, see `parse_upgraded`; ``definitions``: values of its parameters."""
+    scene: Path, definitions: Mapping[str, object], config: mi.parser.ParserConfig | None = None
+) -> mi.parser.ParserState:
+    """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6.
+
+    ``definitions``: values of the file's parameters.
+    """
+    config = config or mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
+    state = mi.parser.parse_file(config, utf8(scene), **definitions)
+    mi.parser.transform_upgrade(config, state)  # no change when `transform_all` repeats it
+    return state
+
+
+def parsed_anyway(scene: Path, definitions: Mapping[str, object]) -> mi.parser.ParserState:
+    """Like `parsed`, but parameters without value are 1, and unused definitions no error."""
     config = mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
-    return config, parse_upgraded(config, scene, definitions)
-
-
-def parsed_undefined(scene: Path) -> mi.parser.ParserState:
-    """Parse a ``scene`` file whose parameters without value are 1."""
-    definitions: dict[str, str] = {}
+    config.unused_parameters = mi.LogLevel.Debug
     while True:
         try:
-            return parsed(scene, definitions)[1]
+            return parsed(scene, definitions, config)
         except RuntimeError as error:
             missing = re.search(r"undefined parameter: \$(\w+)", str(error))
             if missing is None:
                 raise
-            definitions[missing[1]] = "1"
-
-
-def parse_upgraded(
-    config: mi.parser.ParserConfig, scene: Path, definitions: Mapping[str, object]
-) -> mi.parser.ParserState:
-    """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6."""
-    state = mi.parser.parse_file(config, utf8(scene), **definitions)
-    mi.parser.transform_upgrade(config, state)  # no change when `transform_all` repeats it
-    return state
+            definitions = {**definitions, missing[1]: "1"}
 
 
 def named_files(state: mi.parser.ParserState) -> list[Path]:
@@ -120,8 +112,8 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
         return definitions
 
     def sizes(definitions: dict) -> list[tuple]:
-        state = parsed(scene, definitions)[1]
-        return [(film.props.get("width"), film.props.get("height")) for film in _films(state)]
+        films = _films(parsed(scene, definitions))
+        return [(film.props.get("width"), film.props.get("height")) for film in films]
 
     others = {name: value for name, value in definitions.items() if name != "resolution"}
     try:
@@ -195,9 +187,9 @@ def _load(options: Namespace, merges: bool) -> Loaded:
     if options.time is not None:
         overrides["timeout"] = options.time
     asked = None if options.integrator == SCENES_OWN else options.integrator
-    defines = in_proportion(options.scene, dict(options.defines))
-    config, state = parsed(options.scene, defines)
+    config = mi.parser.ParserConfig(mi.variant())
     config.merge_meshes = merges
+    state = parsed(options.scene, in_proportion(options.scene, dict(options.defines)), config)
     _check_root(state, options.scene)
     _check_film_sizes(state)
     for film in _films_of_images(state):
@@ -378,11 +370,12 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
     """
     aovs, carried, prefix = [], {}, ""
     while (kind := node.props.plugin_name()) in AROUND:
-        if kind in NOT_CARRIED:
+        if kind == "moment":
             raise CommandError(
-                f"integrator=bdpt cannot replace the scene's integrator {kind}, which is around another and "
-                f"adds {NOT_CARRIED[kind]}; {_own_instead(nodes, node)}write the inner integrator alone into "
-                "the file."
+                "integrator=bdpt cannot replace the scene's integrator moment, which is around another and "
+                "adds second moments, which bdpt does not have (its layers=variance is the variance of each "
+                f"pixel); render with the scene file's own by --integrator {SCENES_OWN}, or write the inner "
+                "integrator alone into the file."
             )
         if kind == "stokes":
             if not mi.is_polarized:
@@ -402,14 +395,6 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
         if "layers" in carried:
             carried["layers"] = _added(node.props.get("layers", ""), carried["layers"])
     return node.props, carried | ({"aovs": ",".join(aovs)} if aovs else {})
-
-
-def _own_instead(nodes: Sequence, node) -> str:
-    """Return the advice to render with ``node``, empty if it is around `bdpt`, which it cannot render."""
-    while node.props.plugin_name() in AROUND:
-        node = _nested(nodes, node)[1]
-    own = f"render with the scene file's own by --integrator {SCENES_OWN}, or "
-    return "" if node.props.plugin_name() == "bdpt" else own
 
 
 def _nested(nodes: Sequence, node) -> tuple[str, object]:

@@ -18,8 +18,8 @@ from ..errors import CommandError, message
 from ..files.loading import (
     choose_sensor,
     named_files,
-    parse_upgraded,
-    parsed_undefined,
+    parsed,
+    parsed_anyway,
     searching,
     spectra,
     unless_incompatible,
@@ -128,7 +128,7 @@ class SceneFile(MeasuredScene):
     @property
     def sha256(self) -> str:
         with searching(self.file):
-            state = parsed_undefined(self.file)
+            state = parsed_anyway(self.file, {})
             content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
         return hashlib.sha256(b"".join(content)).hexdigest()
 
@@ -137,7 +137,7 @@ class SceneFile(MeasuredScene):
             return super()._instantiated(definitions, sampler, merges)
 
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        return parse_upgraded(config, self.file, definitions)
+        return parsed(self.file, definitions, config)
 
 
 class DictionaryScene(MeasuredScene):
