@@ -25,7 +25,7 @@ MOST = {
     "": 1550,  # top files
 }
 OUTSIDE = {"scripts": 5055, "tests": 43574}
-MOST_WORDS = 28880
+MOST_WORDS = 28878
 
 
 def _lines(files):
