@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError
-from ..files.images import check_output, developed, grey, has_channels, write_whole
+from ..files.images import check_output, developed, grey, header_of, write_whole
 from ..files.loading import set_variant
 from ..files.mixing import described, mix
 from ..image.layers import DENOISED
@@ -54,7 +54,7 @@ def _run(options: Namespace) -> int:
     has_bands = mixed.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel
     png = developed(grey(np.array(mixed)) if has_bands else mixed, options.exposure)
     write_whole(png, output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
-    if has_channels(options.image, DENOISED):
+    if set(DENOISED) <= {channel.name for channel in header_of(options.image)["channels"]}:
         print(
             "note: the layers are not denoised, so that the mix has the noise of the render", file=sys.stderr
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +25,13 @@ MOST_CHANNELS = 1023
 
 
 def check_channels(film: mi.Film, layers: list[str]) -> None:
-    """Raise ``CommandError``, before the render, if a file cannot hold the ``layers``.
-
-    ``layers``: names of channels.
-    """
-    if len(layers) + film.base_channels_count() > MOST_CHANNELS // 2:
-        count = film.prepare(layers)
-        if count > MOST_CHANNELS:
-            raise CommandError(
-                f"the image has {count} channels, {len(layers)} of them layers, and Mitsuba's images hold "
-                f"{MOST_CHANNELS} at most; ask for fewer layers: of strategies, by a smaller max_depth."
-            )
+    """Raise ``CommandError``, before the render, if a file cannot hold the ``layers`` (names of channels)."""
+    is_large = len(layers) + film.base_channels_count() > MOST_CHANNELS // 2
+    if is_large and (count := film.prepare(layers)) > MOST_CHANNELS:
+        raise CommandError(
+            f"the image has {count} channels, {len(layers)} of them layers, and Mitsuba's images hold "
+            f"{MOST_CHANNELS} at most; ask for fewer layers: of strategies, by a smaller max_depth."
+        )
 
 
 def check_png(film: mi.Film) -> None:
@@ -54,21 +50,14 @@ STATISTICS = "bdptStatistics"
 
 def attribute(path: Path, name: str) -> str | None:
     """Return a text of an EXR header; None if it is missing, or the file is no EXR."""
-    found = _header(path).get(name)
+    found = header_of(path).get(name)
     return found if isinstance(found, str) else None
 
 
-def has_channels(path: Path, names: Iterable[str]) -> bool:
-    """Return whether the file is an EXR with all of these channels."""
-    return set(names) <= {channel.name for channel in _header(path).get("channels", [])}
-
-
-def _header(path: Path) -> dict[str, Any]:
+def header_of(path: Path) -> dict[str, Any]:
     """Return the header of an EXR; empty for other files."""
-    if not path.is_file():
-        return {}
     try:
-        return OpenEXR.File(utf8(path), header_only=True).header()
+        return OpenEXR.File(utf8(path), header_only=True).header() if path.is_file() else {}
     except (OSError, RuntimeError, ValueError):
         return {}
 
@@ -129,16 +118,13 @@ def screen_image(film: mi.Film, bitmap: mi.Bitmap) -> mi.Bitmap:
         return grey(np.array(bitmap)[..., : film.base_channels_count()])
     if bitmap.pixel_format() == mi.Bitmap.PixelFormat.MultiChannel:
         parts = dict(bitmap.split())
-        is_denoised = all(name in {c.name for c in bitmap.struct_()} for name in DENOISED)
-        return parts["denoised"] if is_denoised else parts["<root>"]
+        is_denoised = set(DENOISED) <= {channel.name for channel in bitmap.struct_()}
+        return parts["denoised" if is_denoised else "<root>"]
     return bitmap
 
 
 def grey(bands: np.ndarray) -> mi.Bitmap:
-    """Return a grey image, the mean of `bands`, of a film without colours.
-
-    Units of bands are arbitrary; the exposure makes 1 % of the pixels white.
-    """
+    """Return the mean of a film's ``bands``, of arbitrary units: 1 % of the pixels are white."""
     mean = np.mean(bands, axis=-1, dtype=np.float32, keepdims=True)
     return mi.Bitmap(mean / max(np.quantile(mean, 0.99), 1e-30), mi.Bitmap.PixelFormat.Y)
 
@@ -163,10 +149,10 @@ def write_whole(bitmap: mi.Bitmap, path: Path, file_format: mi.Bitmap.FileFormat
 
 
 def check_output(path: Path, suffix: str) -> None:
-    """Create the folder of an output; raise an error now if the output cannot be written.
+    """Create the folder of an output; raises ``CommandError`` if it cannot be written.
 
-    That is an output of another ``suffix``, not writable, or one that would overwrite an image of another
-    format (the EXR, or the PNG beside it).
+    Also for another ``suffix``, or if it would overwrite an image of another format (the EXR, or the PNG
+    beside it).
     """
     is_exr = suffix == ".exr"
     if path.suffix.lower() != suffix:

@@ -42,7 +42,7 @@ def ensure_two_threads() -> int:
 
 @contextlib.contextmanager
 def two_threads():
-    """Within, Dr.Jit has at least two threads, also if the user has set one, until the last caller leaves."""
+    """Within, Dr.Jit has at least two threads, until the last caller leaves."""
     with _lock:
         _before.append(ensure_two_threads())
     try:

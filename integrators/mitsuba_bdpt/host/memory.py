@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,8 +36,7 @@ def set_limit(most: float | None) -> None:
 def available() -> Available:
     """Return the smallest of all limits; infinite if none is known.
 
-    ``ulimit -v`` and ``-d`` are reduced by the memory in use; limits of the machine and of control groups
-    (containers, batch slots) are not.
+    ``ulimit -v`` and ``-d`` are reduced by the memory in use; other limits are not.
     """
     return min(_limits(), key=lambda found: found.bytes, default=Available(math.inf, "nothing"))
 
@@ -48,8 +48,8 @@ def peak() -> int | None:
     """
     if sys.platform == "win32":
         return None
-    if found := _status("VmHWM"):
-        return found["VmHWM"]
+    if found := _status().get("VmHWM"):
+        return found
     import resource
 
     found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -92,21 +92,16 @@ def _own_limits() -> Iterator[Available]:
         return
     import resource
 
-    taken = _status("VmSize", "VmData")
-    for kind, name, option in (
-        (resource.RLIMIT_AS, "VmSize", "-v"),
-        (resource.RLIMIT_DATA, "VmData", "-d"),
-    ):
+    taken = _status()
+    limits = (resource.RLIMIT_AS, "VmSize", "-v"), (resource.RLIMIT_DATA, "VmData", "-d")
+    for kind, name, option in limits:
         most = resource.getrlimit(kind)[0]
         if most != resource.RLIM_INFINITY:
             yield Available(max(most - taken.get(name, 0), 0), f"the process's limit, ulimit {option}")
 
 
-def _status(*names: str) -> dict[str, int]:
-    """Fields ``names`` of ``/proc/self/status`` in bytes; empty if not on Linux."""
-    file, found = ROOT / "proc/self/status", {}
-    for line in file.read_text().splitlines() if file.is_file() else []:
-        name, _, value = line.partition(":")
-        if name in names:
-            found[name] = 1024 * int(value.split()[0])
-    return found
+def _status() -> dict[str, int]:
+    """Memory fields of ``/proc/self/status`` in bytes; empty if not on Linux."""
+    file = ROOT / "proc/self/status"
+    fields = re.findall(r"(\w+):\s*(\d+) kB", file.read_text()) if file.is_file() else []
+    return {name: 1024 * int(value) for name, value in fields}
