@@ -232,8 +232,7 @@ def _load(options: Namespace, merges: bool) -> Loaded:
 def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: str | None) -> str:
     """Describe which integrator is ``used``, and what it replaces.
 
-    ``own``: the scene file's; ``kept``: its parameters that the new one takes over; ``asked``: value of
-    ``--integrator``, None for the file's own.
+    ``own``: the scene file's, of which ``kept`` are parameters; ``asked``: as in `_load`.
     """
     if own is None:
         return f"{used} (the scene file has no integrator)"
@@ -338,9 +337,7 @@ def check_file(scene: Path) -> None:
 def replace_integrator(
     nodes: Sequence, node, kind: str | None, overrides: Mapping[str, bool | int | float | str]
 ) -> dict[str, object]:
-    """Set the ``kind`` of the integrator ``node``, if given, and ``overrides``.
-
-    Returns the parameters of the replaced integrator that are kept.
+    """Set the ``kind`` of the integrator ``node``, if given, and ``overrides``; returns what is kept.
 
     `bdpt` replaces integrators around another (`AROUND`) as a whole, since it has their layers; others
     replace the innermost integrator. Raises ``CommandError`` for layers that cannot be kept.
@@ -364,10 +361,7 @@ def _added(layers: str, more: str) -> str:
 
 
 def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
-    """Return the innermost properties, and what `bdpt` takes from outer integrators.
-
-    The latter are layers, named as in Mitsuba's film, and the outermost ``timeout``, which applies there.
-    """
+    """Return the innermost properties, and the layers and ``timeout`` that `bdpt` takes from outer ones."""
     aovs, carried, prefix = [], {}, ""
     while (kind := node.props.plugin_name()) in AROUND:
         if kind == "moment":

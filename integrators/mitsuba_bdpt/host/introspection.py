@@ -81,10 +81,9 @@ def own_parameters(owner) -> dict:
 
 
 def _value(value, cpptype, owner):
-    """Return the parameter's value, read as ``mi.traverse`` does.
+    """Return a parameter's value; raises ``UnsupportedError`` for an animated transformation.
 
-    Python plugins put the value itself, C++ plugins a pointer to a value of type ``cpptype``. Raises
-    ``UnsupportedError`` for an animated transformation.
+    Python plugins put the value itself, C++ plugins a pointer to a value of type ``cpptype``.
     """
     if renamed.is_transform(value):
         return renamed.transform(value, _called(owner))
@@ -147,8 +146,7 @@ def _entries(matrix) -> np.ndarray:
 def _collector(variant: str):
     """Return the class that collects parameters, one per variant.
 
-    A class per call would be cyclic garbage that keeps emitters alive beyond their scene, and the next
-    virtual call of any scene would crash.
+    One per call would be cyclic garbage that keeps emitters alive beyond their scene; virtual calls crash.
     """
 
     class Collector(mi.TraversalCallback):

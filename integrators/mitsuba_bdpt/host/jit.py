@@ -32,7 +32,7 @@ def registered_emitters() -> list[str]:
 def ensure_two_threads() -> int:
     """Give Dr.Jit a second thread if it has one only; returns the number before.
 
-    Mitsuba's reader and writer of EXR files wait for another thread than the caller's, for ever with one.
+    With one, Mitsuba's reader and writer of EXR files wait for ever.
     """
     before = dr.thread_count()
     if before < 2:
@@ -66,11 +66,7 @@ def evaluated_mode(on=True):
 
 @contextlib.contextmanager
 def gc_paused():
-    """Pause Python's cycle collector.
-
-    If it frees a scene while a kernel is recorded, calls of the scene's objects stay in the kernel and
-    Dr.Jit aborts the process ("invalid redefinition of function").
-    """
+    """Pause Python's cycle collector: if it frees a scene while a kernel is recorded, Dr.Jit aborts."""
     enabled = gc.isenabled()
     gc.disable()
     try:

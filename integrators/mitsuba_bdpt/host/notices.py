@@ -1,8 +1,4 @@
-"""State cached with a scene between renders, and fingerprints of parameters that detect edits.
-
-Warnings already logged, facts about shapes, and results of pilots and estimates of unsampled light
-transport.
-"""
+"""State cached with a scene between renders, and fingerprints of parameters that detect edits."""
 
 from __future__ import annotations
 
@@ -70,10 +66,7 @@ def cached(
     find: Callable[[], Found],
     most: int = FINDINGS,
 ) -> tuple[Found, bool]:
-    """Return the cached or computed result of ``find()``, and whether it was cached.
-
-    Caches the latest ``most`` results of each ``kind``.
-    """
+    """Return the result of ``find()``, and whether it was among the latest ``most`` cached of a ``kind``."""
     known = notes(scene, sensor).setdefault(kind, {})
     is_known, found = key in known, known.pop(key, None)
     known[key] = found = found if is_known else find()
@@ -103,7 +96,7 @@ class State:
     """Fingerprint of the parameters of Mitsuba's objects; equal if nothing was edited.
 
     ``marks``: JIT indices of small arrays, checksums of larger arrays, text of all other values. ``kept``:
-    the arrays known by index, kept alive so that Dr.Jit does not reuse the index.
+    the small arrays, so that Dr.Jit does not reuse their indices.
     """
 
     marks: tuple[Any, ...]

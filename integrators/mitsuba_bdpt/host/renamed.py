@@ -1,9 +1,7 @@
 """Names that differ between Mitsuba 3.9 and 3.10: meshes, hits and ``to_world``.
 
-All version differences are handled here. (Tested with 3.9; names of 3.10, in development, are from its
-release notes and its branch ``motion_blur``, and tested with parameters of that form.)
-
-``to_world`` is a transformation in 3.9, and an ``AnimatedTransform4f`` with key frames in 3.10.
+``to_world`` is a transformation in 3.9, and an ``AnimatedTransform4f`` with key frames in 3.10. Names of
+3.10, in development, are from its release notes and its branch ``motion_blur``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Signals that end the command at once while it imports and loads, when there is nothing to be written.
+"""Signals that end the command at once while it imports and loads.
 
-A handler of Python runs after a call of Mitsuba only, and its exception breaks imports; a thread waits for
-neither.
+By a thread: handlers of Python run after a call of Mitsuba only, and their exceptions break imports.
 """
 
 from __future__ import annotations
