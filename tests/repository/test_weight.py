@@ -17,10 +17,10 @@ MOST = {
     "media": 1349,
     "geometry": 1659,
     "image": 1508,
-    "files": 970,
+    "files": 950,
     "run": 1234,
     "scene sampling": 777,
-    "host": 948,
+    "host": 927,
     "sensors": 939,
     "": 1550,  # top files
 }
