@@ -372,11 +372,6 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
                 "integrator alone into the file."
             )
         if kind == "stokes":
-            if not mi.is_polarized:
-                raise CommandError(
-                    f"the scene's integrator stokes needs a polarized variant, not {mi.variant()}; use for "
-                    "example -m llvm_ad_spectral_polarized."
-                )
             carried["layers"] = "stokes"
         else:
             aovs += [prefix + pair for pair in features.pairs(node.props.get("aovs", ""))]
@@ -393,9 +388,8 @@ def _layers(nodes: Sequence, node) -> tuple[mi.Properties, dict]:
 
 def _nested(nodes: Sequence, node) -> tuple[str, object]:
     """Return name and node of the single integrator nested in ``node``."""
-    held = {key: node.props[key] for key in node.props.keys()}
-    held = {key: value for key, value in held.items() if isinstance(value, mi.Properties.ResolvedReference)}
-    found = [(key, nodes[reference.index()]) for key, reference in held.items()]
+    held = [(key, node.props[key]) for key in node.props.keys()]
+    found = [(key, nodes[v.index()]) for key, v in held if isinstance(v, mi.Properties.ResolvedReference)]
     found = [(key, inner) for key, inner in found if inner.type == mi.ObjectType.Integrator]
     if len(found) != 1:
         names = ", ".join(f"{key!r} ({inner.props.plugin_name()})" for key, inner in found)
@@ -416,14 +410,11 @@ def integrator_properties(
     else:
         properties = mi.Properties(kind)
         properties.set_id(given.id())
-        if given.plugin_name() in DEPTHS:
-            properties["max_depth"] = DEPTHS[given.plugin_name()]
-            properties.mark_queried("max_depth")
-        for key in KEPT:
-            if key in given:
-                properties[key] = given[key]
-                # Not every integrator has all of them, which is no error.
-                properties.mark_queried(key)
+        depth = {"max_depth": DEPTHS.get(given.plugin_name())}
+        for key, value in (depth | {key: given[key] for key in KEPT if key in given}).items():
+            if value is not None:
+                properties[key] = value
+                properties.mark_queried(key)  # not every integrator has all of them, which is no error
     for key, value in overrides.items():
         properties[key] = value
     return properties
