@@ -17,7 +17,7 @@ MOST = {
     "media": 1349,
     "geometry": 1659,
     "image": 1508,
-    "files": 950,
+    "files": 941,
     "run": 1234,
     "scene sampling": 777,
     "host": 927,
