@@ -1688,7 +1688,7 @@ MUTANTS = (
     Mutant(
         "guided emission: points on the details' disk have the density of another cell",
         "emitters/disks.py",
-        "density = dr.select(aimed, guided.density(p), density)",
+        "density = dr.select(aimed, density_at(p), density)",
         "pass",
         ("tests/guided_emission/test_emission_tables.py::test_details_beside_tables[middle-130-False]",),
     ),

@@ -467,7 +467,7 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
     emitters = Emitters(mi.load_dict({"type": "scene", "dome": dome}))
     (group,) = emitters.groups
     assert mitsubas_choices.is_sampled_by_texture(emitters.scene.emitters()[0])
-    assert group._textured.mask.all
+    assert group._surfaces.textured.mask.all
 
 
 @pytest.mark.parametrize("emitter", [None, "timed_sunsky", "own_area"])

@@ -17,16 +17,16 @@ from ..geometry.mitsubas_choices import (
     is_sampled_by_texture,
     is_textured,
 )
-from ..geometry.quadrics import cone_pdf_w, is_small, may_light_itself
+from ..geometry.quadrics import Sphere, cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import LEAVES, children, named, number, own_parameters
 from ..host.notices import State
 from .group import Context, Group, HitOnlyEmitters, weight_over
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
-from .surfaces import Surfaces, spheres_of
+from .surfaces import Surfaces
 from .tables import Mask, look_up, rows, table
-from .textured import TexturedPoints, is_mapped
+from .textured import is_mapped
 
 _CURVES = {mi.ShapeType.BSplineCurve.value, mi.ShapeType.LinearCurve.value}
 _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.value}
@@ -45,15 +45,11 @@ class _Sphere:
     cone_radius: mi.Float | float = 0.0
 
     @staticmethod
-    def of(emitter, sphere, extent) -> _Sphere:
+    def of(emitter, sphere: Sphere | None, extent: float) -> _Sphere:
         """Parameters of an emitter in a scene of diameter ``extent``."""
         if sphere is None or is_textured(emitter):  # a texture is sampled from every position
             return _Sphere()
-        return _Sphere(
-            center=sphere.center,
-            inner_radius=sphere.inner_radius,
-            cone_radius=sphere.radius if is_small(sphere, extent) else 0.0,
-        )
+        return _Sphere(sphere.center, sphere.inner_radius, sphere.radius if is_small(sphere, extent) else 0.0)
 
 
 # Share of a curved light's directions sampled by the cosine where emission is guided.
@@ -78,8 +74,7 @@ class _Table:
     flat: mi.Float | float = 0.0
 
     @staticmethod
-    def of(emitter) -> _Table:
-        shape = emitter.get_shape()
+    def of(shape: mi.Shape) -> _Table:
         if not is_flat(shape):
             return _Table()
         frame = mi.Frame3f(mi.Vector3f(shape.sample_position(0, mi.Point2f(0.5)).n))
@@ -120,8 +115,6 @@ class AreaEmitters(Group):
     spheres and for textured lights whose points are sampled here.
     """
 
-    hittable = guidable = True
-
     @classmethod
     def of(cls, emitter) -> type[Group]:
         return cls if _samples_points(emitter) else HitOnlyEmitters
@@ -132,21 +125,17 @@ class AreaEmitters(Group):
 
     def __init__(self, emitters, context: Context, checks: bool = True):
         """See `Group`; ``checks`` the densities of points where Mitsuba's choices are replicated."""
-        self._emitters = emitters
-        spheres = spheres_of(emitters, context)
-        pairs = list(zip(emitters, spheres, strict=True))
+        self._emitters, self._facts = emitters, context.facts
         how = rows(emitters, None, lambda e: _Sampled.of(e, context.by_shapes))
-        mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
-        by_shape = rows(how, None, lambda h: h is _Sampled.BY_SHAPE)
         self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
         self.redraws = rows(how, False, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE))
         self._redrawn = Mask([e and r for e, r in zip(emitters, self.redraws, strict=True)])
-        self._textured = TexturedPoints(emitters, spheres, mapped, context.facts)
+        mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
+        self._surfaces = Surfaces(emitters, context, self.redraws, mapped)
+        pairs = list(zip(emitters, self._surfaces.spheres, strict=True))
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
-        self._surfaces = Surfaces(emitters, context, spheres, by_shape, self._textured)
-        self._facts = context.facts
         extent = 2 * scene_box(context.scene, context.facts.about).bounding_sphere().radius
-        found = [_Sphere() if e is None else _Sphere.of(e, s, extent) for e, s in pairs]
+        found = [_Sphere.of(e, s, extent) for e, s in pairs]
         self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
         self._seen_through = any(
             sphere.inner_radius > 0 and mi.has_flag(e.get_shape().bsdf().flags(), mi.BSDFFlags.Null)
@@ -183,11 +172,12 @@ class AreaEmitters(Group):
 
     def _own_pdf_a(self, index, uv, active):
         """`pdf_a` of a light whose texture Mitsuba does not sample."""
+        textured = self._surfaces.textured
         density = dr.gather(mi.Float, self._surfaces.inv_area, index, active)
-        if not self._textured.mask.any:
+        if not textured.mask.any:
             return density
-        mapped = self._textured.mask.at(index, active)
-        return dr.select(mapped, self._textured.pdf_a(index, uv, mapped), density)
+        mapped = textured.mask.at(index, active)
+        return dr.select(mapped, textured.pdf_a(index, uv, mapped), density)
 
     def direct_pdf_w(self, emitter, index, it, ds, active):
         """Density (solid angle) with which next-event estimation at ``it`` samples ``ds``.
@@ -238,7 +228,8 @@ class AreaEmitters(Group):
         return other
 
     def _directions(self, emitter) -> _Table:
-        return self._facts.about("directions", partial(_Table.of, emitter), emitter.get_shape())
+        shape = emitter.get_shape()
+        return self._facts.about("directions", partial(_Table.of, shape), shape)
 
     def place(self, index, p, d, active) -> Place:
         known = look_up(self._tables, index, active)
@@ -304,9 +295,6 @@ class AreaEmitters(Group):
             cos=cos,
             pdf_first=pdf_a,
             pdf_second=pdf_w,
-            infinite=mi.Bool(False),
-            delta=mi.Bool(False),
-            beam=mi.Bool(False),
             index=chosen.index,
             si=si,
         )
@@ -347,8 +335,6 @@ class AreaEmitters(Group):
             pdf_w=pdf_w,
             d=ds.d,
             anchor=self._surfaces.anchor(chosen, ds.p, n, active),
-            infinite=mi.Bool(False),
-            delta=mi.Bool(False),
             emission_ratio=emitted / (pdf_w * cos),
         )
 

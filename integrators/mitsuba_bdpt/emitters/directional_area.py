@@ -8,7 +8,7 @@ import mitsuba as mi
 from ..host.introspection import children
 from .group import Context, Group
 from .records import Chosen, Emission
-from .surfaces import Surfaces, spheres_of
+from .surfaces import Surfaces
 
 
 class DirectionalAreaEmitters(Group):
@@ -18,11 +18,10 @@ class DirectionalAreaEmitters(Group):
     reaches y_0.
     """
 
-    supports_next_event = connectible_to_sensor = False
     limits = "its light leaves in one direction only"
 
     def __init__(self, emitters, context: Context):
-        self._surfaces = Surfaces(emitters, context, spheres_of(emitters, context))
+        self._surfaces = Surfaces(emitters, context)
         # Only the texture gives the radiance.
         self._radiances = [(i, children(e)["radiance"]) for i, e in enumerate(emitters) if e is not None]
 
@@ -42,7 +41,6 @@ class DirectionalAreaEmitters(Group):
             cos=dr.abs(dr.dot(n, d)),
             pdf_first=ps.pdf,
             pdf_second=mi.Float(1),
-            infinite=mi.Bool(False),
             delta=mi.Bool(True),
             beam=mi.Bool(True),
             index=chosen.index,

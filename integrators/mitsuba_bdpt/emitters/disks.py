@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -70,19 +69,6 @@ class BoundingSphere:
         return axis, width
 
 
-@dataclass
-class Guided:
-    """Guides the start of subpaths on a scene's disk.
-
-    ``share`` of the subpaths aimed at details; ``warp`` maps uniform numbers to guided ones and their
-    density; ``density`` returns that of a point.
-    """
-
-    share: mi.Float
-    warp: Callable[[Any], Any]
-    density: Callable[[Any], Any]
-
-
 class Disks:
     """Disks of a scene: outlines of ``scene`` and ``details``.
 
@@ -109,10 +95,13 @@ class Disks:
             return 0.0
         return AIMED if dr.slice(self.details.radius) * side < dr.slice(self.scene.radius) else 0.0
 
-    def start(self, d, u, guided: Guided | None = None):
-        """Sample a subpath's start along ``d`` and its density (area across ``d``)."""
+    def start(self, d, u, share=AIMED, warp: Callable | None = None, density_at: Callable | None = None):
+        """Sample a subpath's start along ``d`` and its density (area across ``d``).
+
+        ``share`` of the subpaths is aimed at details. A guide's ``warp`` maps uniform numbers to guided ones
+        and their density, ``density_at`` returns that of a point.
+        """
         center, radius, aimed = self.scene.center, self.scene.radius, None
-        share = AIMED if guided is None else guided.share
         if self.details is not None:
             aimed = u.x < share
             u = mi.Point2f(dr.select(aimed, u.x / share, (u.x - share) / (1 - share)), u.y)
@@ -120,15 +109,15 @@ class Disks:
             center = dr.select(aimed, self.details.center - along * d, center)
             radius = dr.select(aimed, self.details.radius, radius)
         frame, density = mi.Frame3f(d), None
-        if guided is not None:
+        if warp is not None:
             frame = _frame(d)
-            warped, density = guided.warp(u)
+            warped, density = warp(u)
             u = warped if aimed is None else dr.select(aimed, u, warped)
         disk = mi.warp.square_to_uniform_disk_concentric(u)
         p = center + radius * (frame.s * disk.x + frame.t * disk.y) - self.scene.radius * d
-        if guided is not None and aimed is not None:
-            density = dr.select(aimed, guided.density(p), density)
-        return p, self._pdf_a(p, d, aimed, density, share)
+        if density_at is not None and aimed is not None:
+            density = dr.select(aimed, density_at(p), density)
+        return p, self.pdf_a(p, d, density, share, aimed)
 
     def place(self, p, d):
         """Primary numbers of a subpath along ``d`` that passes ``p``, on the scene's disk."""
@@ -136,15 +125,12 @@ class Disks:
         disk = mi.Point2f(dr.dot(frame.s, offset), dr.dot(frame.t, offset))
         return mi.warp.uniform_disk_to_square_concentric(disk)
 
-    def pdf_a(self, p, d, density=None, share=AIMED):
+    def pdf_a(self, p, d, density=None, share=AIMED, aimed=None):
         """Density (area across ``d``) with which a subpath along ``d`` passes ``p``.
 
         Without details ``p`` must be a point of the scene, else it may be anywhere. ``density`` on the
-        scene's disk relative to uniform; ``share`` of the details' disk.
+        scene's disk relative to uniform; ``share`` of the details' disk; ``aimed``: mask of samples of it.
         """
-        return self._pdf_a(p, d, None, density, share)
-
-    def _pdf_a(self, p, d, aimed, density, share):
         scene = self.scene.pdf_a()
         if density is not None:
             scene = scene * density

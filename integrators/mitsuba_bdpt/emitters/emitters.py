@@ -6,7 +6,7 @@ See the subpackage's docstring for densities, `group.Group` for the methods of a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property, partial
 from typing import Any
@@ -39,14 +39,14 @@ class Emitters:
     * ``hittable``, ``unhittable``: camera subpaths can hit one; cannot hit one.
     * ``direct``, ``traced``: next-event estimation, light subpaths can choose one.
     * ``connectible_to_sensor``: y_0 of one can be connected to a sensor; ``connectible_nearby``: of one that
-      is not at infinity; ``unhittable_connectible``: indices of those that cannot be hit;
-      ``finite_hittable``: one can be hit and connected, and is not at infinity.
+      is not at infinity; ``unhittable_connectible``, ``finite_hittable``: of one that cannot be hit; that
+      can be hit and is not at infinity.
     * ``on_shapes``: one is on a shape; ``at_infinity``: light subpaths can start at infinity; ``beams``: only
       its own light subpaths reach one; ``black``: none of them emits light.
     * ``evaluated``: an emitter in the process, even of another scene, requires evaluated loops and calls.
     * ``left_out``: strategies that single emitters lack, with reasons.
     * ``groups`` of the scene; ``disks``: where light subpaths from infinity start, or None; ``shape_errors``.
-    * ``tables``: squares of primary numbers of each emitter, see `place`; ``has_places``: it has `place`.
+    * ``tables``: squares of primary numbers of each emitter, see `place`.
     * ``indexed``: samples of next-event estimation have the index of their emitter.
     """
 
@@ -61,7 +61,7 @@ class Emitters:
         self._summarize(emitters, types)
         # It evaluates a mask, which cannot be recorded.
         self.evaluated = "TimedSunskyEmitter" in registered
-        self.groups, self.disks, self.has_places, self.indexed = (), None, False, False
+        self.groups, self.disks, self.indexed = (), None, False
         if not emitters:
             return
         _make_opaque(emitters, facts)
@@ -78,8 +78,6 @@ class Emitters:
         )
         self._of_groups = [[i for i, t in enumerate(types) if t is group] for group in present]
         self._group = mi.UInt32([present.index(t) for t in types])
-        self._starts = Mask([t.supports_emission for t in types])
-        self._lights = Mask([t.supports_next_event for t in types])
         redrawn = [group.redraws for group in self.groups if group.redraws]
         self._drawn_by_mitsuba = Mask([not any(of[i] for of in redrawn) for i in range(self.count)])
         self.disks = next((group.disks for group in self.groups if group.at_infinity), None)
@@ -87,29 +85,26 @@ class Emitters:
 
     def _summarize(self, emitters, types):
         """Set the properties that depend on all emitters; ``types``: their groups."""
-        hittable = [t.is_hittable(e) for e, t in zip(emitters, types, strict=True)]
+        pairs = list(zip(emitters, types, strict=True))
+        hittable = [t.is_hittable(e) for e, t in pairs]
+        connectible = [hasattr(t, "direction_density") for t in types]
+        nearby = [c and not t.at_infinity for c, t in zip(connectible, types, strict=True)]
+        traced = [hasattr(t, "sample_emission") for t in types]
+        direct = [hasattr(t, "complete_direct") for t in types]
         self._hittable_types = {t for t, h in zip(types, hittable, strict=True) if h}
+        self._starts, self._lights = Mask(traced), Mask(direct)
         self.count = len(emitters)
         self.black = all(t is BlackEmitters for t in types)
         self.hittable, self.unhittable = any(hittable), not all(hittable)
-        self.direct = any(t.supports_next_event for t in types)
-        self.traced = any(t.supports_emission for t in types)
-        self.connectible_to_sensor = any(t.connectible_to_sensor for t in types)
-        self.connectible_nearby = any(t.connectible_to_sensor and not t.at_infinity for t in types)
-        connectible = [h and t.connectible_to_sensor for h, t in zip(hittable, types, strict=True)]
-        self.unhittable_connectible = tuple(
-            i
-            for i, (h, t) in enumerate(zip(hittable, types, strict=True))
-            if not h and t.connectible_to_sensor
-        )
-        self.finite_hittable = any(c and not t.at_infinity for c, t in zip(connectible, types, strict=True))
+        self.direct, self.traced = any(direct), any(traced)
+        self.connectible_to_sensor, self.connectible_nearby = any(connectible), any(nearby)
+        self.unhittable_connectible = any(c and not h for c, h in zip(connectible, hittable, strict=True))
+        self.finite_hittable = any(c and h for c, h in zip(nearby, hittable, strict=True))
         self.on_shapes = any(emitter.get_shape() is not None for emitter in emitters)
-        self.beams = any(t.supports_emission and not t.connectible_to_sensor for t in types)
+        self.beams = any(t and not c for t, c in zip(traced, connectible, strict=True))
         self.at_infinity = any(t.at_infinity for t in types)
-        self.tables = [t.tables(e) for e, t in zip(emitters, types, strict=True)]
-        self.left_out: list[tuple[str, str]] = [
-            text for e, t in zip(emitters, types, strict=True) for text in t.left_out(e)
-        ]
+        self.tables = [t.tables(e) for e, t in pairs]
+        self.left_out = [text for e, t in pairs for text in t.left_out(e)]
 
     def _lacks_sample_position(self, registered: list[str]) -> bool:
         """Whether `sample_position` fails: classes in the process may lack it."""
@@ -131,7 +126,7 @@ class Emitters:
     def with_guide(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
         """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
         other = copy(self)
-        other.has_places = other.indexed = True
+        other.indexed = True
         other.groups = tuple(
             group.with_guide(guide if guide is not None and any(is_guided[i] for i in own) else None)
             for group, own in zip(self.groups, self._of_groups, strict=True)
@@ -139,12 +134,9 @@ class Emitters:
         return other
 
     def place(self, index: mi.UInt32, p, d, cos, side: int, active: mi.Bool) -> tuple[Place, Factor]:
-        """`Group.place` and `Group.factor` of emissions; only for copies made by `with_guide`."""
-
-        def where(group: Group, mask: mi.Bool):
-            return group.place(index, p, d, mask), group.factor(index, p, d, cos, side, mask)
-
-        return self._querying("guidable", index, active)(where)
+        """``place`` and ``factor`` of a `Group`; only for copies made by `with_guide`."""
+        place = self._query("place", index, active, index, p, d)
+        return place, self._query("factor", index, active, index, p, d, cos, side)
 
     # -- selection and dispatch -------------------------------------------------------------
 
@@ -164,39 +156,26 @@ class Emitters:
         pmf = dr.gather(mi.Float, self._pmf, index, active) if self.count > 1 else mi.Float(1)
         return Chosen(emitter, index, pmf)
 
-    def _query(
-        self,
-        question: Callable[[Group, mi.Bool], Any],
-        answering: Sequence[Group],
-        index: mi.UInt32,
-        active: mi.Bool,
-        possible: Sequence[Group] | None = None,
-    ):
-        """Return the result of ``question(group, mask)`` for each lane's group.
+    def _query(self, method: str, index: mi.UInt32, active: mi.Bool, *arguments, among=None) -> Any:
+        """Return ``method(*arguments, mask)`` of each lane's group; undefined where it has no such method.
 
-        ``answering``: groups that have a result; lanes of other groups are undefined. ``possible``: groups
-        that ``index`` may refer to (default: all). A single group is recorded without a branch. Raises
-        ``ValueError`` if ``answering`` is empty.
+        ``among``: groups that ``index`` may refer to (default: all). A single group is recorded without a
+        branch. Raises ``ValueError`` if no group has the method.
         """
-        possible = self.groups if possible is None else possible
+        among = self.groups if among is None else among
 
         def lanes_of(group: Group) -> mi.Bool:
             mask = mi.Bool(active)
-            if len(possible) > 1:
+            if len(among) > 1:
                 mask &= dr.gather(mi.UInt32, self._group, index, active) == self.groups.index(group)
             return mask
 
-        first, *others = answering
-        found = question(first, lanes_of(first))
+        first, *others = (group for group in among if hasattr(group, method))
+        found = getattr(first, method)(*arguments, lanes_of(first))
         for group in others:
             mask = lanes_of(group)
-            found = dr.select(mask, question(group, mask), found)
+            found = dr.select(mask, getattr(group, method)(*arguments, mask), found)
         return found
-
-    def _querying(self, capability: str, index: mi.UInt32, active: mi.Bool) -> Callable[..., Any]:
-        """Return `_query`, of the groups that have a ``capability``."""
-        answering = [group for group in self.groups if getattr(group, capability)]
-        return partial(self._query, answering=answering, index=index, active=active)
 
     def covers(self, p, d):
         """`Disks.covers`; true where no light subpath starts at infinity."""
@@ -212,9 +191,8 @@ class Emitters:
         """
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
-        e = self._querying("supports_emission", chosen.index, active)(
-            lambda group, mask: group.sample_emission(chosen, u_point, u_direction, shared, mask)
-        )
+        arguments = chosen, u_point, u_direction, shared
+        e = self._query("sample_emission", chosen.index, active, *arguments)
         e.pdf_first *= chosen.pmf
         e.weight = dr.select(chosen.pmf > 0, e.weight / chosen.pmf, 0)
         if not self._starts.all:  # selected with next-event estimation's probability, but emits nothing
@@ -232,23 +210,17 @@ class Emitters:
         infinity): on surfaces the solid-angle density at the hit times the geometric cosine at y_0.
         """
         chosen = self._chosen(emission.index, active)
-        return self._querying("supports_emission", emission.index, active)(
-            lambda group, mask: group.connection_density(chosen, emission, si, mask)
-        )
+        return self._query("connection_density", emission.index, active, chosen, emission, si)
 
     def direction_density(self, emission: Emission, p, d, active):
         """Density of emission from y_0 along ``d`` to ``p``, in ``pdf_second``'s measure."""
         chosen = self._chosen(emission.index, active)
-        return self._querying("connectible_to_sensor", emission.index, active)(
-            lambda group, mask: group.direction_density(chosen, emission, p, d, mask)
-        )
+        return self._query("direction_density", emission.index, active, chosen, emission, p, d)
 
     def radiance_towards(self, emission: Emission, d, active):
         """Radiance, intensity (point) or irradiance (delta direction) of y_0 along ``d``."""
         chosen = self._chosen(emission.index, active)
-        return self._querying("connectible_to_sensor", emission.index, active)(
-            lambda group, mask: group.radiance_towards(chosen, emission, d, mask)
-        )
+        return self._query("radiance_towards", emission.index, active, chosen, emission, d)
 
     # -- next-event estimation --------------------------------------------------------------
 
@@ -258,9 +230,7 @@ class Emitters:
         u = mi.Point2f(u_x, u.y)
         sampled = active if self._drawn_by_mitsuba.all else self._drawn_by_mitsuba.at(chosen.index, active)
         ds, weight = chosen.emitter.sample_direction(si, u, sampled)
-        direct = self._querying("supports_next_event", chosen.index, active)(
-            lambda group, mask: group.complete_direct(chosen, ds, weight, si, u, mask)
-        )
+        direct = self._query("complete_direct", chosen.index, active, chosen, ds, weight, si, u)
         if not self._lights.all:
             direct.weight = dr.select(self._lights.at(chosen.index, active), direct.weight, 0)
         if self.indexed:  # only then: branches would carry it along
@@ -273,8 +243,7 @@ class Emitters:
 
     def emitted(self, si, active):
         """Radiance of the emitter hit (or missed into) at ``si`` towards ``si.wi``."""
-        emitter = si.emitter(self.scene)
-        return emitter.eval(si, active)
+        return si.emitter(self.scene).eval(si, active)
 
     def with_indices(self) -> Emitters:
         """Return a copy whose samples of next-event estimation have the index of their emitter."""
@@ -313,9 +282,7 @@ class Emitters:
         before.p, before.time, before.wavelengths = previous, si.time, si.wavelengths
         hit = Hit(self.scene, si, before)
         hittable = [group for group in self.groups if type(group) in self._hittable_types]
-        return self._query(
-            lambda group, mask: group.hit_densities(chosen, hit, mask), hittable, index, active, hittable
-        )
+        return self._query("hit_densities", index, active, chosen, hit, among=hittable)
 
 
 def _make_opaque(emitters, facts: ShapeFacts):

@@ -11,8 +11,8 @@ import numpy as np
 from ..geometry import rays
 from ..geometry.to_world import check_rotation
 from ..host.introspection import own_parameters
-from .disks import AIMED, Disks, Guided
-from .group import Context, Group, emitting_point, free_emission, weight_over
+from .disks import AIMED, Disks
+from .group import Context, Group, emitting_point, weight_over
 from .records import Chosen, Direct, Emission, Factor, Hit, Place
 from .tables import Mask, cell_at, rows
 
@@ -31,7 +31,7 @@ class InfiniteEmitters(Group):
     whatever the lit vertex. ``disks``: where light subpaths start.
     """
 
-    hittable = at_infinity = guidable = True
+    at_infinity = True
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
@@ -80,15 +80,14 @@ class InfiniteEmitters(Group):
         guide = self.guide
         if guide is None:
             return self.disks.start(d, u)
-        which = self._bin(index, d, active)
-
-        def density(p):
-            return guide.density(index, Place(which, self.disks.place(p, d)), active)
 
         def warp(u):
-            return guide.warp(index, which, u, active)
+            return guide.warp(index, self._bin(index, d, active), u, active)
 
-        return self.disks.start(d, u, Guided(self._share(guide, index, active), warp, density))
+        def density_at(p):
+            return guide.density(index, self.place(index, p, d, active), active)
+
+        return self.disks.start(d, u, self._share(guide, index, active), warp, density_at)
 
     # -- emission ---------------------------------------------------------------------------
 
@@ -103,9 +102,10 @@ class InfiniteEmitters(Group):
         pdf_w = dr.select(directional, 1, ds.pdf)
         si = emitting_point(p, shared)
         si.wi = d
-        emission = free_emission(chosen.index, weight, d, pdf_w, pdf_a, directional, si)
-        emission.infinite = mi.Bool(True)
-        return emission
+        anchor, infinite = rays.free_anchor(p), mi.Bool(True)
+        return Emission(
+            weight, d, anchor, mi.Float(1), pdf_w, pdf_a, chosen.index, si, infinite, delta=directional
+        )
 
     def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
         return self._point_pdf_a(chosen.index, p, d, active)

@@ -23,7 +23,6 @@ class ThirdPartyEmitters(Group):
     the geometric one.
     """
 
-    supports_emission = connectible_to_sensor = False
     limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"
 
     @classmethod
@@ -36,7 +35,7 @@ class ThirdPartyEmitters(Group):
 
     def __init__(self, emitters, context: Context):
         on_shapes = any(emitter.get_shape() is not None for emitter in filter(None, emitters))
-        self._shape_errors = context.shape_errors if on_shapes else None
+        self._shape_errors = context.facts.errors if on_shapes else None
 
     def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
         flags = chosen.emitter.flags()
@@ -75,10 +74,6 @@ KINDS: dict[str, type[Group]] = {
     "TimedSunskyEmitter": InfiniteEmitters,
 }
 
-# Mitsuba's own classes, which have all calls. Virtual calls visit every emitter in the process, and a
-# user-defined class may lack ``sample_position``.
-MITSUBAS = frozenset(KINDS)
-
 # In the order of dispatch in a kernel.
 GROUPS: tuple[type[Group], ...] = (
     *dict.fromkeys(KINDS.values()),
@@ -96,7 +91,8 @@ def group_of(emitter) -> type[Group]:
 
 
 def is_third_party(class_name: str) -> bool:
-    return class_name not in MITSUBAS
+    """Whether a class may lack calls that Mitsuba's own have, as ``sample_position``."""
+    return class_name not in KINDS
 
 
 def third_party_elsewhere(scene) -> int:

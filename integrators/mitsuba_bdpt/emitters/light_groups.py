@@ -141,26 +141,22 @@ class LightGroups:
 
     ``names``: of the groups, in the order of their layers; ``of_emitters``: group of each emitter;
     ``lamps``: of each group the ids of each emitter, of its shape and its own, or the name that ``auto``
-    gives one without, whose place is a text in ``places``;
-    ``warnings``: of patterns that match no emitter.
+    gives one without; ``warnings``: of patterns that match no emitter.
     """
 
-    def __init__(
-        self,
-        names: list[str],
-        of_emitters: list[int],
-        lamps: list[list[str]],
-        places: dict[str, str],
-        warnings: Sequence[str] = (),
-    ):
-        self._places = places
-        self.names, self.of_emitters, self.warnings = tuple(names), tuple(of_emitters), tuple(warnings)
-        self.lamps: dict[str, list[list[str]]] = {name: [] for name in names}
-        for group, lamp in zip(of_emitters, lamps, strict=True):
-            self.lamps[names[group]].append(lamp)
+    def __init__(self, emitters: list[mi.Emitter], text: str):
+        groups, made = parsed(text), _layer_names(emitters)
+        chosen, self.warnings = _matched(text, groups, emitters, made) if groups else (_own(made), [])
+        names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
+        self.names = tuple(names + [REST] * (len(chosen) < len(emitters)))
+        self.of_emitters = tuple(self.names.index(chosen.get(i, REST)) for i in range(len(emitters)))
+        self._places = {name: _place(e) for e, name in zip(emitters, made, strict=True) if not _ids(e)}
+        self.lamps: dict[str, list[list[str]]] = {name: [] for name in self.names}
+        for group, emitter, name in zip(self.of_emitters, emitters, made, strict=True):
+            self.lamps[self.names[group]].append(_ids(emitter) or [name])
         for of_group in self.lamps.values():
             of_group.sort(key=lambda ids: by_numbers(ids[0]))
-        self._table = mi.UInt32(of_emitters)
+        self._table = mi.UInt32(list(self.of_emitters))
         dr.make_opaque(self._table)
 
     @staticmethod
@@ -175,15 +171,7 @@ class LightGroups:
         emitters = in_order(scene)
         if not emitters:
             raise _error(text, "the scene has no emitters; leave light_groups out")
-        groups, made = parsed(text), _layer_names(emitters)
-        chosen, warnings = _matched(text, groups, emitters, made) if groups else (_own(made), [])
-        names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
-        if len(chosen) < len(emitters):
-            names.append(REST)
-        of_emitters = [names.index(chosen.get(i, REST)) for i in range(len(emitters))]
-        lamps = [_ids(emitter) or [name] for emitter, name in zip(emitters, made, strict=True)]
-        places = {name: _place(e) for e, name in zip(emitters, made, strict=True) if not _ids(e)}
-        return LightGroups(names, of_emitters, lamps, places, warnings)
+        return LightGroups(emitters, text)
 
     def explained(self) -> list[str]:
         """Describe each group by its emitters, with the places of those without id."""

@@ -12,9 +12,9 @@ from ..errors import UsageError
 from ..geometry import rays
 from ..geometry.to_world import check_angles
 from ..host.introspection import children, matrix_of, named, own_parameters
-from .group import Context, Group, emitting_point, free_emission, weight_over
-from .records import Chosen, Direct, Emission, Place
-from .tables import Mask, look_up, rows, table
+from .group import Context, Group, emitting_point, weight_over
+from .records import Chosen, Direct, Emission, Factor, Place
+from .tables import Mask, look_up, rows, switch, table
 
 
 @dataclass
@@ -40,8 +40,6 @@ class PositionEmitters(Group):
     Emission: y_0 is the position; the direction is uniform in a cone, or a projector's own (solid angle).
     """
 
-    guidable = True
-
     @classmethod
     def tables(cls, emitter) -> int:
         return 0 if emitter.class_name() == "Projector" else 1
@@ -50,22 +48,25 @@ class PositionEmitters(Group):
         self._cones = table(rows(emitters, _Cone(), lambda emitter: _CONES[emitter.class_name()](emitter)))
         projects = rows(emitters, None, lambda emitter: emitter.class_name() == "Projector")
         self._is_projector = Mask(projects)
-        self._projectors = Projectors.of(emitters, projects)
+        self._projectors = [_Projector(e) if p else None for e, p in zip(emitters, projects, strict=True)]
 
     def _direction_pdf_w(self, index, d, active):
         """Density (solid angle) of emission along ``d``."""
         pdf_w = dr.gather(mi.Float, self._cones.pdf_w, index, active)
         if self.guide is not None:
             pdf_w *= self.guide.density(index, self.place(index, None, d, active), active)
-        if self._projectors is None:
+        if not self._is_projector.any:
             return pdf_w
-        projector = self._is_projector.at(index, active)
-        return dr.select(projector, self._projectors.pdf_w(index, d, projector), pdf_w)
+        mask = self._is_projector.at(index, active)
+        return dr.select(mask, switch(self._projectors, "pdf_w", index, d, mask), pdf_w)
 
     def place(self, index, p, d, active) -> Place:
         cone = look_up(self._cones, index, active)
         local = mi.Vector3f(dr.dot(cone.x, d), dr.dot(cone.y, d), dr.dot(cone.z, d))
         return Place(mi.UInt32(0), mi.warp.uniform_cone_to_square(local, cone.cos_cutoff))
+
+    def factor(self, index, p, d, cos, side, active) -> Factor:
+        return Factor.whole()
 
     # -- emission ---------------------------------------------------------------------------
 
@@ -77,16 +78,17 @@ class PositionEmitters(Group):
             pdf_w *= density
         local = mi.warp.square_to_uniform_cone(u, cone.cos_cutoff)
         d = cone.x * local.x + cone.y * local.y + cone.z * local.z
-        if self._projectors is not None:
+        if self._is_projector.any:
             mask = self._is_projector.at(chosen.index, active)
-            projected, density = self._projectors.sample(chosen.index, u_direction, mask)
+            projected, density = switch(self._projectors, "sample", chosen.index, u_direction, mask)
             d, pdf_w = dr.select(mask, projected, d), dr.select(mask, density, pdf_w)
         p = mi.Point3f(cone.position)
         intensity = _intensity(chosen.emitter, p, d, shared, active)
         weight = dr.select(pdf_w == 0, 0, intensity / pdf_w)
         si = emitting_point(p, shared)
         si.t = mi.Float(0)
-        return free_emission(chosen.index, weight, d, mi.Float(1), pdf_w, mi.Bool(True), si)
+        cos, first, delta = mi.Float(1), mi.Float(1), mi.Bool(True)
+        return Emission(weight, d, rays.free_anchor(p), cos, first, pdf_w, chosen.index, si, delta=delta)
 
     def direction_density(self, chosen: Chosen, emission: Emission, p, d, active):
         return self._direction_pdf_w(chosen.index, d, active)
@@ -106,7 +108,6 @@ class PositionEmitters(Group):
             pdf_w=mi.Float(chosen.pmf),
             d=ds.d,
             anchor=rays.free_anchor(ds.p),
-            infinite=mi.Bool(False),
             delta=mi.Bool(True),
             emission_ratio=emitted / dr.square(ds.dist),
         )
@@ -156,41 +157,11 @@ _CONES = {
 }
 
 
-class Projectors:
-    """Densities of the directions of the scene's projectors, which Mitsuba lacks.
-
-    A projector's ``uv`` is an affine map of (x / z, y / z) about its axis, measured by probes.
-    """
-
-    @staticmethod
-    def of(emitters, projects):
-        """Return the projectors among ``emitters`` (flags ``projects``), or None."""
-        found = [(i, e) for i, (e, p) in enumerate(zip(emitters, projects, strict=True)) if p]
-        return Projectors(found) if found else None
-
-    def __init__(self, projectors):
-        self._rows = [(index, _Projector(emitter)) for index, emitter in projectors]
-
-    def sample(self, index, u, active):
-        """Sample a direction (world, unit length) and its density (solid angle)."""
-        return self._query("sample", (mi.Vector3f(0, 0, 1), mi.Float(1)), index, u, active)
-
-    def pdf_w(self, index, d, active):
-        """Density (solid angle) of ``d`` from the projector ``index``; 0 for others."""
-        return self._query("pdf_w", mi.Float(0), index, d, active)
-
-    def _query(self, method, found, index, argument, active):
-        for number, projector in self._rows:
-            mask = active & (index == number)
-            found = dr.select(mask, getattr(projector, method)(argument, mask), found)
-        return found
-
-
 class _Projector:
-    """One projector: unit axes, affine map to ``uv`` and back, sampled texture.
+    """Density of a projector's directions, which Mitsuba lacks: unit axes, map to ``uv``, sampled texture.
 
-    The texture is None where it would miss directions: with ``to_uv`` Mitsuba's textures sample another image
-    than they show.
+    ``uv`` is an affine map of (x / z, y / z) about the axis, measured by probes. The texture is None where it
+    would miss directions: with ``to_uv`` Mitsuba's textures sample another image than they show.
     """
 
     def __init__(self, emitter):

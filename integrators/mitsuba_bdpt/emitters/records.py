@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import drjit as dr
@@ -38,11 +38,11 @@ class Emission:
     cos: mi.Float
     pdf_first: mi.Float
     pdf_second: mi.Float
-    infinite: mi.Bool
-    delta: mi.Bool
-    beam: mi.Bool
     index: mi.UInt32
     si: mi.SurfaceInteraction3f
+    infinite: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    delta: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    beam: mi.Bool = field(default_factory=lambda: mi.Bool(False))
 
 
 @dataclass
@@ -62,9 +62,9 @@ class Direct:
     pdf_w: mi.Float
     d: mi.Vector3f
     anchor: rays.Anchor
-    infinite: mi.Bool
-    delta: mi.Bool
     emission_ratio: mi.Float
+    infinite: mi.Bool = field(default_factory=lambda: mi.Bool(False))
+    delta: mi.Bool = field(default_factory=lambda: mi.Bool(False))
     met: mi.UInt32 | None = None
     index: mi.UInt32 | None = None
 

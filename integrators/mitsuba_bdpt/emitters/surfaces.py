@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
@@ -19,32 +18,30 @@ from .tables import Mask, look_up, rows, switch, table
 from .textured import TexturedPoints
 
 
-@dataclass
-class _Turned:
-    """A sphere whose sampled normals are turned; ``outward``: see `Sphere` (0: none)."""
-
-    center: mi.Vector3f | tuple = (0, 0, 0)
-    outward: mi.Float | float = 0.0
-
-
 class Surfaces:
-    """The shapes of a group of emitters.
+    """The shapes of a group of emitters (None for other groups), and their ``spheres`` (`Sphere` or None).
 
-    ``emitters`` of the group (None for other groups), ``spheres`` their shapes (`Sphere` or None),
-    ``by_shape`` flags (None for other groups): sampled by shape here, by texture in Mitsuba; ``textured``
-    points of others. ``own``: the `Mask` of both. ``inv_area`` of each shape, by emitter index; ``smooth``:
-    one has interpolated normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
+    ``redraws`` flags shapes whose points are sampled here, not by Mitsuba's emitter; ``mapped`` flags those
+    of ``textured`` points. ``inv_area`` of each shape, by emitter index; ``smooth``: one has interpolated
+    normals. Raises ``UsageError`` for shapes that Mitsuba samples wrongly.
     """
 
-    def __init__(self, emitters, context: Context, spheres, by_shape=None, textured=None):
+    def __init__(self, emitters, context: Context, redraws=None, mapped=None):
+        about = context.facts.about
+
+        def fact(kind: str, default, find):
+            """``find(shape)`` of each emitter's shape."""
+            shapes = rows(emitters, None, lambda emitter: emitter.get_shape())
+            return rows(shapes, default, lambda shape: about(kind, partial(find, shape), shape))
+
         for emitter in filter(None, emitters):
-            context.facts.about("to_world", partial(_check_to_world, emitter), emitter.get_shape())
+            shape, owner = emitter.get_shape(), f"emitter {named(emitter)}"
+            about("to_world", partial(check_to_world, shape, owner), shape)
         # First: the area of a mesh whose faces have invalid vertices is arbitrary.
         shapes = (emitter and emitter.get_shape() for emitter in emitters)
-        look = partial(SmoothMeshes.of, emitters)
-        self._smooth_meshes = context.facts.about("smooth meshes", look, *shapes)
+        self._smooth_meshes = about("smooth meshes", partial(SmoothMeshes.of, emitters), *shapes)
         self.smooth = self._smooth_meshes is not None
-        areas = rows(emitters, 1.0, partial(_area, context))
+        areas = fact("area", 1.0, lambda shape: number(shape.surface_area()))
         if 0 in areas:
             emitter = emitters[areas.index(0)]
             raise UsageError(
@@ -53,34 +50,27 @@ class Surfaces:
             )
         self.inv_area = dr.rcp(mi.Float(areas))
         dr.make_opaque(self.inv_area)
-        self._emitters, self._shape_errors = emitters, context.shape_errors
-        by_shape = by_shape or rows(emitters, None, lambda _: False)
+        self._emitters, self._shape_errors = emitters, context.facts.errors
+        self.spheres: list[Sphere | None] = fact("sphere", None, Sphere.of)
         none = rows(emitters, None, lambda _: False)
-        self._textured = textured or TexturedPoints(emitters, spheres, none, context.facts)
-        mapped = self._textured.chosen
-        self.own = Mask(
-            [
-                None if e is None else context.by_shapes or s or m
-                for e, s, m in zip(emitters, by_shape, mapped, strict=True)
-            ]
-        )
-        turned = [s is not None and s.turned for s in spheres]
-        self._turned = None
-        if any(turned):
-            pairs = zip(spheres, turned, strict=True)
-            self._turned = table([_Turned(s.center, s.outward) if t else _Turned() for s, t in pairs])
-        self._reversed = Mask(rows(emitters, None, partial(_is_reversed, context)))
+        self.textured = TexturedPoints(emitters, self.spheres, mapped or none, context.facts)
+        redrawn = zip(emitters, redraws or none, strict=True)
+        self._own = Mask([None if e is None else context.by_shapes or r for e, r in redrawn])
+        turned = [s if s is not None and s.turned else None for s in self.spheres]
+        other = Sphere((0, 0, 0), 0.0, 0.0, False)
+        self._turned = table([s or other for s in turned]) if any(turned) else None
+        self._reversed = Mask(fact("reversed", None, is_reversed))
 
     def sample(self, chosen, u, shared, active):
         """Sample a ``PositionSample3f`` (density over area) and its geometric normal."""
         index = chosen.index
-        if self.own.all:
+        if self._own.all:
             ps = self._own_point(index, shared.time, u, active)
         else:
-            mask = self.own.at(index, active)
-            sampled = active & ~mask if self.own.any else active
+            mask = self._own.at(index, active)
+            sampled = active & ~mask if self._own.any else active
             ps, _ = chosen.emitter.sample_position(shared.time, u, sampled)
-            if self.own.any:
+            if self._own.any:
                 ps = dr.select(mask, self._own_point(index, shared.time, u, mask), ps)
         ps = self._upright(ps, index, active)
         return ps, self.geometric_normal(ps, index, u, active)
@@ -90,14 +80,14 @@ class Surfaces:
         return self._upright(self._own_point(index, time, u, active), index, active)
 
     def _own_point(self, index, time, u, active):
-        mapped = self._textured.mask
+        mapped = self.textured.mask
         if mapped.all:
-            return self._textured.sample(index, time, u, active)
+            return self.textured.sample(index, time, u, active)
         ps = self._point(index, time, u, active)
         if not mapped.any:
             return ps
         mask = mapped.at(index, active)
-        return dr.select(mask, self._textured.sample(index, time, u, mask), ps)
+        return dr.select(mask, self.textured.sample(index, time, u, mask), ps)
 
     def _point(self, index, time, u, active):
         """Sample a point uniformly on the shape of the emitter ``index``.
@@ -129,27 +119,3 @@ class Surfaces:
     def anchor(self, chosen, p, n, active) -> rays.Anchor:
         errors = self._shape_errors.at(chosen.emitter.get_shape(), active)
         return rays.sampled_anchor(p, n, errors)
-
-
-def spheres_of(emitters, context: Context) -> list[Sphere | None]:
-    """Return the `Sphere` of each emitter's shape, None for other shapes."""
-
-    def sphere(emitter: mi.Emitter) -> Sphere | None:
-        shape = emitter.get_shape()
-        return context.facts.about("sphere", lambda: Sphere.of(shape), shape)
-
-    return rows(emitters, None, sphere)
-
-
-def _is_reversed(context: Context, emitter: mi.Emitter) -> bool:
-    shape = emitter.get_shape()
-    return context.facts.about("reversed", partial(is_reversed, shape), shape)
-
-
-def _area(context: Context, emitter: mi.Emitter) -> float:
-    shape = emitter.get_shape()
-    return context.facts.about("area", lambda: number(shape.surface_area()), shape)
-
-
-def _check_to_world(emitter: mi.Emitter) -> None:
-    check_to_world(emitter.get_shape(), f"emitter {named(emitter)}")

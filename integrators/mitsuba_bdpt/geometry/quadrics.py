@@ -32,7 +32,7 @@ class Sphere:
     ``eval_parameterization``, which samples a texture, does not rotate the point).
     """
 
-    center: mi.ScalarPoint3f
+    center: mi.ScalarPoint3f | tuple
     radius: float
     outward: float
     turned: bool

@@ -198,7 +198,7 @@ def unsampled_at_sensor(prepared: PreparedScene, p: Plan, settings: Settings) ->
     starts = _unsampled_starts(prepared)
     found = [f"{' or '.join(starts)} - sensor (needs t=0)"] if starts else []
     # With hide_emitters this light is hidden on purpose.
-    direct = bool(prepared.emitters.unhittable_connectible) and not settings.hide_emitters
+    direct = prepared.emitters.unhittable_connectible and not settings.hide_emitters
     if direct and not p.endpoints and settings.max_depth:
         found.append("delta emitter - sensor (needs (1,1))")
     return found
