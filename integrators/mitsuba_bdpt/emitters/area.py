@@ -34,10 +34,10 @@ _SAMPLED = TEXTURE_SAMPLED | {mi.ShapeType.Cylinder.value, mi.ShapeType.Mesh.val
 
 @dataclass
 class _Sphere:
-    """How next-event estimation samples a sphere at ``center``.
+    """How next-event estimation samples a sphere at ``center``; 0: not applicable.
 
-    By area from within ``inner_radius`` (`quadrics.Sphere.inner_radius`). ``cone_radius``: radius of a sphere
-    that may be so small that Mitsuba's density is wrong and `quadrics.cone_pdf_w` is used. 0: not applicable.
+    By area from within ``inner_radius``. ``cone_radius``: that of a sphere which may be so small that
+    Mitsuba's density is wrong and `quadrics.cone_pdf_w` is used.
     """
 
     center: mi.Vector3f | tuple = (0, 0, 0)
@@ -63,9 +63,8 @@ _LEAST_COS = 1e-3
 class _Table:
     """Coordinates of the square of an area light's directions.
 
-    Flat lights (``flat`` 1): directions about the normal in the frame ``s``, ``t``, ``n``, stored because a
-    frame built from a normal is mirrored by the sign of a zero. Curved lights: directions in world space, up
-    to their sign.
+    Flat lights (``flat`` 1): directions in the ``frame``, stored because one built from a normal is mirrored
+    by the sign of a zero. Curved lights: directions in world space, up to their sign.
     """
 
     s: mi.Vector3f | tuple = (1, 0, 0)
@@ -97,7 +96,6 @@ class _Sampled(Enum):
 
     @staticmethod
     def of(emitter, by_shapes: bool) -> _Sampled:
-        """Choose the sampling of an emitter's points. ``by_shapes``: see `Context`."""
         if not is_textured(emitter):
             return _Sampled.UNIFORMLY
         if not is_sampled_by_texture(emitter):
@@ -124,7 +122,6 @@ class AreaEmitters(Group):
         return 1
 
     def __init__(self, emitters, context: Context, checks: bool = True):
-        """See `Group`; ``checks`` the densities of points where Mitsuba's choices are replicated."""
         self._emitters, self._facts = emitters, context.facts
         how = rows(emitters, None, lambda e: _Sampled.of(e, context.by_shapes))
         self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
@@ -154,15 +151,11 @@ class AreaEmitters(Group):
     # -- densities of points ----------------------------------------------------------------
 
     def pdf_a(self, emitter, index, at, n, active):
-        """Density of y_0 in emission (area measure), without the selection.
-
-        ``at`` has ``p`` and ``uv``; ``n`` is its normal.
-        """
+        """Density of y_0 = ``at`` with the normal ``n`` in emission (area measure), without the selection."""
         density = self._own_pdf_a(index, at.uv, active)
         if not self._by_texture.any:
             return density
-        # Where Mitsuba samples the texture, it returns the area density only at unit distance along the
-        # normal.
+        # Mitsuba's density of a texture is that of area only at unit distance along the normal.
         textured = self._by_texture.at(index, active)
         it = dr.zeros(mi.Interaction3f)
         it.p = at.p + n
@@ -189,17 +182,14 @@ class AreaEmitters(Group):
         """
         # Mitsuba masks by the sign of the normal, but the shading frame decides which side emits.
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
-        by_area = mi.Bool(False)
-        if self._redrawn.any:
-            by_area |= self._redrawn.at(index, active)
-        pdf_w = emitter.pdf_direction(it, ds, active & ~by_area if self._redrawn.any else active)
+        by_area = self._redrawn.at(index, active)
+        pdf_w = emitter.pdf_direction(it, ds, active & ~by_area)
         if self.any_inner:
             sphere = look_up(self._spheres, index, active)
             inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
-            by_area |= active & (sphere.inner_radius > 0) & inside
+            by_area = by_area | (active & (sphere.inner_radius > 0) & inside)
             if self._seen_through:
-                # From outside Mitsuba samples only the near half, the dark one of a sphere that emits
-                # inwards.
+                # From outside Mitsuba samples only the near half, which is dark.
                 beyond = dr.dot(ds.p - sphere.center, ds.d) > 0
                 pdf_w = dr.select((sphere.inner_radius > 0) & ~inside & beyond, 0, pdf_w)
         cos = dr.abs(dr.dot(ds.d, ds.n))
@@ -217,8 +207,8 @@ class AreaEmitters(Group):
 
     def points(self, emitter, index, u):
         """Sample points of the ``emitter`` with this ``index``, as emission does."""
-        active, shared = mi.Bool(True), dr.zeros(mi.Interaction3f)
-        return self._surfaces.sample(Chosen(emitter, index, mi.Float(1)), u, shared, active)[0]
+        chosen = Chosen(emitter, index, mi.Float(1))
+        return self._surfaces.sample(chosen, u, dr.zeros(mi.Interaction3f), mi.Bool(True))[0]
 
     # -- directions of emission -------------------------------------------------------------
 
@@ -243,7 +233,7 @@ class AreaEmitters(Group):
         return Factor(dr.select(flat, 1, curved), dr.select(flat, 0, mi.Float(PLAIN)))
 
     def _direction_pdf_w(self, index, cos, d, active):
-        """Density (solid angle) of emission along ``d``; ``cos`` with the shading normal."""
+        """Density (solid angle) of emission along ``d``; ``cos``: with the shading normal."""
         own, guide = dr.maximum(cos, 0) * dr.inv_pi, self.guide
         if guide is None:
             return own
@@ -263,7 +253,6 @@ class AreaEmitters(Group):
             return si.to_world(local), local, mi.warp.square_to_cosine_hemisphere_pdf(local)
         known = look_up(self._tables, index, active)
         flat, plain = known.flat > 0, self._plain(guide, index, active)
-        # A curved light's table has directions up to their sign: they are turned to the side of the normal.
         by_table = u.x >= plain
         x = dr.select(by_table, (u.x - plain) / (1 - plain), u.x / plain)
         own = si.to_world(mi.warp.square_to_cosine_hemisphere(mi.Point2f(x, u.y)))
@@ -346,8 +335,8 @@ class AreaEmitters(Group):
         emitter, index = chosen.emitter, chosen.index
         if self._redrawn.any:
             mask = self._redrawn.at(index, active)
-            ps = self._surfaces.sample_own(index, si.time, u, mask)
-            redrawn, its_weight = _towards(emitter, ps, si, mask)
+            redrawn = _towards(emitter, self._surfaces.sample_own(index, si.time, u, mask), si, mask)
+            its_weight = _radiance_over_density(emitter, redrawn, redrawn.pdf, si, mask)
             ds, weight = dr.select(mask, redrawn, ds), dr.select(mask, its_weight, weight)
         pdf_w = ds.pdf
         if self._any_cone:
@@ -369,11 +358,8 @@ class AreaEmitters(Group):
         return pdf_w * hit.to_area(ds), chosen.pmf * pdf_a, direction
 
 
-def _towards(emitter, ps, si, active):
-    """Sample of next-event estimation at the emitter point ``ps``, and its weight.
-
-    As in Mitsuba: the density divides by the shading normal's cosine, the weight is radiance / density.
-    """
+def _towards(emitter, ps, si, active) -> mi.DirectionSample3f:
+    """Sample of next-event estimation at the emitter point ``ps``; density as Mitsuba's, see `_corrected`."""
     ds = dr.zeros(mi.DirectionSample3f)
     ds.p, ds.n, ds.uv, ds.time, ds.emitter = ps.p, ps.n, ps.uv, si.time, emitter
     between = ps.p - si.p
@@ -381,21 +367,18 @@ def _towards(emitter, ps, si, active):
     ds.d = between / ds.dist
     cos = dr.abs(dr.dot(ds.n, ds.d))
     ds.pdf = dr.select(active & (cos > 0), ps.pdf * dr.square(ds.dist) / cos, 0)
-    return ds, _radiance_over_density(emitter, ds, ds.pdf, si, active)
+    return ds
 
 
 def _radiance_over_density(emitter, ds, pdf_w, si, active):
-    """Radiance of the emitter point ``ds`` towards ``si``, over its density ``pdf_w``."""
+    """Radiance of the emitter point ``ds`` towards ``si`` / ``pdf_w``."""
     there = mi.SurfaceInteraction3f(ds, si.wavelengths)
     there.wi = there.to_local(-ds.d)
     return dr.select(pdf_w == 0, 0, emitter.eval(there, active) / pdf_w)
 
 
-# -- which area lights there are --------------------------------------------------------------
-
-
 def _check_densities(asked: list, context: Context):
-    """`check_densities` of emitters, with their `_Sampled`; repeated after an edit of shape or radiance."""
+    """`check_densities` of emitters and their `_Sampled`, again after an edit of shape or radiance."""
 
     @cache
     def group() -> AreaEmitters:
@@ -425,11 +408,15 @@ def _samples_points(emitter) -> bool:
             f"emitter {named(emitter)} is on a curve ({named(shape)}), which Mitsuba's emitters cannot "
             "sample; use a cylinder or a mesh"
         )
-    sampled = shape.shape_type() in _SAMPLED
-    if not sampled and number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
+    if shape.shape_type() not in _SAMPLED and number(shape.sample_position(0, mi.Point2f(0.5)).pdf) == 0:
         return False
-    if is_textured(emitter):
-        _check_coordinates(emitter)
+    # By parameters: a shape that Python first met as an emitter's has no mesh methods.
+    on_mesh = shape.shape_type() == mi.ShapeType.Mesh.value
+    if is_textured(emitter) and on_mesh and not renamed.has_coordinates(own_parameters(shape)):
+        raise UsageError(
+            f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
+            f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
+        )
     return not _reads_attributes(children(emitter)["radiance"])
 
 
@@ -437,18 +424,5 @@ def _reads_attributes(texture) -> bool:
     """Whether a texture reads mesh attributes, which need a face index."""
     if texture.class_name() == "MeshAttribute":
         return True
-    if texture.class_name() in LEAVES:
-        return False
-    inner = (value for value in children(texture).values() if isinstance(value, mi.Texture))
-    return any(_reads_attributes(value) for value in inner)
-
-
-def _check_coordinates(emitter):
-    """Raise ``UsageError`` for a texture on a mesh without texture coordinates."""
-    shape = emitter.get_shape()
-    # By parameters: a shape that Python first met as an emitter's has no mesh methods.
-    if shape.shape_type() == mi.ShapeType.Mesh.value and not renamed.has_coordinates(own_parameters(shape)):
-        raise UsageError(
-            f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
-            f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
-        )
+    inner = children(texture).values() if texture.class_name() not in LEAVES else ()
+    return any(_reads_attributes(value) for value in inner if isinstance(value, mi.Texture))

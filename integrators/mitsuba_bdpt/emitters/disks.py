@@ -1,8 +1,8 @@
 """Disks across the direction on which light subpaths from infinity start.
 
-One disk covers the scene. If the scene has details, shapes that are small beside it and lie together, part of
-the subpaths starts on a second disk that covers these. Every density is that of the mixture. Where emission
-is guided, the guide's tables replace the second disk unless the details are smaller than a cell.
+One disk covers the scene. If it has details, shapes that are small beside it and lie together, part of the
+subpaths starts on a second disk that covers these. Every density is the mixture's. Where emission is guided,
+the guide's tables replace the second disk unless the details are smaller than a cell.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class BoundingSphere:
 
     @staticmethod
     def about(sphere, margin: float = MARGIN) -> BoundingSphere:
-        """Enlarge Mitsuba's bounding sphere, as Mitsuba does."""
+        """Enlarge a ``sphere`` of Mitsuba's, as Mitsuba does."""
         radius = max(float(sphere.radius) * (1 + margin), 1e-30)
         made = BoundingSphere(mi.Point3f(sphere.center), mi.Float(radius))
         dr.make_opaque(made)
@@ -70,14 +70,12 @@ class BoundingSphere:
 
 
 class Disks:
-    """Disks of a scene: outlines of ``scene`` and ``details``.
+    """Outlines of two spheres: ``scene``, about all shapes, and ``details``, about the scene's, or None.
 
-    ``scene``: sphere about all shapes (a unit sphere if no shape has a finite box); ``details``: sphere about
-    the scene's details, or None.
+    ``scene`` is a unit sphere if no shape has a finite box. ``about`` caches facts, see `ShapeFacts.about`.
     """
 
     def __init__(self, scene, about: Callable = asked_anew):
-        """``about``: caches facts, see `ShapeFacts.about`."""
         each, box = boxes(scene, about), mi.ScalarBoundingBox3f()
         for one in each:
             box.expand(one)

@@ -31,8 +31,8 @@ from .tables import Mask, inverse_table
 class Emitters:
     """The scene's emitters as tables that a kernel can index.
 
-    Built for each render, so that edits of the scene count. Raises ``UsageError`` and ``UnsupportedError``
-    for emitters for which Mitsuba's own sampling and evaluation disagree.
+    Built for each render. Raises ``UsageError`` and ``UnsupportedError`` for emitters for which Mitsuba's own
+    sampling and evaluation disagree.
 
     Properties of the scene's ``count`` emitters, ``objects`` by index (see `order.in_order`):
 
@@ -142,14 +142,14 @@ class Emitters:
 
     def _select(self, u, active: mi.Bool):
         """Choose an emitter; also returns the reused part of ``u``."""
-        if self.count == 1:
-            return self._chosen(mi.UInt32(0), active), u
+        index = mi.UInt32(0)
         if self._choice is not None:
             index, u = self._choice.sample_reuse(u, active)
-            return self._chosen(index, active), u
-        scaled = u * self.count
-        index = dr.minimum(mi.UInt32(scaled), self.count - 1)
-        return self._chosen(index, active), scaled - mi.Float(index)
+        elif self.count > 1:
+            scaled = u * self.count
+            index = dr.minimum(mi.UInt32(scaled), self.count - 1)
+            u = scaled - mi.Float(index)
+        return self._chosen(index, active), u
 
     def _chosen(self, index, active) -> Chosen:
         emitter = dr.gather(mi.EmitterPtr, self._pointers, index, active)
@@ -184,10 +184,9 @@ class Emitters:
     # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, u_point, u_direction, shared, active) -> Emission:
-        """Sample y_0 and the direction to y_1.
+        """Sample y_0 and the direction to y_1; ``shared``: time and wavelengths.
 
-        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction; ``shared`` carries time and
-        wavelengths.
+        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction.
         """
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
@@ -268,10 +267,10 @@ class Emitters:
     def hit_densities(self, si, previous, active):
         """Densities of the light-side strategies at the emitter point hit.
 
-        ``previous``: position of the camera vertex before. Returns ``(connect, first, second)``, selection
-        included: next-event estimation from ``previous`` and ``pdf_first`` of emission (area measure on
-        surfaces, solid angle at infinity), and ``pdf_second`` towards ``previous`` (solid angle on surfaces,
-        area across the direction at infinity).
+        ``previous``: position of the camera vertex before. Returns, selection included, those of next-event
+        estimation from ``previous`` and ``pdf_first`` of emission (area measure on surfaces, solid angle at
+        infinity), and ``pdf_second`` towards ``previous`` (solid angle on surfaces, area across the direction
+        at infinity).
         """
         emitter = si.emitter(self.scene)
         active = active & (emitter != dr.zeros(mi.EmitterPtr))
@@ -286,10 +285,7 @@ class Emitters:
 
 
 def _make_opaque(emitters, facts: ShapeFacts):
-    """`make_parameters_opaque` of emitters, or of their shapes unless known to be so since the last edit.
-
-    Parameters of Mitsuba's emitters on shapes are numbers.
-    """
+    """Make parameters of emitters, or of their shapes unless known to be so since the last edit, opaque."""
     fresh = []
     for emitter in emitters:
         shape = emitter.get_shape()
@@ -301,7 +297,6 @@ def _make_opaque(emitters, facts: ShapeFacts):
 
 
 def _sampling_weight(emitter: mi.Emitter) -> float:
-    """The emitter's weight in the choice among emitters; one that is none would spoil every choice."""
     weight = number(emitter.sampling_weight())
     if not 0 <= weight < math.inf:
         raise UsageError(

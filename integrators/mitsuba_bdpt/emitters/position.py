@@ -19,11 +19,10 @@ from .tables import Mask, look_up, rows, switch, table
 
 @dataclass
 class _Cone:
-    """Position of an emitter and its cone of directions (all for a point light).
+    """Position of an emitter (world) and its cone of directions (all for a point light).
 
-    ``position`` (world); the axes ``x``, ``y``, ``z`` of the cone (unit length), the cosine ``cos_cutoff`` of
-    its half angle, and the density ``pdf_w`` of a direction within (solid angle). Projectors use ``position``
-    alone.
+    Unit axes of the cone, cosine ``cos_cutoff`` of its half angle, and density ``pdf_w`` of a direction
+    within (solid angle). Projectors use ``position`` alone.
     """
 
     position: mi.Vector3f | tuple = (0, 0, 0)
@@ -185,7 +184,7 @@ class _Projector:
         self._texture = texture if texture.is_spatially_varying() and _is_as_it_was(texture) else None
 
     def sample(self, u, active):
-        """Sample a direction and its density (solid angle)."""
+        """Sample a direction (world) and its density (solid angle)."""
         uv, pdf = mi.Point2f(u), mi.Float(1)
         if self._texture is not None:
             uv, pdf = self._texture.sample_position(u, active)
@@ -212,7 +211,5 @@ class _Projector:
 
 def _is_as_it_was(texture) -> bool:
     """Whether a texture has no ``to_uv`` that changes it."""
-    found = own_parameters(texture)
-    if "to_uv" not in found:
-        return True
-    return np.allclose(np.array(found["to_uv"].matrix).reshape(3, 3), np.eye(3), atol=1e-7)
+    to_uv = own_parameters(texture).get("to_uv")
+    return to_uv is None or np.allclose(np.array(to_uv.matrix).reshape(3, 3), np.eye(3), atol=1e-7)

@@ -37,23 +37,24 @@ class BlackEmitters(HitOnlyEmitters):
 
 def is_black(emitter: mi.Emitter) -> bool:
     """Whether one of Mitsuba's emitters is known to emit no light."""
-    found = children(emitter)
-    textures = [found[name] for name in _FACTORS if isinstance(found.get(name), mi.Texture)]
-    if any(map(_is_black, textures)):
+    own, found = own_parameters(emitter), children(emitter)
+    if any(map(_is_black, _textures(found))):
         return True
     if "sun_scale" in found:
-        own = own_parameters(emitter)
         return number(own["sun_scale"]) == number(own["sky_scale"]) == 0
     if "scale" not in found:
         return False
-    own = own_parameters(emitter)
     return number(own["scale"]) == 0 or ("data" in own and not _any_lit(own["data"]))
+
+
+def _textures(found: dict) -> list[mi.Texture]:
+    return [found[name] for name in _FACTORS if isinstance(found.get(name), mi.Texture)]
 
 
 def is_negative(emitter: mi.Emitter) -> bool:
     """Whether one of Mitsuba's emitters is known to have negative radiance; reads some values of pictures."""
     found = children(emitter)
-    held = [_data(found[name]) for name in _FACTORS if isinstance(found.get(name), mi.Texture)]
+    held = [_data(texture) for texture in _textures(found)]
     if "scale" in found:
         own = own_parameters(emitter)
         held += [own["scale"], own.get("data")]

@@ -71,10 +71,7 @@ class Direct:
 
 @dataclass
 class Place:
-    """An emission's primary numbers ``u`` in the unit square, and the square's index ``bin``.
-
-    `group.Group.place` defines the squares of an emitter.
-    """
+    """An emission's primary numbers ``u`` in the unit square, and the index ``bin`` of that square."""
 
     bin: mi.UInt32
     u: mi.Point2f
@@ -103,7 +100,7 @@ class Cell:
 
 
 class EmissionGuide(Protocol):
-    """Densities over the squares of primary numbers, see `guided_emission.tables.EmissionGuide`."""
+    """See `guided_emission.tables.EmissionGuide`."""
 
     side: int
 

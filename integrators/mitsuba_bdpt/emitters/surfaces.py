@@ -68,8 +68,7 @@ class Surfaces:
             ps = self._own_point(index, shared.time, u, active)
         else:
             mask = self._own.at(index, active)
-            sampled = active & ~mask if self._own.any else active
-            ps, _ = chosen.emitter.sample_position(shared.time, u, sampled)
+            ps, _ = chosen.emitter.sample_position(shared.time, u, active & ~mask)
             if self._own.any:
                 ps = dr.select(mask, self._own_point(index, shared.time, u, mask), ps)
         ps = self._upright(ps, index, active)
@@ -83,20 +82,12 @@ class Surfaces:
         mapped = self.textured.mask
         if mapped.all:
             return self.textured.sample(index, time, u, active)
-        ps = self._point(index, time, u, active)
+        shapes = [emitter and emitter.get_shape() for emitter in self._emitters]
+        ps = switch(shapes, "sample_position", index, time, u, active)
         if not mapped.any:
             return ps
         mask = mapped.at(index, active)
         return dr.select(mask, self.textured.sample(index, time, u, mask), ps)
-
-    def _point(self, index, time, u, active):
-        """Sample a point uniformly on the shape of the emitter ``index``.
-
-        Calls these shapes alone: a virtual call visits all shapes in the process, and instances, curves and
-        grids have no ``sample_position``.
-        """
-        shapes = [emitter and emitter.get_shape() for emitter in self._emitters]
-        return switch(shapes, "sample_position", index, time, u, active)
 
     def _upright(self, ps, index, active):
         """Turn the sampled normal of a turned sphere; see `Sphere`."""

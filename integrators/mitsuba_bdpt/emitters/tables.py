@@ -22,10 +22,7 @@ def rows(emitters, default, row) -> list:
 
 
 def table(records: list[Record]) -> Record:
-    """Convert records of numbers and tuples to opaque columns for `look_up`.
-
-    Columns are ``mi.Float`` or ``mi.Vector3f``.
-    """
+    """Opaque columns (``mi.Float``, ``mi.Vector3f``) of records of numbers and tuples, for `look_up`."""
 
     def column(name):
         # Lists, not NumPy: Dr.Jit borrows an array's memory, and its alignment is part of the kernel.
@@ -67,7 +64,7 @@ def switch(owners, method: str, index: mi.UInt32, *arguments):
 class Mask:
     """Property of a group's emitters: ``any``, ``all``, and a mask by index.
 
-    ``values``: one per emitter of the scene, None for other groups. Records nothing if none or all have it.
+    ``values``: one per emitter of the scene, None for other groups.
     """
 
     def __init__(self, values):

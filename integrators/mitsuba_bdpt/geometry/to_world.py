@@ -22,8 +22,6 @@ _OF_REFLECTORS = 0.04
 # Condition number above which a single-precision inverse cannot be judged.
 _FLAT = 1e5
 
-_REMEDY = "give rotate an axis of length 1"
-
 
 def check_to_world(shape, owner: str):
     """Raise ``UsageError`` if Mitsuba samples ``shape`` wrongly with its ``to_world``.
@@ -46,7 +44,7 @@ def is_reversed(shape: mi.Shape) -> bool:
     """Whether normals sampled on ``shape`` are opposite to those of hits (``si.n``).
 
     True for mirrored rectangles, whose hits use the cross product of the edges. (Meshes: see `smooth_meshes`;
-    mirrored cylinders raise an error in `check_to_world`.)
+    mirrored disks and spheres agree, mirrored cylinders raise an error in `check_to_world`.)
     """
     is_rectangle = shape.shape_type() == mi.ShapeType.Rectangle.value
     return is_rectangle and bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
@@ -61,7 +59,7 @@ def _disk(matrix, inverse):
     return (
         "has another inverse than Mitsuba takes it to have, so that rays find the shape elsewhere than its "
         "sampled points are: rotate about an axis that is not of length 1 makes such a matrix, and shears; "
-        + _REMEDY
+        "give rotate an axis of length 1"
     )
 
 
@@ -73,16 +71,17 @@ def _rectangle(matrix, inverse):
         return None
     return (
         "turns its normal out of the right angle to its plane: rotate about an axis that is not of length 1 "
-        f"does; {_REMEDY}"
+        "does; give rotate an axis of length 1"
     )
 
 
 def _sphere(matrix, inverse):
-    if _scales(matrix):
+    size = np.linalg.norm(matrix[:, 0])
+    if np.allclose(matrix.T @ matrix, size**2 * np.eye(3), rtol=0, atol=_TOLERANCE * size**2):
         return None
     return (
         f"stretches or shears it (the lengths of its columns are {_lengths(matrix)}): Mitsuba finds a sphere "
-        f"and samples an ellipsoid; use one scale, {_REMEDY}, or use a mesh"
+        "and samples an ellipsoid; use one scale, give rotate an axis of length 1, or use a mesh"
     )
 
 
@@ -99,7 +98,7 @@ def _cylinder(matrix, inverse):
         return None
     return (
         f"squashes or shears it (the lengths of its columns are {_lengths(matrix)}): Mitsuba takes its "
-        f"points to be evenly spread and its area to be that of a round one; {_REMEDY}, "
+        "points to be evenly spread and its area to be that of a round one; give rotate an axis of length 1, "
         "and x and y the same scale, or use a mesh"
     )
 
@@ -121,7 +120,7 @@ def check_inverse(shape: mi.Shape):
         raise UsageError(
             f"to_world of {kind} {named(shape)} has another inverse than Mitsuba takes it to have, so that "
             "its points, normals and rays are of different surfaces: rotate about an axis that is not of "
-            f"length 1 makes such a matrix; {_REMEDY}"
+            "length 1 makes such a matrix; give rotate an axis of length 1"
         )
 
 
@@ -132,12 +131,12 @@ def _differs(inverse, true, tolerance: float) -> bool:
 def check_rotation(emitter: mi.Emitter):
     """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation."""
     columns = matrix_of(emitter)[:3, :3]
-    if not _scales(columns, 1.0):
+    if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
         name = emitter.class_name()
         kind = _PLUGINS.get(name) or name.removesuffix("Emitter").lower()
         raise UsageError(
             f"to_world of {kind} {named(emitter)} is not a rotation (the lengths of its "
-            f"columns are {_lengths(columns)}); leave out scaling, and {_REMEDY}"
+            f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
         )
 
 
@@ -147,7 +146,10 @@ def check_angles(emitter: mi.Emitter):
     Intensity and density are functions of the untransformed angles. Uniform scaling and mirroring keep them.
     """
     columns = matrix_of(emitter)[:3, :3]
-    if not _scales(columns):
+    scale = np.linalg.norm(columns, axis=0).mean()
+    with np.errstate(invalid="ignore"):  # non-finite is not close
+        keeps = np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2)
+    if not keeps:
         plugin, angle = _ANGLES[emitter.class_name()]
         raise UsageError(
             f"to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
@@ -155,14 +157,8 @@ def check_angles(emitter: mi.Emitter):
         )
 
 
-def _scales(matrix, by: float | None = None) -> bool:
-    """Whether a matrix keeps angles (false if not finite); ``by``: and scales by this."""
-    size = np.linalg.norm(matrix[:, 0]) if by is None else by
-    with np.errstate(invalid="ignore"):
-        return np.allclose(matrix.T @ matrix, size**2 * np.eye(3), rtol=0, atol=_TOLERANCE * size**2)
-
-
 _ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}
+
 
 _PLUGINS = {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}
 
@@ -174,6 +170,7 @@ def _lengths(matrix) -> str:
 # Shapes that use both matrix and inverse for points, normals and rays. (Disks and spheres, if they only
 # reflect, use the inverse alone, rectangles their corners, and meshes keep no matrix.)
 _USES_BOTH = {mi.ShapeType.Cylinder.value, mi.ShapeType.SDFGrid.value}
+
 
 _CHECKS = {
     mi.ShapeType.Rectangle.value: _rectangle,
