@@ -587,8 +587,8 @@ MUTANTS = (
     Mutant(
         "sensors: t = 0 lacks the cosine at the lens",
         "sensors/cameras.py",
-        "arrival=cos * view.lens_area() / dist2 if self.area",
-        "arrival=view.lens_area() / dist2 if self.area",
+        "else cos * view.lens_area() / dist2",
+        "else view.lens_area() / dist2",
         ("tests/sensors/test_sensor_densities.py::test_an_arrival_is_a_start_in_reverse[thinlens]",),
     ),
     Mutant(
@@ -626,8 +626,8 @@ MUTANTS = (
     Mutant(
         "sensors: light hits a meter that is not in the scene",
         "sensors/others.py",
-        "        elif not in_scene:\n",
-        "        elif False:\n",
+        "        if not in_scene:\n",
+        "        if False:\n",
         ("tests/images/test_coverage.py::test_meter_of_another_scene",),
     ),
     Mutant(

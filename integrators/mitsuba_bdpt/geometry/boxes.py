@@ -26,7 +26,7 @@ def asked_anew(kind: str, find: Callable[[], Found], *shapes) -> Found:
 
 
 def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
-    """Bounding box of a shape, for a mesh that of its finite vertices; or None."""
+    """Bounding box of a shape, of a mesh's finite vertices; or None."""
     box = mi.ScalarBoundingBox3f(shape.bbox())
     params = own_parameters(shape) if shape.is_mesh() else {}
     if renamed.holds_a_mesh(params):
@@ -61,10 +61,8 @@ def scene_box(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> mi.Sca
 
 def points_in(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray, u: np.ndarray) -> mi.Point3f:
     """Points in the boxes ``which`` at the positions ``u`` (n, 3) of the unit cube."""
-    low, high = (
-        np.array([np.array(corner, dtype=np.float64).ravel() for corner in of_all])[which]
-        for of_all in ([box.min for box in boxes], [box.max for box in boxes])
-    )
+    corners = [[np.array(corner, dtype=np.float64).ravel() for corner in (box.min, box.max)] for box in boxes]
+    low, high = np.array(corners)[which].swapaxes(0, 1)
     return mi.Point3f((low + u * (high - low)).T)
 
 

@@ -1,8 +1,8 @@
 """Surfaces at hits, with one function for all instances and one for all spheres.
 
 Mitsuba records a function per shape; of an instance it has in turn one per shape of the process: n^2 for n
-instances. Here what distinguishes instances or spheres is looked up: ``to_world`` and the side of the normal.
-For instances the shape of the group is called in its own coordinates.
+instances. Here ``to_world`` and the side of the normal are looked up, and the shape of an instance's group is
+called in its own coordinates.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from .boxes import asked_anew
 from .quadrics import is_sphere
 from .rounding import met
 
-# From this number of instances or spheres on they are looked up; of spheres only where other shapes, which
-# are then called through Python, are at most `_OTHERS` times as many.
+# Fewest instances or spheres that are looked up; of spheres only where other shapes, which are then called
+# through Python, are at most `_OTHERS` times as many.
 MANY = 8
 _OTHERS = 4
 
@@ -62,8 +62,7 @@ class HitTables:
         """Return the tables of a scene; None if Mitsuba's own call is to be used.
 
         That is, for few instances and spheres, for instances whose group is not known by its name, and on
-        GPUs, where hits do not have the index of the shape in its group. ``about``: caches facts, see
-        `ShapeFacts.about`.
+        GPUs, where hits do not have the index of the shape in its group.
         """
         shapes = scene.shapes()
         instances, spheres = ([s for s in shapes if is_one(s)] for is_one in (is_instance, is_sphere))
@@ -76,11 +75,12 @@ class HitTables:
         if not first_of.keys() >= set(names):
             return None
         targets = {registry_id(shape): place for place, shape in enumerate(_targets(scene))}
-        rows = {registry_id(shape): row for row, shape in enumerate([*instances, *spheres])}
+        placed = [*instances, *spheres]
+        rows = {registry_id(shape): row for row, shape in enumerate(placed)}
         places = targets | {index: first_of[name] for index, name in zip(rows, names, strict=False)}
         sides = {registry_id(s): -1.0 if s.has_flipped_normals() else 1.0 for s in spheres}
         indices = range(max(*places, *rows) + 1)
-        frames = np.array([about("frame", partial(_frame_of, one), one) for one in [*instances, *spheres]])
+        frames = np.array([about("frame", partial(_frame_of, shape), shape) for shape in placed])
         made = HitTables(
             first=mi.UInt32([places.get(index, 0) for index in indices]),
             row=mi.UInt32([rows.get(index, 0) for index in indices]),
@@ -105,7 +105,7 @@ class HitTables:
 
 
 class Hits:
-    """Computes the surface at a hit of ``scene``; ``tables`` of it, or None."""
+    """Computes the surface at a hit of ``scene``; its ``tables``, or None."""
 
     def __init__(self, scene: mi.Scene, tables: HitTables | None):
         self._tables = tables
@@ -202,16 +202,13 @@ def _frame_of(shape: mi.Shape) -> np.ndarray:
 
 
 def _targets(scene: mi.Scene) -> list[mi.Shape]:
-    """Shapes that are called one by one: all but instances and the scene's spheres, then those of groups."""
+    """Shapes that are called: all but instances and the scene's spheres, then those of groups."""
     own = [shape for shape in scene.shapes() if not (is_instance(shape) or is_sphere(shape))]
     return [*own, *grouped_shapes(scene)]
 
 
 def _first_shapes(scene: mi.Scene, place: int) -> dict[str, int]:
-    """Place in `_targets` of the first shape of each group, by the group's name; {} if two have one name.
-
-    ``place``: that of the first of all.
-    """
+    """Places in `_targets` of groups' first shapes, from ``place`` on, by name; {} if two have one name."""
     groups, found = shape_groups(scene), {}
     for group in groups:
         found[group.id()] = place

@@ -1,7 +1,4 @@
-"""Choices of Mitsuba's samplers that are replicated here, and checks of them.
-
-Strategies need densities of points that they have not sampled, and normals that Mitsuba does not return. Each
-choice has one home, with a check at the start of a render for the emitters and irradiance meters concerned:
+"""Choices of Mitsuba's samplers that are replicated for the densities of strategies, and checks of them.
 
 ============================================  ===================================  =======================
 choice of Mitsuba                             home                                 check before a render
@@ -21,8 +18,6 @@ turned spheres: the point is rotated by       `quadrics.Sphere.turned`,         
 shapes whose ``to_world`` samples other       `to_world.check_to_world`            the matrix alone
 points than rays hit
 ============================================  ===================================  =======================
-
-``tests/emitters/test_lamps.py`` plants other choices and expects the checks to name the emitter.
 """
 
 from __future__ import annotations
@@ -63,10 +58,7 @@ def is_textured(emitter) -> bool:
 
 
 def is_sampled_by_texture(emitter) -> bool:
-    """Whether points of a textured area light are chosen by its texture.
-
-    (With a non-finite texel all densities are NaN.)
-    """
+    """Whether points of a textured area light are chosen by its texture (whose texels are finite)."""
     if emitter.get_shape().shape_type() not in TEXTURE_SAMPLED:
         return False
     try:
@@ -80,7 +72,7 @@ def check_densities(emitters, emitter, index: int, by_mitsuba: bool = True):
 
     Compares densities of emission (area) where rays hit the point's front, and, if points are sampled
     ``by_mitsuba``, of next-event estimation (solid angle) from positions inside and outside of the emitter.
-    ``emitters``: the `area.AreaEmitters` with ``emitter`` at ``index``. Raises ``UnsupportedError``.
+    ``emitters``: an `area.AreaEmitters`. Raises ``UnsupportedError``.
     """
     if _is_rounded(emitter):
         return
@@ -123,8 +115,7 @@ def _is_rounded(emitter) -> bool:
 def _seen(shape, ps):
     """Hits of rays towards the points ``ps`` of a shape from their front.
 
-    The ray origins are far enough for rounding not to change the side, and close enough that hardly any other
-    part of the shape lies between.
+    From far enough for rounding not to change the side, with hardly any other part of the shape between.
     """
     height = dr.opaque(mi.Float, 1e-3 * max(shape.bbox().extents()))
     ray = mi.Ray3f(ps.p + height * ps.n, -mi.Vector3f(ps.n))

@@ -72,8 +72,7 @@ def sphere_normal(p, center, outward):
 def may_light_itself(shape: mi.Shape, sphere: Sphere | None) -> bool:
     """Whether ``shape``, with this ``sphere`` or None, emits outwards and transmits.
 
-    None of its points lights another, but rounding puts some outside, from where Mitsuba samples the cone
-    into the sphere.
+    Rounding puts some of its points outside, from where Mitsuba samples the cone into the sphere.
     """
     if sphere is None or sphere.outward < 0:
         return False

@@ -3,12 +3,11 @@
 Mitsuba offsets ray origins by 8.9e-5 (1 + max|p|), which exceeds small scenes and leaves gaps in large ones.
 Here the offset along the geometric normal follows from the rounding error of the hit:
 ``OFFSET_ULPS * 2^-24 * max(|p|, |o|, t, reach)`` with maximum norms, where ``o`` and ``t`` belong to the ray
-that found ``p``, and ``reach`` bounds the coordinates from which hits on the shape are computed, as far as
-their rounding moves hits along the normal (`reaches`).
+that found ``p``, and ``reach`` is that of its shape (`reaches`).
 
-Shadow rays end short of their target by its offset, not by a fraction of the distance, and by more if their
-own length errs more (`_before`). Towards spheres and cylinders they end earlier still; where these are so
-small that occluders in front would be missed, the ray tests what it meets first (`shadow_ray`).
+Shadow rays end short of their target by its offset, and by more if their own length errs more (`_before`).
+Towards spheres and cylinders they end earlier still; where these are so small that occluders in front would
+be missed, the ray tests what it meets first (`shadow_ray`).
 """
 
 from __future__ import annotations
@@ -62,10 +61,7 @@ _STEEPEST = 0.05
 
 
 def passed(ray: mi.Ray3f, si: mi.SurfaceInteraction3f, shape_errors: ShapeErrors) -> mi.Float:
-    """Distance along ``ray`` just beyond the surface ``si``, by its anchor's offset.
-
-    On the ray itself, so that many surfaces do not shift it past its target.
-    """
+    """Distance along ``ray`` just beyond ``si``: on the ray, so that many surfaces do not shift it."""
     anchor = surface_anchor(si, ray, shape_errors)
     cos = dr.maximum(dr.abs(dr.dot(anchor.n, ray.d)), _STEEPEST)
     return si.t + anchor.offset / cos
@@ -90,8 +86,7 @@ def spawn(anchor: Anchor, d: mi.Vector3f, shared) -> mi.Ray3f:
 def _before(a: Anchor, b: Anchor) -> mi.Point3f:
     """End of the shadow ray from ``a`` to ``b`` if the surface of ``b`` is flat.
 
-    The offset of ``b`` covers the error of its hit and coordinates. The error of the ray from ``a`` grows
-    with its length, which with the coordinates of ``b`` bounds those of ``a``.
+    The offset of ``b`` covers the error of its hit and coordinates; that of the ray grows with its length.
     """
     offset = dr.maximum(b.offset, offset_at(dr.norm(b.p - a.p)))
     return replace(b, offset=offset).towards(a.p - b.p)
@@ -108,11 +103,10 @@ def end_point(a: Anchor, b: Anchor) -> mi.Point3f:
 
 
 def _early(back, b: Anchor):
-    """Share of a ray's length in which it may hit a round target too early.
+    """Share of a ray's length in which it may hit its end ``b``, on a sphere or cylinder, too early.
 
-    ``b``: the end, on a sphere or cylinder; ``back``: direction against the ray. Behind a shape so small that
-    the ray would pass its front, at most half the chord, so that the front still occludes (the open end of a
-    cylinder does not).
+    ``back``: direction against the ray. Behind a shape so small that the ray would pass its front, at most
+    half the chord, so that the front still occludes (the open end of a cylinder does not).
     """
     dist = dr.norm(back)
     along = dr.dot(b.n, back)
@@ -152,9 +146,9 @@ class Own:
 def shadow_ray(
     shape_errors: ShapeErrors, a: Anchor, b: Anchor, number: mi.UInt32, shared
 ) -> tuple[mi.Ray3f, Own | None]:
-    """Return the shadow ray from ``a`` to ``b``, and an `Own` for `occluded`.
+    """Return the shadow ray from ``a`` to ``b`` on the shape ``number``, and an `Own` for `occluded`.
 
-    ``number``: index of the shape of ``b``. The `Own` is None unless ``shape_errors`` are small.
+    None unless ``shape_errors`` are small.
     """
     if not shape_errors.small:
         return segment(a, b, shared), None

@@ -16,23 +16,21 @@ from .boxes import asked_anew, scene_box
 from .directions import random_directions
 from .quadrics import ROUND, is_sphere, outward_sign
 
-# Ray offset in ulps, so that no hit finds its own start; see experiments, section Rounding.
+# Ray offset in ulps, so that no hit finds its own start (this and the next: experiments, section Rounding).
 OFFSET_ULPS = 32
 
-# Bound of the error of t on spheres and cylinders, which Mitsuba intersects in single precision, in units of
-# 2^-24 t^2 / radius; see experiments, section Rounding.
+# Bound of the error of t on spheres and cylinders, in units of 2^-24 t^2 / radius.
 QUADRIC_ULPS = 8
 
-# Cosine at a sphere's point below which that error is taken not to grow (1 % of the points seen from afar);
-# rays to these may still hit the sphere too early; see experiments, section Rounding.
+# Cosine at a sphere's point below which that error is taken not to grow (1 % of the points seen from afar).
 LEAST_COSINE = 0.1
 
 # Diameter of a scene in radii of its smallest sphere or cylinder, above which shadow rays test what they hit:
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
 
-# Largest gap before a small sphere, in radii, that shadow rays leave untested where nothing is in it: none of
-# so many rays from the sphere meets another shape there; see experiments, section Rounding.
+# Largest gap before a small sphere, in radii, that shadow rays leave untested where none of so many rays from
+# the sphere meets another shape.
 SHELL, _AROUND = 0.1, 256
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
@@ -55,9 +53,9 @@ def offset_at(magnitude):
 class Errors:
     """Rounding errors of hits on a shape.
 
-    ``ends``: curvature 1 / radius of spheres and cylinders, which shadow rays that end there hit too early
-    (negative if normals point inwards, where needed, see `FAR`); ``starts``: the same for shapes whose hits
-    lie off their surface, cylinders and all round shapes within instances; ``reach``: largest of `reaches`.
+    ``ends``: curvature 1 / radius of spheres and cylinders (negative if normals point inwards, where needed,
+    see `FAR`); ``starts``: the same for shapes whose hits lie off their surface, cylinders and all round
+    shapes within instances; ``reach``: largest of `reaches`.
     """
 
     ends: mi.Float | float
@@ -66,14 +64,13 @@ class Errors:
 
 
 class ShapeErrors:
-    """`Errors` of the scene's shapes, by pointer.
+    """`Errors` of the scene's shapes, by pointer; ``about`` caches facts, see `ShapeFacts.about`.
 
     ``any``: one of them is a sphere or cylinder, or an instance of a group with one; ``small``: one of these
     is so small that shadow rays test what they hit, see `SMALL`.
     """
 
     def __init__(self, scene: mi.Scene, about: Callable = asked_anew):
-        """``about``: caches facts, see `ShapeFacts.about`."""
         shapes = scene.shapes()
         extent = 2 * scene_box(scene, about).bounding_sphere().radius
         with np.errstate(all="ignore"):  # non-finite values are checked elsewhere
@@ -173,15 +170,13 @@ def _stretch(shape) -> np.ndarray:
 
 
 def reaches(shape: mi.Shape) -> np.ndarray:
-    """Magnitude of the coordinates that hits on a shape are computed from.
+    """Magnitude of the coordinates, beyond a hit's, that hits on a shape are computed from.
 
-    Beyond that of the hits; one number, or one per triangle of a mesh (one for an ``ellipsoidsmesh``).
-
-    Coordinates whose rounding moves hits within the surface do not count: corners of rectangles and edges of
-    triangles are weighted by |n_i| / max |n|, so that an axis-aligned floor has 0, however large. With CUDA
-    they all count, since OptiX blocks rays that leave such a floor (experiments, "CUDA"). For spheres,
-    cylinders and grids all coordinates count, for instances all of their shapes. 0 for disks and curves,
-    whose accuracy does not depend on their size.
+    One number, or one per triangle of a mesh (one for an ``ellipsoidsmesh``). Coordinates whose rounding
+    moves hits within the surface do not count: corners of rectangles and edges of triangles are weighted by
+    |n_i| / max |n|, so that an axis-aligned floor has 0 (with CUDA they all count: experiments, "CUDA"). For
+    spheres, cylinders and grids all count, for instances all of their shapes. 0 for disks and curves, whose
+    accuracy does not depend on their size.
     """
     kind = shape.shape_type()
     if is_instance(shape):
@@ -203,7 +198,7 @@ def reaches(shape: mi.Shape) -> np.ndarray:
 
 
 def _uses_embree() -> bool:
-    """Whether Embree intersects rays (LLVM variants); OptiX is less exact on large flat shapes."""
+    """Whether Embree intersects rays; OptiX blocks rays that leave large axis-aligned floors."""
     return dr.backend_v(mi.Float) == dr.JitBackend.LLVM
 
 
@@ -223,7 +218,6 @@ def _reaches_of_triangles(positions, faces) -> np.ndarray:
 
 
 def _finite(x) -> float:
-    """Replace non-finite values, of shapes without extent, by 0."""
     return float(x) if np.isfinite(x) else 0.0
 
 

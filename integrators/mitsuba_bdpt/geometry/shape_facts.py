@@ -46,8 +46,7 @@ class ShapeFacts:
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
         """Return the cached facts; after an edit, new ones about the shapes that were edited.
 
-        Marks have everything that facts depend on; registry indices are part of the key, since facts are
-        looked up by them: the cache may belong to another scene, see `notices.notes`.
+        Registry indices are part of the key: the cache may belong to another scene, see `notices.notes`.
         """
         marks = {registry_id(shape): _mark(shape) for shape in all_shapes(scene)}
         before = next(iter(notes(scene, sensor).get("shapes", {}).values()), None)

@@ -1,8 +1,7 @@
 """Meshes with vertex normals: the face that Mitsuba sampled, and its normal.
 
 The normal has the sign that hits report (``si.n``): that of the face's winding, turned by ``flip_normals``.
-Vertex normals may point to the other side: a mirroring ``to_world`` turns the winding only. The choice is
-replicated here and checked at preparation, see `mitsubas_choices`.
+Vertex normals may point to the other side: a mirroring ``to_world`` turns the winding only.
 """
 
 from __future__ import annotations
@@ -134,10 +133,7 @@ class _Faces:
 
 
 def _arrays(params) -> list[np.ndarray]:
-    """Faces, vertex positions and normals of a mesh, (n, 3).
-
-    By parameters: a shape that Python first met as an emitter's has no mesh methods.
-    """
+    """Faces, vertex positions and normals, (n, 3); a shape first met as an emitter's has no mesh methods."""
     parts = renamed.faces(params), renamed.positions(params), renamed.normals(params)
     return [
         np.array(part, dtype=kind).reshape(-1, 3)

@@ -44,7 +44,7 @@ def is_reversed(shape: mi.Shape) -> bool:
     """Whether normals sampled on ``shape`` are opposite to those of hits (``si.n``).
 
     True for mirrored rectangles, whose hits use the cross product of the edges. (Meshes: see `smooth_meshes`;
-    mirrored disks and spheres agree, mirrored cylinders raise an error in `check_to_world`.)
+    mirrored cylinders raise an error in `check_to_world`.)
     """
     is_rectangle = shape.shape_type() == mi.ShapeType.Rectangle.value
     return is_rectangle and bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
@@ -159,7 +159,6 @@ def check_angles(emitter: mi.Emitter):
 
 _ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}
 
-
 _PLUGINS = {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}
 
 
@@ -170,7 +169,6 @@ def _lengths(matrix) -> str:
 # Shapes that use both matrix and inverse for points, normals and rays. (Disks and spheres, if they only
 # reflect, use the inverse alone, rectangles their corners, and meshes keep no matrix.)
 _USES_BOTH = {mi.ShapeType.Cylinder.value, mi.ShapeType.SDFGrid.value}
-
 
 _CHECKS = {
     mi.ShapeType.Rectangle.value: _rectangle,

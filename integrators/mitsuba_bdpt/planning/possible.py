@@ -106,7 +106,7 @@ def _why_no_path(prepared: PreparedScene, depth: int, needed: int = 1) -> str:
 def _why_not_endpoints(prepared: PreparedScene, settings: Settings) -> str:
     """Why (1,1) is impossible; empty if it is possible."""
     emitters, camera = prepared.emitters, prepared.camera
-    if not camera.connectible:
+    if camera.reason:
         return camera.reason
     if settings.hide_emitters:
         return "hide_emitters: emitters are not seen directly"
@@ -122,7 +122,7 @@ def _why_not_endpoints(prepared: PreparedScene, settings: Settings) -> str:
 def _why_not_arrival(prepared: PreparedScene, settings: Settings) -> str:
     """Why t=0 is impossible; empty if it is possible."""
     emitters, camera = prepared.emitters, prepared.camera
-    if not camera.area:
+    if camera.no_area:
         return camera.no_area
     if settings.hide_emitters and emitters.on_shapes:
         return "hide_emitters: camera rays pass through emitting shapes, which block light subpaths"

@@ -30,9 +30,9 @@ KINDS = ("PerspectiveCamera", "ThinLensCamera")
 class _View:
     """One camera, or a table of them.
 
-    Rows of the transforms (``Vector4f``); affine map from (x/z, y/z) to the unit square and back (four
-    numbers each) and its image of (0, 0); ``area`` of the region at z = 1; clip planes; lens ``radius``;
-    distance of the plane in ``focus``.
+    Rows of the transforms; affine map from (x/z, y/z) to the unit square and back (four numbers each) and its
+    image of (0, 0); ``area`` of the region at z = 1; clip planes; lens ``radius``; distance of the plane in
+    ``focus``.
     """
 
     to_camera: list
@@ -85,9 +85,8 @@ class Camera(Sensor):
         self.delta = not self.lens  # no area: (1,1) with a delta emitter has measure zero
         self._count = len(views)
         self.needs_film_sample = self._count > 1
-        self.area = self.lens and self._count == 1
         if self.lens:
-            self.no_area = "which of the batch's lenses light hits is not looked for"
+            self.no_area = "which of the batch's lenses light hits is not looked for" * (self._count > 1)
         columns = zip(*(_numbers(view, self.region.share) for view in views), strict=True)
         # Opaque, so that moving the camera does not recompile the kernel.
         self._columns = [mi.Float(list(column)) for column in columns]
@@ -119,34 +118,24 @@ class Camera(Sensor):
             p=z0,
             pdf_w=pdf_w,
             weight=mi.Float(1),
-            arrival=cos * view.lens_area() / pdf_w if self.area else mi.Float(0),
+            arrival=mi.Float(0) if self.no_area else cos * view.lens_area() / pdf_w,
         )
 
-    def connect(self, p, u_lens, u_film) -> CameraConnection:
-        which = self._lens_point(u_lens, u_film)
-        _, view, z0, _ = which
-        to_z0 = z0 - p
-        dist2 = dr.squared_norm(to_z0)
-        d = to_z0 * dr.rsqrt(dist2)
-        return self._connection(which, p - z0, d, dist2, (view.near, view.far))
-
-    def connect_direction(self, d, u_lens, u_film) -> CameraConnection:
-        which = self._lens_point(u_lens, u_film)
-        return self._connection(which, -d, mi.Vector3f(d), mi.Float(1), (0, dr.inf))
-
-    def _lens_point(self, u_lens, u_film):
-        """View index, view, and a point of its lens in world and in camera coordinates."""
+    def _point(self, u_lens, u_film):
+        """Point of a lens, the same in camera coordinates, view index, view."""
         index = mi.UInt32(0)
         if self._count > 1:
             index, _ = view_at(u_film.x, self._count)
         view = self._view(index)
         local = view.lens_point(u_lens) if self.lens else mi.Point3f(0)
-        return index, view, _transform(view.to_world, local, 1), local
+        return _transform(view.to_world, local, 1), local, index, view
 
-    def _connection(self, which, outward, d, dist2, clip) -> CameraConnection:
-        index, view, z0, lens = which
-        position, depth, inside = self._project(index, view, outward, lens)
-        within = (depth > 0) & (depth >= clip[0]) & (depth <= clip[1])
+    def _connection(self, point, d, dist2, to_z0=None) -> CameraConnection:
+        z0, lens, index, view = point
+        position, depth, inside = self._project(index, view, -d if to_z0 is None else -to_z0, lens)
+        within = depth > 0
+        if to_z0 is not None:
+            within &= (depth >= view.near) & (depth <= view.far)
         cos = view.axis_cos(-d)
         on_near_plane = z0 - d * (view.near / cos)
         pdf_w = view.density(cos)
@@ -157,7 +146,7 @@ class Camera(Sensor):
             dist2=dist2,
             importance=pdf_w,
             pdf_w=pdf_w,
-            arrival=cos * view.lens_area() / dist2 if self.area else mi.Float(0),
+            arrival=mi.Float(0) if self.no_area else cos * view.lens_area() / dist2,
             position=position,
             reach=(view.far - view.near) / cos,
             valid=inside & within,

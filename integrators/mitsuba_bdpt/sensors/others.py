@@ -34,7 +34,7 @@ class _Parallel(Sensor):
             arrival=mi.Float(0),
         )
 
-    def _connection(self, z0, position, valid) -> CameraConnection:
+    def _connected(self, z0, position, valid) -> CameraConnection:
         return CameraConnection(
             p=mi.Point3f(z0),
             anchor=rays.free_anchor(z0),
@@ -76,7 +76,7 @@ class Orthographic(_Parallel):
         x, y, depth = (dr.dot(row, from_origin) for row in self._rows)
         uv = mi.Point2f(x, y)
         valid = self.region.contains(uv) & (depth >= 0) & (depth <= self._reach)
-        return self._connection(self._on_near_plane(uv), self.region.to_position(uv), valid)
+        return self._connected(self._on_near_plane(uv), self.region.to_position(uv), valid)
 
 
 class Distant(_Parallel):
@@ -109,7 +109,7 @@ class Distant(_Parallel):
         aside = from_origin - self._axis * depth
         z0 = self._origin + aside
         valid = (depth >= 0) & (dr.squared_norm(aside) <= self._radius2)
-        return self._connection(z0, self.region.anywhere(u_film), valid)
+        return self._connected(z0, self.region.anywhere(u_film), valid)
 
 
 class _Face:
@@ -149,22 +149,19 @@ class IrradianceMeter(Sensor):
         super().__init__(sensor)
         self._faces = [_Face(view, shape_errors) for view in views or [sensor]]
         self._density = dr.opaque(mi.Float, 1 / number(self._faces[0].shape.surface_area()))
-        self._find_area(in_scene)
+        self.no_area = self._why_no_area(in_scene)
 
-    def _find_area(self, in_scene: bool):
-        """Set ``area``; ``in_scene``: the shape is in the scene, so that rays can hit it."""
+    def _why_no_area(self, in_scene: bool) -> str:
         if len(self._faces) > 1:
-            self.no_area = "which of the batch's meters light hits is not looked for"
-        elif not in_scene:
-            self.no_area = "the meter's shape is not in the scene"
-        elif not self.region.box or tuple(self.region.crop_size) != (1, 1):
-            # A light subpath determines the point on the shape, but not the film position that maps to it.
-            self.no_area = (
-                "with more than one pixel, or a filter other than box, the film position of a point of its "
-                "shape is unknown"
-            )
-        else:
-            self.area = True
+            return "which of the batch's meters light hits is not looked for"
+        if not in_scene:
+            return "the meter's shape is not in the scene"
+        if self.region.box and tuple(self.region.crop_size) == (1, 1):
+            return ""
+        return (
+            "with more than one pixel, or a filter other than box, the film position of a point of its "
+            "shape is unknown"
+        )
 
     def _sample(self, u, shared):
         if len(self._faces) == 1:
@@ -186,21 +183,16 @@ class IrradianceMeter(Sensor):
             p=p,
             pdf_w=pdf_w,
             weight=mi.Float(dr.pi),
-            arrival=dr.pi / self._density if self.area else mi.Float(0),  # cos / (density * cos / pi)
+            # cos / (density * cos / pi)
+            arrival=mi.Float(0) if self.no_area else dr.pi / self._density,
         )
 
-    def connect(self, p, u_lens, u_film) -> CameraConnection:
-        z0, n, anchor = self._sample(u_film, self._like())
-        to_z0 = z0 - p
-        dist2 = dr.squared_norm(to_z0)
-        d = to_z0 * dr.rsqrt(dist2)
-        return self._connection(z0, n, mi.Vector3f(d), dist2, anchor, u_film)
+    def _point(self, u_lens, u_film):
+        any_time = dr.zeros(mi.Interaction3f)  # shapes do not move
+        return *self._sample(u_film, any_time), u_film
 
-    def connect_direction(self, d, u_lens, u_film) -> CameraConnection:
-        z0, n, anchor = self._sample(u_film, self._like())
-        return self._connection(z0, n, mi.Vector3f(d), mi.Float(1), anchor, u_film)
-
-    def _connection(self, z0, n, d, dist2, anchor, u_film) -> CameraConnection:
+    def _connection(self, point, d, dist2, to_z0=None) -> CameraConnection:
+        z0, n, anchor, u_film = point
         cos = dr.dot(n, -d)
         return CameraConnection(
             p=z0,
@@ -209,14 +201,11 @@ class IrradianceMeter(Sensor):
             dist2=dist2,
             importance=cos,
             pdf_w=cos * dr.inv_pi,
-            arrival=cos / (dist2 * self._density) if self.area else mi.Float(0),
+            arrival=mi.Float(0) if self.no_area else cos / (dist2 * self._density),
             position=self.region.to_position(u_film),
             reach=mi.Float(dr.inf),
             valid=cos > 0,
         )
-
-    def _like(self):
-        return dr.zeros(mi.Interaction3f)  # shapes do not move: any time will do
 
     def hit(self, walk, vertex, distant) -> SensorHit:
         si = vertex.si
@@ -236,7 +225,6 @@ class RayOnlySensor(Sensor):
     """Sensors, one or several side by side, that use Mitsuba's camera rays alone."""
 
     needs_aperture_sample = True
-    connectible = False
 
     def __init__(self, sensor, reason: str, views=None):
         super().__init__(sensor)

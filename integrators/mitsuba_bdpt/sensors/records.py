@@ -139,15 +139,13 @@ class Sensor:
     * ``region`` of the film; ``parallel``: all camera rays have one direction.
     * ``needs_aperture_sample``: z_0 needs a random point; ``needs_film_sample``: a connection a second one.
     * ``delta``: a connection with a delta emitter has measure zero.
-    * ``connectible``: vertices of light subpaths can be connected to it, else ``reason`` says why.
-    * ``area``: light subpaths can hit it (t = 0), else ``no_area`` says why.
+    * ``reason``: why vertices of light subpaths cannot be connected to it; empty if they can.
+    * ``no_area``: why light subpaths cannot hit it (t = 0); empty if they can.
     """
 
     needs_aperture_sample = False
     delta = True
     parallel = False
-    connectible = True
-    area = False
     needs_film_sample = False
     reason = ""
     no_area = "light cannot hit a pinhole (delta) sensor"
@@ -169,12 +167,21 @@ class Sensor:
 
     def connect(self, p: mi.Point3f, u_lens: mi.Point2f, u_film: mi.Point2f | None) -> CameraConnection:
         """Connect the scene point ``p`` with z_0, chosen by ``u_lens`` and ``u_film``."""
+        point = self._point(u_lens, u_film)
+        to_z0 = point[0] - p
+        dist2 = dr.squared_norm(to_z0)
+        return self._connection(point, mi.Vector3f(to_z0 * dr.rsqrt(dist2)), dist2, to_z0)
+
+    def connect_direction(self, d: mi.Vector3f, u_lens: mi.Point2f, u_film) -> CameraConnection:
+        """Like `connect`, for light from infinity along ``d``; ``dist2`` is 1."""
+        return self._connection(self._point(u_lens, u_film), mi.Vector3f(d), mi.Float(1))
+
+    def _point(self, u_lens, u_film) -> tuple:
+        """Sample z_0, followed by what `_connection` needs besides."""
         raise NotImplementedError
 
-    def connect_direction(
-        self, d: mi.Vector3f, u_lens: mi.Point2f, u_film: mi.Point2f | None
-    ) -> CameraConnection:
-        """Like `connect`, for light from infinity along ``d``; ``dist2`` is 1."""
+    def _connection(self, point, d, dist2, to_z0=None) -> CameraConnection:
+        """Connection along ``d`` with a ``point`` of `_point`; ``to_z0``: from the scene point, if finite."""
         raise NotImplementedError
 
     def hit(self, walk, vertex, distant) -> SensorHit:
