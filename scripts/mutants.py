@@ -282,8 +282,8 @@ MUTANTS = (
     Mutant(
         "emitters: lamps on meshes are in Mitsuba's order",
         "emitters/order.py",
-        "sorted(on_meshes, key=key)",
-        "on_meshes",
+        "sorted(slots, key=key)",
+        "slots",
         ("tests/emitters/test_order.py::test_a_seed_has_one_image_in_every_load",),
     ),
     Mutant(

@@ -22,8 +22,8 @@ from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import LEAVES, children, named, number, own_parameters
 from ..host.notices import State
-from .group import Context, Group, HitOnlyEmitters, weight_over
-from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
+from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
+from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Place
 from .surfaces import Surfaces
 from .tables import Mask, look_up, rows, table
 from .textured import is_mapped
@@ -349,13 +349,13 @@ class AreaEmitters(Group):
             weight = dr.select(own, 0, weight)
         return ds, pdf_w, weight
 
-    def hit_densities(self, chosen: Chosen, hit: Hit, active):
-        si, ds = hit.si, hit.direction()
+    def hit_densities(self, chosen: Chosen, si, previous, ds, active):
+        ds = mi.DirectionSample3f(ds)
         ds.n = mi.Normal3f(si.n)
-        pdf_w = chosen.pmf * self.direct_pdf_w(chosen.emitter, chosen.index, hit.previous, ds, active)
+        pdf_w = chosen.pmf * self.direct_pdf_w(chosen.emitter, chosen.index, previous, ds, active)
         pdf_a = self.pdf_a(chosen.emitter, chosen.index, si, si.n, active)
         direction = self._direction_pdf_w(chosen.index, mi.Frame3f.cos_theta(si.wi), -ds.d, active)
-        return pdf_w * hit.to_area(ds), chosen.pmf * pdf_a, direction
+        return pdf_w * to_area(si, ds), chosen.pmf * pdf_a, direction
 
 
 def _towards(emitter, ps, si, active) -> mi.DirectionSample3f:

@@ -24,7 +24,7 @@ from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party
 from .order import in_order
 from .radiance import BlackEmitters
-from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Hit, Place
+from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Place
 from .tables import Mask, inverse_table
 
 
@@ -279,9 +279,10 @@ class Emitters:
         chosen.emitter = emitter
         before = dr.zeros(mi.Interaction3f)
         before.p, before.time, before.wavelengths = previous, si.time, si.wavelengths
-        hit = Hit(self.scene, si, before)
+        ds = mi.DirectionSample3f(self.scene, si, before)
+        ds.time = mi.Float(si.time)
         hittable = [group for group in self.groups if type(group) in self._hittable_types]
-        return self._query("hit_densities", index, active, chosen, hit, among=hittable)
+        return self._query("hit_densities", index, active, chosen, si, before, ds, among=hittable)
 
 
 def _make_opaque(emitters, facts: ShapeFacts):

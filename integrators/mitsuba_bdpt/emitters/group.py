@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import named
-from .records import Chosen, EmissionGuide, Hit
+from .records import Chosen, EmissionGuide
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,8 @@ class Group:
     Constructed from ``emitters``, in the order of `order.in_order` with None for those of other groups, and a
     `Context`. A group has the methods of the strategies that its emitters support:
 
-    * ``hit_densities(chosen, hit)``: camera subpaths hit them (`is_hittable`: each one).
+    * ``hit_densities(chosen, si, previous, ds)``: camera subpaths hit them (`is_hittable`: each one). ``ds``:
+      the hit ``si`` as a sample of next-event estimation at ``previous``, not to be changed.
     * ``complete_direct(chosen, ds, weight, si, u)``: next-event estimation. Completes ``ds``, ``weight``, the
       result of ``sample_direction``, one call for all groups, not to be changed (0 where the group
       ``redraws``). Densities of the `Direct` include the selection; ``met`` stays None.
@@ -101,7 +102,7 @@ class HitOnlyEmitters(Group):
     def __init__(self, emitters, context: Context):
         pass
 
-    def hit_densities(self, chosen: Chosen, hit: Hit, active):
+    def hit_densities(self, chosen: Chosen, si, previous, ds, active):
         return mi.Float(0), mi.Float(0), mi.Float(0)
 
 
@@ -116,3 +117,8 @@ def weight_over(pmf, weight, pdf):
     """Weight of next-event estimation over ``pmf``; NaN for non-finite densities."""
     weight = dr.select(pdf == 0, 0, weight / pmf)
     return dr.select(dr.isfinite(pdf), weight, dr.nan)
+
+
+def to_area(si, ds):
+    """Factor that converts the density of ``ds``, the hit ``si``, from solid angle to area."""
+    return dr.abs(dr.dot(si.n, ds.d)) / dr.square(ds.dist)

@@ -13,7 +13,7 @@ from ..geometry.to_world import check_rotation
 from ..host.introspection import own_parameters
 from .disks import AIMED, Disks
 from .group import Context, Group, emitting_point, weight_over
-from .records import Chosen, Direct, Emission, Factor, Hit, Place
+from .records import Chosen, Direct, Emission, Factor, Place
 from .tables import Mask, cell_at, rows
 
 # Bins per dimension of an environment's directions, each with a square of points on a disk.
@@ -140,10 +140,9 @@ class InfiniteEmitters(Group):
             emission_ratio=self._point_pdf_a(chosen.index, si.p, ds.d, active, -1),
         )
 
-    def hit_densities(self, chosen: Chosen, hit: Hit, active):
-        ds = hit.direction()
-        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
-        return pdf_w, mi.Float(pdf_w), self._point_pdf_a(chosen.index, hit.previous.p, ds.d, active, -1)
+    def hit_densities(self, chosen: Chosen, si, previous, ds, active):
+        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(previous, ds, active)
+        return pdf_w, mi.Float(pdf_w), self._point_pdf_a(chosen.index, previous.p, ds.d, active, -1)
 
 
 def _is_directional(emitter) -> bool:

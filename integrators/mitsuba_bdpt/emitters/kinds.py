@@ -9,11 +9,11 @@ from ..geometry import rays
 from ..host.jit import registered_emitters
 from .area import AreaEmitters
 from .directional_area import DirectionalAreaEmitters
-from .group import Context, Group, HitOnlyEmitters, weight_over
+from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
 from .infinite import InfiniteEmitters
 from .position import PositionEmitters
 from .radiance import BlackEmitters, is_black
-from .records import Chosen, Direct, Hit
+from .records import Chosen, Direct
 
 
 class ThirdPartyEmitters(Group):
@@ -54,10 +54,9 @@ class ThirdPartyEmitters(Group):
             emission_ratio=mi.Float(0),
         )
 
-    def hit_densities(self, chosen: Chosen, hit: Hit, active):
-        ds = hit.direction()
-        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(hit.previous, ds, active)
-        connect = dr.select(hit.si.is_valid(), pdf_w * hit.to_area(ds), pdf_w)
+    def hit_densities(self, chosen: Chosen, si, previous, ds, active):
+        pdf_w = chosen.pmf * chosen.emitter.pdf_direction(previous, ds, active)
+        connect = dr.select(si.is_valid(), pdf_w * to_area(si, ds), pdf_w)
         return connect, mi.Float(0), mi.Float(0)
 
 

@@ -6,6 +6,8 @@ the order of their addresses in memory, another one in each load, unless loaded 
 
 from __future__ import annotations
 
+from collections import Counter
+
 import mitsuba as mi
 
 
@@ -15,24 +17,14 @@ def in_order(scene: mi.Scene) -> list[mi.Emitter]:
     Those of equal ids are in the order of their places.
     """
     emitters = scene.emitters()
-    slots = [i for i, emitter in enumerate(emitters) if _is_on_mesh(emitter)]
-    on_meshes = [emitters[i] for i in slots]
-    ids = [emitter.get_shape().id() for emitter in on_meshes]
-    key = _by_id if len(set(ids)) == len(ids) else _by_id_and_place
-    for i, emitter in zip(slots, sorted(on_meshes, key=key), strict=True):
-        emitters[i] = emitter
+    shapes = [emitter.get_shape() for emitter in emitters]
+    slots = [i for i, shape in enumerate(shapes) if shape is not None and shape.is_mesh()]
+    ids = Counter(shapes[i].id() for i in slots)
+
+    def key(i: int) -> tuple:
+        box, name = shapes[i].bbox(), shapes[i].id()
+        return name, *((tuple(box.min), tuple(box.max), str(emitters[i])) if ids[name] > 1 else ())
+
+    for slot, emitter in zip(slots, [emitters[i] for i in sorted(slots, key=key)], strict=True):
+        emitters[slot] = emitter
     return emitters
-
-
-def _is_on_mesh(emitter: mi.Emitter) -> bool:
-    shape = emitter.get_shape()
-    return shape is not None and shape.is_mesh()
-
-
-def _by_id(emitter: mi.Emitter) -> str:
-    return emitter.get_shape().id()
-
-
-def _by_id_and_place(emitter: mi.Emitter) -> tuple:
-    box = emitter.get_shape().bbox()
-    return _by_id(emitter), tuple(box.min), tuple(box.max), str(emitter)

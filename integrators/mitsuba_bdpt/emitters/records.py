@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
@@ -109,22 +108,3 @@ class EmissionGuide(Protocol):
     def density(self, index: mi.UInt32, place: Place, active) -> mi.Float: ...
 
     def warp(self, index: mi.UInt32, which: mi.UInt32, u: mi.Point2f, active) -> tuple: ...
-
-
-@dataclass
-class Hit:
-    """Emitter point ``si`` hit (or missed into) by a camera subpath from ``previous``."""
-
-    scene: mi.Scene
-    si: mi.SurfaceInteraction3f
-    previous: mi.Interaction3f
-
-    def direction(self) -> mi.DirectionSample3f:
-        """The hit as a sample of next-event estimation from ``previous``."""
-        ds = mi.DirectionSample3f(self.scene, self.si, self.previous)
-        ds.time = mi.Float(self.si.time)
-        return ds
-
-    def to_area(self, ds):
-        """Factor that converts the density of ``ds`` from solid angle to area."""
-        return dr.abs(dr.dot(self.si.n, ds.d)) / dr.square(ds.dist)

@@ -22,13 +22,8 @@ from .tables import Mask, look_up, switch, table
 # Half a step of the random numbers; replaces coordinates of 0, where the density is infinite.
 _LEAST = 2.0**-25
 
-_RECTANGLE, _DISK, _SPHERE = range(3)
-
-_KINDS = {
-    mi.ShapeType.Rectangle.value: _RECTANGLE,
-    mi.ShapeType.Disk.value: _DISK,
-    mi.ShapeType.Sphere.value: _SPHERE,
-}
+_KINDS = mi.ShapeType.Rectangle, mi.ShapeType.Disk, mi.ShapeType.Sphere
+_RECTANGLE, _DISK, _SPHERE = (float(kind.value) for kind in _KINDS)
 
 
 @dataclass
@@ -39,7 +34,7 @@ class _Map:
     `Sphere`; ``area``: of a unit square of a flat shape's own coordinates, or a sphere's squared radius.
     """
 
-    kind: mi.Float | float = float(_RECTANGLE)
+    kind: mi.Float | float = _RECTANGLE
     x: mi.Vector3f | tuple = (0, 0, 0)
     y: mi.Vector3f | tuple = (0, 0, 0)
     z: mi.Vector3f | tuple = (0, 0, 0)
@@ -53,10 +48,10 @@ class _Map:
         matrix = matrix_of(shape)
         x, y, z, origin = (tuple(column) for column in matrix[:3].T)
         if sphere is not None:
-            return _Map(float(_SPHERE), x, y, z, origin, outward=sphere.outward, area=sphere.radius**2)
+            return _Map(_SPHERE, x, y, z, origin, outward=sphere.outward, area=sphere.radius**2)
         n = tuple(dr.slice(shape.sample_position(0, mi.Point2f(0.5)).n))
         area = float(np.linalg.norm(np.cross(x, y)))
-        return _Map(float(_KINDS[shape.shape_type()]), x, y, z, origin, n=n, area=area)
+        return _Map(float(shape.shape_type()), x, y, z, origin, n=n, area=area)
 
 
 class TexturedPoints:
