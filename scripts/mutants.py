@@ -459,7 +459,7 @@ MUTANTS = (
         "sensors/cameras.py",
         "return dr.rcp(self.area * cos * cos * cos)",
         "return dr.rcp(self.area * cos * cos)",
-        ("tests/emitters/test_endpoints.py::test_importance_integrates_to_one[plain]",),
+        ("tests/sensors/test_sensor_densities.py::test_importance_integrates_to_the_weight[plain]",),
     ),
     Mutant(
         "adjoint: no ratio of geometric cosines in the walk",
@@ -582,7 +582,7 @@ MUTANTS = (
         "sensors/cameras.py",
         "x, y = x + lens.x / view.focus, y + lens.y / view.focus",
         "x, y = x - lens.x / view.focus, y - lens.y / view.focus",
-        ("tests/emitters/test_endpoints.py::test_splats_land_where_rays_started[thinlens]",),
+        ("tests/sensors/test_sensor_densities.py::test_a_join_is_the_ray_back[thinlens]",),
     ),
     Mutant(
         "sensors: t = 0 lacks the cosine at the lens",
@@ -603,7 +603,7 @@ MUTANTS = (
         "sensors/cameras.py",
         "area = 1 / abs(np.linalg.det(to_film)) * share",
         "area = 1 / abs(np.linalg.det(to_film))",
-        ("tests/emitters/test_endpoints.py::test_importance_integrates_to_one[sample_border]",),
+        ("tests/sensors/test_sensor_densities.py::test_importance_integrates_to_the_weight[sample_border]",),
     ),
     Mutant(
         "sensors: orthographic rays without an end",

@@ -14,22 +14,19 @@ import pytest
 import welch
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.kinds import GROUPS, group_of
-from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
-from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.transport.inputs import Shared
 from scene_parts import (
+    CAMERAS,
     EGG,
     EMITTERS,
     T,
     emitter_part,
     grey,
-    orthographic,
     perspective,
     register_plugins,
     room,
     texture,
-    thinlens,
 )
 from welch import tiles
 
@@ -342,189 +339,27 @@ def test_rotated_environment_by_light_tracing_alone():
 
 # -- sensors ----------------------------------------------------------------------------------
 
-CAMERAS = {
-    "plain": perspective,
-    "crop": lambda: perspective(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16),
-    "off axis": lambda: perspective(
-        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15}
+SEEN = {name: (make, {}) for name, make in CAMERAS.items() if name not in ("plain", "thinlens")} | {
+    "near and far clip": (
+        lambda: perspective(keys={"near_clip": 1.0, "far_clip": 6.0}),
+        {"type": "disk", "to_world": T().look_at([0, 1.8, 4.4], [0, 2, 5], [0, 1, 0]).scale(0.15)},
     ),
-    "off axis, crop": lambda: perspective(
-        size=32,
-        crop_offset_x=10,
-        crop_offset_y=3,
-        crop_width=16,
-        crop_height=16,
-        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15},
-    ),
-    **{
-        f"fov {axis}": (lambda axis=axis: perspective(height=24, keys={"fov_axis": axis}))
-        for axis in ("x", "y", "diagonal", "smaller", "larger")
-    },
-    "thinlens": thinlens,
-    "thinlens, crop": lambda: thinlens(
-        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
-    ),
-    "sample_border": lambda: perspective(rfilter="gaussian", sample_border=True),
-    "orthographic": orthographic,
-    "orthographic, stretched, crop": lambda: orthographic(
-        1.5,
-        keys={"near_clip": 0.5, "far_clip": 12.0},
-        size=32,
-        height=24,
-        crop_offset_x=10,
-        crop_offset_y=3,
-        crop_width=16,
-        crop_height=16,
-    ),
-    "orthographic, sample_border": lambda: orthographic(rfilter="gaussian", sample_border=True),
+    "default focus distance": (lambda: perspective() | {"type": "thinlens", "aperture_radius": 0.02}, {}),
 }
 
 
-def camera_of(sensor):
-    scene = mi.load_dict({"type": "scene"})
-    camera = sensors.prepare(sensor, ShapeErrors(scene), scene)
-    return camera, like_of_rgb()
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_splats_land_where_rays_started(name):
-    """Rationale: a splat's film position must be that of the camera ray that finds the same point.
-    Expected: joining a point on a camera ray gives back the ray's film position within 1e-4 pixels
-    (float32: 1e-7 of some 30 pixels, times ten), and the density with which the ray was sampled
-    within 1e-4.
-    """
-    sensor = mi.load_dict(CAMERAS[name]())
-    camera, like = camera_of(sensor)
-    n = 5000
-    rng = np.random.default_rng(6)
-    u = rng.random((5, n), dtype=np.float32)
-    width, height = (int(x) for x in camera.region.size)
-    index = mi.UInt32(rng.integers(0, width * height, n).astype(np.uint32))
-    lens = mi.Point2f(u[2], u[3])
-    start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
-    reach = dr.minimum(start.ray.maxt, 20)
-    p = start.ray.o + start.ray.d * (reach * mi.Float(0.02 + 0.96 * u[4]))
-    join = camera.connect(p, lens, None)
-    assert np.array(join.valid).mean() > 0.999  # float32 loses a few on the film's rim
-    for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
-        assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
-    np.testing.assert_allclose(join.importance, start.pdf_w, rtol=1e-4)
-
-
-@pytest.mark.parametrize("name", [k for k in CAMERAS if "orthographic" not in k])
-def test_splats_do_not_depend_on_where_the_camera_stands(name):
-    """Rationale: where a light vertex is seen follows from its direction from the lens point; taken back from
-    world to camera coordinates, a lens point 1e4 units away is off by up to 1e-3, and so were splats, of
-    pinholes too: by 2e-2 pixels here, more in larger images. Expected: the direction of a camera ray, joined
-    with the same point of the lens, gives back the ray's film position within 1e-4 pixels, as at the origin.
-    Eight places, since in some of them rounding errors cancel.
-    """
-    rng = np.random.default_rng(6)
-    for shift in rng.uniform(-1e4, 1e4, (8, 3)):
-        part = CAMERAS[name]()
-        away = mi.ScalarTransform4f().translate(shift.tolist()).rotate([0.6, 0, 0.8], 35)
-        part["to_world"] = away @ part["to_world"]
-        camera, like = camera_of(mi.load_dict(part))
-        u = rng.random((5, 500), dtype=np.float32)
-        width, height = (int(x) for x in camera.region.size)
-        index, lens = mi.UInt32((u[4] * width * height).astype(np.uint32)), mi.Point2f(u[2], u[3])
-        start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[1]), lens, like)
-        join = camera.connect_direction(-start.ray.d, lens, None)
-        assert np.array(join.valid).mean() > 0.99  # float32 loses a few on the film's rim
-        for a, b in ((join.position.x, start.position.x), (join.position.y, start.position.y)):
-            assert np.max(np.abs(np.array(a) - np.array(b))) < 1e-4
-
-
-@pytest.mark.parametrize("name", CAMERAS)
-def test_camera_rays_are_those_of_mitsuba(name):
-    """Rationale: camera rays are made here, with run-time values where Mitsuba's are literals in the
-    kernel. Expected: origin, direction and length of `sensor.sample_ray` for the same film position and
-    lens sample, within 1e-5 of the scene's scale (float32, some ten operations).
-    """
-    sensor = mi.load_dict(CAMERAS[name]())
-    camera, like = camera_of(sensor)
-    u = np.random.default_rng(8).random((4, 5000), dtype=np.float32)
-    width, height = (int(x) for x in camera.region.size)
-    index = mi.UInt32((u[3] * width * height).astype(np.uint32))
-    lens = mi.Point2f(u[1], u[2])
-    start = camera.start(camera.region.pixel(index), mi.Point2f(u[0], u[3]), lens, like)
-    film = sensor.film()
-    uv = (start.position - mi.Point2f(film.crop_offset())) / mi.Point2f(film.crop_size())
-    ray, _ = sensor.sample_ray(0, 0.5, uv, lens)
-    np.testing.assert_allclose(start.ray.o, ray.o, atol=1e-5)
-    np.testing.assert_allclose(start.ray.d, ray.d, atol=1e-5)
-    np.testing.assert_allclose(start.ray.maxt, ray.maxt, rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", [k for k in CAMERAS if "orthographic" not in k])
-def test_importance_integrates_to_one(name):
-    """Rationale: W_e as a density over directions. Expected: its integral over the hemisphere is 1 for
-    a fixed lens point (uniform sampling of a cone around the axis). Tolerance: five standard errors, the
-    standard error below 1 %.
-    """
-    sensor = mi.load_dict(CAMERAS[name]())
-    camera, _ = camera_of(sensor)
-    n = 400_000
-    rng = np.random.default_rng(7)
-    u = rng.random((2, n), dtype=np.float32)
-    cos = np.cos(np.deg2rad(50))
-    local = mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), mi.Float(float(cos)))
-    to_world = sensor.world_transform()
-    d = to_world @ mi.Vector3f(local)
-    lens = mi.Point2f(0.3, 0.6)
-    join = camera.connect(camera._lens_point(lens, None)[2] + 7 * d, lens, None)
-    values = np.where(np.array(join.valid), np.array(join.importance), 0) * 2 * np.pi * (1 - cos)
-    error = values.std() / np.sqrt(n)
-    assert error < 0.01
-    assert abs(values.mean() - 1) < 5 * error
-
-
-@pytest.mark.parametrize("name", [k for k in CAMERAS if k not in ("plain", "thinlens")])
+@pytest.mark.parametrize("name", SEEN)
 def test_every_camera_sees_what_path_sees(name):
     """Rationale: crop windows, offsets of the principal point (where Mitsuba's sample_direction loses
-    28 to 45 % of the points) and field-of-view axes change the importance. Expected: t = 1 alone
+    28 to 45 % of the points) and field-of-view axes change the importance; a blocker before the near plane
+    neither is seen nor hides the floor from t = 1, nor is the wall beyond the far plane seen; Mitsuba's
+    thinlens.sample_direction returns zero at its default focus distance, the far clip. Expected: t = 1 alone
     equals s = 1 alone, and all strategies equal `path`. Tolerance: the confidence interval, below
     12 % and 2 %. Statistic: Welch over tiles, 10 seeds a side.
     """
-    scene = mi.load_dict(room(CAMERAS[name]()) | {"lamp": EMITTERS["point"]()})
-    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
-    a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
-    agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
-    path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
-    agree(tiles(a[..., :3]), tiles(path), 0.02)
-
-
-def test_near_and_far_clip():
-    """Rationale: rays start on the near plane and end on the far one. Expected: a blocker before the
-    near plane neither is seen nor hides the floor from t = 1; a wall beyond the far plane is not
-    seen by t = 1 either. All strategies equal `path`. Tolerance: the confidence interval, below
-    2 %; t = 1 alone against s = 1 alone 10 %. Statistic: Welch over tiles.
-    """
-    scene = mi.load_dict(
-        room(perspective(keys={"near_clip": 1.0, "far_clip": 6.0}))
-        | {
-            "lamp": EMITTERS["point"](),
-            "blocker": {
-                "type": "disk",
-                "bsdf": grey(0.3),
-                "to_world": T().look_at([0, 1.8, 4.4], [0, 2, 5], [0, 1, 0]).scale(0.15),
-            },
-        }
-    )
-    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
-    a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
-    agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)
-    path = render(scene, integrator("path", max_depth=2), range(100, 110), 256)
-    agree(tiles(a[..., :3]), tiles(path), 0.02)
-
-
-def test_thin_lens_at_its_default_focus_distance():
-    """Rationale: Mitsuba's thinlens.sample_direction returns zero when the focus distance is the far
-    clip, which is its default. Expected: t = 1 alone equals s = 1 alone, and everything `path`.
-    Tolerance and statistic as above.
-    """
-    sensor = perspective() | {"type": "thinlens", "aperture_radius": 0.02}
-    scene = mi.load_dict(room(sensor) | {"lamp": EMITTERS["point"]()})
+    make, blocker = SEEN[name]
+    more = {"blocker": blocker | {"bsdf": grey(0.3)}} if blocker else {}
+    scene = mi.load_dict(room(make()) | {"lamp": EMITTERS["point"]()} | more)
     bdpt = integrator(max_depth=2, skip="none", layers="strategies")
     a, b = render(scene, bdpt, range(10), 256), render(scene, bdpt, range(50, 60), 256)
     agree(tiles(layer(a, bdpt, "unweighted.s2t1")), tiles(layer(b, bdpt, "unweighted.s1t2")), 0.12)

@@ -404,6 +404,45 @@ SENSORS = {
 }
 
 
+# Cameras whose film, crop window, lens or field of view differ.
+CAMERAS = {
+    "plain": perspective,
+    "crop": lambda: perspective(size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16),
+    "off axis": lambda: perspective(
+        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15}
+    ),
+    "off axis, crop": lambda: perspective(
+        size=32,
+        crop_offset_x=10,
+        crop_offset_y=3,
+        crop_width=16,
+        crop_height=16,
+        keys={"principal_point_offset_x": 0.2, "principal_point_offset_y": -0.15},
+    ),
+    **{
+        f"fov {axis}": (lambda axis=axis: perspective(height=24, keys={"fov_axis": axis}))
+        for axis in ("x", "y", "diagonal", "smaller", "larger")
+    },
+    "thinlens": thinlens,
+    "thinlens, crop": lambda: thinlens(
+        size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
+    ),
+    "sample_border": lambda: perspective(rfilter="gaussian", sample_border=True),
+    "orthographic": orthographic,
+    "orthographic, stretched, crop": lambda: orthographic(
+        1.5,
+        keys={"near_clip": 0.5, "far_clip": 12.0},
+        size=32,
+        height=24,
+        crop_offset_x=10,
+        crop_offset_y=3,
+        crop_width=16,
+        crop_height=16,
+    ),
+    "orthographic, sample_border": lambda: orthographic(rfilter="gaussian", sample_border=True),
+}
+
+
 def with_shutter(part):
     """The sensor's entry with a shutter that is open from 0 to 1."""
     if "sensor" in part:
