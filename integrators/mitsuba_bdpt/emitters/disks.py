@@ -23,8 +23,8 @@ DETAIL = 0.25
 # Largest radius of the details' bounding sphere relative to the scene's; above there is little to gain.
 LOCAL = 0.5
 
-# Smallest radius of the details' sphere relative to the scene's size plus distance from the origin: whether a
-# subpath of a disk passes a point is known up to rounding (6e-8 of the same).
+# Smallest radius of the details' sphere relative to the scene's size plus distance from the origin, of which
+# rounding is 6e-8.
 TINY = 1e-4
 
 # Relative enlargement of bounding spheres, so that surfaces on them are not missed.
@@ -137,18 +137,16 @@ class Disks:
         in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
         if aimed is not None:  # rounding may move a point of its disk's rim outside
             in_scene, in_details = in_scene | ~aimed, in_details | aimed
-        return dr.select(in_scene, (1 - share) * scene, 0) + dr.select(
-            in_details, share * self.details.pdf_a(), 0
-        )
+        of_details = dr.select(in_details, share * self.details.pdf_a(), 0)
+        return dr.select(in_scene, (1 - share) * scene, 0) + of_details
 
     def factor(self, p, d, share: float) -> Factor:
         """Effect of tables on the density of subpaths past ``p``; ``share``: see `share`."""
         if self.details is None:
             return Factor.whole()
-        in_scene, in_details = self.scene.is_passed(p, d), self.details.is_passed(p, d)
         before = self.pdf_a(p, d)
-        scaled = dr.select(in_scene, (1 - share) * self.scene.pdf_a(), 0)
-        kept = dr.select(in_details, share * self.details.pdf_a(), 0)
+        scaled = dr.select(self.scene.is_passed(p, d), (1 - share) * self.scene.pdf_a(), 0)
+        kept = dr.select(self.details.is_passed(p, d), share * self.details.pdf_a(), 0)
         usual = before == 0
         return Factor(dr.select(usual, 1, scaled / before), dr.select(usual, 0, kept / before))
 
@@ -177,10 +175,9 @@ def details(found: list, whole):
 
     None if there are none, if they are spread out (`LOCAL`), or too small for rounding (`TINY`).
     """
-    size = max(whole.extents())
     small = mi.ScalarBoundingBox3f()
     for box in found:
-        if max(box.extents()) <= DETAIL * size:
+        if max(box.extents()) <= DETAIL * max(whole.extents()):
             small.expand(box)
     if not small.valid():
         return None

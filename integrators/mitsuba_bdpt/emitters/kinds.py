@@ -19,8 +19,7 @@ from .records import Chosen, Direct
 class ThirdPartyEmitters(Group):
     """Emitters of user-defined classes: only calls that camera subpaths need are used.
 
-    No light subpath starts from them. Their density gets the normal of Mitsuba's ``DirectionSample3f``, not
-    the geometric one.
+    Their density gets the normal of Mitsuba's ``DirectionSample3f``, not the geometric one.
     """
 
     limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"

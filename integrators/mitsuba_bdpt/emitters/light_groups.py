@@ -95,18 +95,17 @@ def _layer_name(emitter_id: str) -> str:
 
 
 def _ids(emitter: mi.Emitter) -> list[str]:
-    """Return an emitter's ids: its shape's and its own, if they have one."""
+    """Return the ids of an emitter's shape and its own, if they have one."""
     return [owner.id() for owner in (emitter.get_shape(), emitter) if owner is not None and owner.id()]
 
 
 def _place(emitter: mi.Emitter) -> str:
-    """Say where an emitter is, if it is on a shape."""
     shape = emitter.get_shape()
     return "" if shape is None else " at ({:.3g}, {:.3g}, {:.3g})".format(*shape.bbox().center())
 
 
 def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
-    """Return a name for each emitter that a layer can have: its id or, if it has none, its plugin's name.
+    """Return names of layers for emitters: their ids or, of those without, their plugins' names.
 
     An id that is a layer's name is the name of its emitter alone; other names that are taken get a number.
     """
@@ -196,12 +195,11 @@ def _matched(
     real = [_ids(emitter) for emitter in emitters]
     known = [list(dict.fromkeys([*ids, made])) for ids, made in zip(real, names, strict=True)]
     every = sorted({name for of_one in known for name in of_one})
-    one_each = sorted({of_one[0] for of_one in known})
-    there = f"Emitters: {listed(one_each, 20)}"
+    there = f"Emitters: {listed(sorted({of_one[0] for of_one in known}), 20)}"
     there += f"; {_SEPARATORS}" if re.search("[,;]", "".join(every)) else ""
     found: dict[int, str] = {}
     unmatched: list[tuple[str, str]] = []
-    for name, pattern in ((name, pattern) for name, patterns in groups.items() for pattern in patterns):
+    for name, pattern in [(name, pattern) for name, patterns in groups.items() for pattern in patterns]:
         own = [i for i, ids in enumerate(real) if pattern in ids]
         own = own or [i for i, made in enumerate(names) if made == pattern]
         own = own or [i for i, of_one in enumerate(known) if any(matches(n, pattern) for n in of_one)]

@@ -129,11 +129,8 @@ def _of_point(emitter) -> _Cone:
 def _of_spot(emitter) -> _Cone:
     check_angles(emitter)
     params = own_parameters(emitter)
-    to_world = params["to_world"]
-    x, y, z = (
-        dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*a))))
-        for a in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-    )
+    to_world, axes = params["to_world"], ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    x, y, z = (dr.slice(dr.normalize(mi.Vector3f(to_world @ mi.Vector3f(*axis)))) for axis in axes)
     cutoff_angle = mi.Float(params["cutoff_angle"])
     cos_cutoff = dr.slice(dr.cos(dr.deg2rad(cutoff_angle)))
     if cos_cutoff >= 1:
@@ -141,8 +138,7 @@ def _of_spot(emitter) -> _Cone:
             f"spot {named(emitter)} has cutoff_angle={dr.slice(cutoff_angle):g}, a cone without "
             "width in single precision; make it 0.02 degrees or more"
         )
-    pdf_w = 1 / (2 * dr.pi * (1 - cos_cutoff))
-    return _Cone(_origin(to_world), x, y, z, cos_cutoff, pdf_w)
+    return _Cone(_origin(to_world), x, y, z, cos_cutoff, pdf_w=1 / (2 * dr.pi * (1 - cos_cutoff)))
 
 
 def _origin(to_world):

@@ -20,8 +20,8 @@ NARROW_SIN2 = 1e-3
 # As in ``Sphere::sample_direction``, which samples by area from up to radius (1 + RAY_EPSILON).
 RAY_EPSILON = 1500 * 2.0**-24
 
-# Spheres and cylinders, with the local z coordinate of their middle.
-ROUND = {mi.ShapeType.Sphere.value: 0.0, mi.ShapeType.Cylinder.value: 0.5}
+# Spheres and cylinders.
+ROUND = {mi.ShapeType.Sphere.value, mi.ShapeType.Cylinder.value}
 
 
 @dataclass
@@ -51,14 +51,9 @@ class Sphere:
             return None
         matrix = matrix_of(shape)
         radius = float(np.sqrt(number(shape.surface_area()) / (4 * np.pi)))
-        # The point may be rounded to the center, but Mitsuba's normal is the unrotated local one or its
-        # opposite.
-        u = mi.Point2f(0.3, 0.2)
-        local = dr.dot(shape.sample_position(0, u).n, mi.warp.square_to_uniform_sphere(u))
         off = np.abs(matrix[:3, :3] - radius * np.eye(3)).max()
         turned = not off <= 1e-6 * radius  # also if it is not finite
-        outward = 1.0 if number(local) > 0 else -1.0
-        return Sphere(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward, turned)
+        return Sphere(mi.ScalarPoint3f(matrix[:3, 3]), radius, outward_sign(shape, matrix), turned)
 
 
 def is_sphere(shape: mi.Shape) -> bool:
@@ -101,11 +96,9 @@ def cone_pdf_w(center, radius, p):
 
 
 def outward_sign(shape: mi.Shape, matrix: np.ndarray) -> float:
-    """1 if the normals of a sphere or cylinder point outwards, else -1."""
-    middle = matrix[:3] @ [0, 0, ROUND[shape.shape_type()], 1]
-    radius = float(np.linalg.norm(matrix[:3, 0]))
-    pi = dr.zeros(mi.PreliminaryIntersection3f)
-    pi.t, pi.shape = dr.opaque(mi.Float, radius), mi.ShapePtr(shape)
-    d = dr.opaque(mi.Vector3f, (matrix[:3, 0] / radius).tolist())
-    si = shape.compute_surface_interaction(mi.Ray3f(dr.opaque(mi.Point3f, middle.tolist()), d), pi)
-    return 1.0 if number(dr.dot(si.n, d)) >= 0 else -1.0
+    """1 if the normals of hits on a sphere or cylinder point outwards, else -1.
+
+    Mitsuba's flag includes the mirroring by ``to_world`` of spheres, but not of cylinders.
+    """
+    mirrors = not is_sphere(shape) and bool(np.linalg.det(matrix[:3, :3]) < 0)
+    return -1.0 if shape.has_flipped_normals() != mirrors else 1.0

@@ -153,9 +153,7 @@ def _curvatures(shape, grouped, extent) -> tuple[float, float]:
         # Across the axis of a cylinder; any axis of a sphere.
         inverse = 1 / max(float(np.linalg.norm(matrix[:3, 0])), 1e-30)
         far = not inverse * extent <= FAR  # the extent may be NaN
-        sign = (
-            outward_sign(shape, matrix) if far and 0 < inverse < 1e30 and np.isfinite(matrix).all() else 1.0
-        )
+        sign = outward_sign(shape, matrix) if far else 1.0
         return sign * inverse, inverse if kind == mi.ShapeType.Cylinder.value else 0.0
     if is_instance(shape):
         within = grouped / max(_stretch(shape)[-1], 1e-30)

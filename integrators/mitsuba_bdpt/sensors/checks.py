@@ -35,9 +35,9 @@ def called(sensor: mi.Sensor) -> str:
 
 
 def check_sensor(sensor: mi.Sensor, of_scene: Sequence[mi.Sensor]):
-    """Raise an error if ``sensor``, or a view of a batch, cannot generate camera rays.
+    """Raise ``UsageError`` or ``UnsupportedError`` if ``sensor``, or a view of a batch, has no camera rays.
 
-    ``of_scene``: the scene's sensors. Raises ``UsageError`` and ``UnsupportedError``.
+    ``of_scene``: the scene's sensors.
     """
     kind = sensor.class_name()
     if kind == "BatchSensor":

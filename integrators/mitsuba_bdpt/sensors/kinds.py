@@ -11,8 +11,6 @@ from . import cameras, checks
 from .others import Distant, IrradianceMeter, Orthographic, RayOnlySensor
 from .records import Sensor
 
-UNTARGETED = "target = none"
-
 
 def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
     """Return the sensor for one render of ``scene``.
@@ -28,14 +26,20 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Se
     if kind == "BatchSensor":
         return _batch(sensor, shape_errors)
     if kind == "IrradianceMeter":
-        return _meter(sensor, shape_errors, scene)
+        if sensor.film().sample_border():
+            raise UnsupportedError(
+                f"film of irradiance meter {named(sensor)} has sample_border, which needs points beyond "
+                "its shape; set it to false"
+            )
+        shape = sensor.get_shape()
+        return IrradianceMeter(sensor, shape_errors, in_scene=any(shape is other for other in scene.shapes()))
     if kind == "RadianceMeter":
         return _by_rays(
             sensor, "a radiance meter has one ray, which a light vertex is on with probability zero"
         )
     if kind == "DistantSensorImpl":
         # Only the text of a distant sensor distinguishes its three kinds.
-        if UNTARGETED in str(sensor):
+        if "target = none" in str(sensor):
             return Distant(sensor) if scene.shapes() else RayOnlySensor(sensor, "the scene has no surface")
         return _by_rays(sensor, "the target of a distant sensor is out of a plugin's reach")
     return _by_rays(sensor, f"of the class {kind} nothing but its camera rays is known")
@@ -67,14 +71,3 @@ def _batch(sensor: mi.Sensor, shape_errors: ShapeErrors) -> Sensor:
         return IrradianceMeter(sensor, shape_errors, views)
     why = "the views of the batch are not all perspective, all thinlens or all irradiance meters"
     return _by_rays(sensor, why, views)
-
-
-def _meter(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
-    film = sensor.film()
-    if film.sample_border():
-        raise UnsupportedError(
-            f"film of irradiance meter {named(sensor)} has sample_border, which needs points beyond "
-            "its shape; set it to false"
-        )
-    shape = sensor.get_shape()
-    return IrradianceMeter(sensor, shape_errors, in_scene=any(shape is other for other in scene.shapes()))

@@ -90,10 +90,9 @@ class Distant(_Parallel):
         u = mi.Point2f([0.5, 1, 0.5], [0.5, 0.5, 1])  # the middle and two points of the rim
         o, d, _ = rays_of(sensor, mi.Point2f(0.5), u)
         axis, across = d[:, 0] / np.linalg.norm(d[:, 0]), o[:, 1:] - o[:, :1]
-        vector = mi.Vector3f
         self._origin = dr.opaque(mi.Point3f, o[:, 0].tolist())
-        self._axis = dr.opaque(vector, axis.tolist())
-        self._across = [dr.opaque(vector, across[:, i].tolist()) for i in (0, 1)]
+        self._axis = dr.opaque(mi.Vector3f, axis.tolist())
+        self._across = [dr.opaque(mi.Vector3f, across[:, i].tolist()) for i in (0, 1)]
         radius2 = float((across**2).sum(0).mean())
         self._radius2 = dr.opaque(mi.Float, radius2)
         self._density = dr.opaque(mi.Float, 1 / (np.pi * radius2))
@@ -128,8 +127,7 @@ class _Face:
         n = ps.n
         if self._smooth_mesh is not None:
             n = self._smooth_mesh.normal(n, mi.UInt32(0), u.y, mi.Bool(True))
-        errors = self._shape_errors.at(mi.ShapePtr(self.shape))
-        anchor = rays.sampled_anchor(ps.p, n, errors)
+        anchor = rays.sampled_anchor(ps.p, n, self._shape_errors.at(mi.ShapePtr(self.shape)))
         return mi.Point3f(ps.p), mi.Normal3f(ps.n), anchor
 
 

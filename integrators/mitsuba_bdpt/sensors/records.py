@@ -80,8 +80,8 @@ class SensorHit:
 class Region:
     """The film region that camera samples cover: crop window and ``sample_border``.
 
-    ``crop_size``, ``crop_offset``, ``size`` (width, height) and ``border`` in pixels; ``box``: whether it is
-    a box filter; ``share``: area relative to the crop window's.
+    ``crop_size``, ``crop_offset``, ``size`` (width, height) and ``border`` in pixels; ``box``: of a box
+    filter; ``share``: area relative to the crop window's.
     """
 
     def __init__(self, film: mi.Film):
@@ -102,8 +102,7 @@ class Region:
     def pixel(self, index: mi.UInt32) -> mi.Point2i:
         """Film pixel of the ``index``-th pixel of the region (row by row)."""
         y = index // self._width
-        x = index - y * self._width
-        return mi.Point2i(mi.Int32(x), mi.Int32(y)) + self._first
+        return mi.Point2i(mi.Int32(index - y * self._width), mi.Int32(y)) + self._first
 
     def to_uv(self, position: mi.Point2f) -> mi.Point2f:
         """Film position in the unit square of the crop window (beyond it in the border)."""
@@ -123,7 +122,6 @@ class Region:
         return self.to_position(self.low + u * (self.high - self.low))
 
     def contains(self, uv: mi.Point2f):
-        """Mask: within the region."""
         return dr.all((uv >= self.low) & (uv < self.high))
 
 
