@@ -104,7 +104,7 @@ class Emitters:
         self.beams = any(t and not c for t, c in zip(traced, connectible, strict=True))
         self.at_infinity = any(t.at_infinity for t in types)
         self.tables = [t.tables(e) for e, t in pairs]
-        self.left_out = [text for e, t in pairs for text in t.left_out(e)]
+        self.left_out: list[tuple[str, str]] = [text for e, t in pairs for text in t.left_out(e)]
 
     def _lacks_sample_position(self, registered: list[str]) -> bool:
         """Whether `sample_position` fails: classes in the process may lack it."""
