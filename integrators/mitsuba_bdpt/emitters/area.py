@@ -350,7 +350,7 @@ class AreaEmitters(Group):
         return ds, pdf_w, weight
 
     def hit_densities(self, chosen: Chosen, si, previous, ds, active):
-        ds = mi.DirectionSample3f(ds)
+        ds = dr.copy(ds)
         ds.n = mi.Normal3f(si.n)
         pdf_w = chosen.pmf * self.direct_pdf_w(chosen.emitter, chosen.index, previous, ds, active)
         pdf_a = self.pdf_a(chosen.emitter, chosen.index, si, si.n, active)
