@@ -72,15 +72,14 @@ def layer(images, bdpt, name):
 # -- emitters ---------------------------------------------------------------------------------
 
 
-def emission(name, count, **others):
-    """Scene, tables, and ``count`` sampled emissions of the emitter ``name``."""
-    scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()} | others)
+def emission(count, **lamps):
+    """Scene, tables, and ``count`` sampled emissions of ``lamps``."""
+    scene = mi.load_dict(room() | lamps)
     emitters = Emitters(scene)
-    rng = np.random.default_rng(11)
-    u = [mi.Float(rng.random(count, dtype=np.float32)) for _ in range(4)]
+    u = [mi.Float(x) for x in np.random.default_rng(11).random((4, count), dtype=np.float32)]
     like = like_of_rgb()
     e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
-    return scene, emitters, e, rng
+    return scene, emitters, e
 
 
 @pytest.mark.parametrize("name", EMITTERS)
@@ -132,7 +131,7 @@ def test_emitted_power(name):
     """Rationale: the mean of the emission's weight is the flux, whatever the densities. Expected: the
     closed form. Tolerance: four standard errors of 1e5 samples plus 1e-4.
     """
-    _, _, e, _ = emission(name, 100_000)
+    _, _, e = emission(100_000, lamp=EMITTERS[name]())
     weight = np.array(e.weight, dtype=np.float64)[0]
     error = weight.std() / np.sqrt(len(weight))
     assert abs(weight.mean() - POWER[name]) < 4 * error + 1e-4 * POWER[name]
@@ -151,8 +150,8 @@ def test_emission_agrees_with_hits(name):
     textured sphere; edges of textures and pixels of an environment, where the traced point falls on the
     other side).
     """
-    scene, emitters, e, _ = emission(name, 20_000)
     n = 20_000
+    scene, emitters, e = emission(n, lamp=EMITTERS[name]())
     ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
     si = scene.ray_intersect(ray)
     hit = np.array(si.is_valid()) & (np.array(dr.max(e.weight)) > 0)
@@ -229,7 +228,7 @@ def test_directions_of_a_spot():
     Expected: the histogram of emitted power over the angle equals the integral of Mitsuba's
     sample_direction on a sphere around the lamp. Tolerance: five standard errors per bin.
     """
-    scene, _, e, _ = emission("spot", 200_000)
+    scene, _, e = emission(200_000, lamp=EMITTERS["spot"]())
     lamp = scene.emitters()[0]
     axis = np.array([0, 0, 0]) - np.array([1, 3, 1.5])
     axis = axis / np.linalg.norm(axis)
@@ -260,10 +259,7 @@ def test_spots_that_are_scaled_or_mirrored(scale):
     flux = []
     for matrix in (T(), T().scale(scale)):
         lamp = EMITTERS["spot"]()
-        scene = mi.load_dict(room() | {"lamp": lamp | {"to_world": lamp["to_world"] @ matrix}})
-        u = [mi.Float(np.random.default_rng(i).random(10_000, dtype=np.float32)) for i in range(4)]
-        sample = mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3])
-        e = Emitters(scene).sample_emission(*sample, like_of_rgb(), mi.Bool(True))
+        _, _, e = emission(10_000, lamp=lamp | {"to_world": lamp["to_world"] @ matrix})
         flux.append(np.array(e.weight, dtype=np.float64).mean())
     assert flux[1] == pytest.approx(flux[0], rel=1e-4)
 
@@ -291,16 +287,7 @@ def test_emitters_are_chosen_by_sampling_weight():
         "b": EMITTERS["sphere"]() | {"emitter": {"type": "area", "radiance": 5.0, "sampling_weight": 3.0}},
         "c": {"type": "spot", "intensity": 1.0, "sampling_weight": 0.0},
     }
-    scene = mi.load_dict(room() | lamps)
-    emitters = Emitters(scene)
-    rng = np.random.default_rng(11)
-    u = [mi.Float(rng.random(100_000, dtype=np.float32)) for _ in range(4)]
-    e = emitters.sample_emission(
-        mi.Point2f(u[0], u[1]),
-        mi.Point2f(u[2], u[3]),
-        like_of_rgb(),
-        mi.Bool(True),
-    )
+    scene, _, e = emission(100_000, **lamps)
     names = [x.class_name() for x in scene.emitters()]
     share = np.bincount(np.array(e.index), minlength=3) / 100_000
     weights = np.array([{"PointLight": 0.5, "AreaLight": 3.0, "SpotLight": 0.0}[n] for n in names])
