@@ -25,7 +25,7 @@ SCENE = """<?xml version="1.0" encoding="utf-8"?>
 </scene>"""
 
 RENDER = ["render", "光.xml", "--spp", "1", "-P", "light_groups=auto", "-D", "sky=空.exr", "-o", "光.exr"]
-COMMANDS = (RENDER, ["mix", "光.exr"], ["mix", "光.exr", "空=2", "-o", "é.exr"])
+COMMANDS = (RENDER, ["mix", "光.exr"], ["mix", "光.exr", "_=2", "-o", "é.exr"])
 
 
 @pytest.fixture(autouse=True)

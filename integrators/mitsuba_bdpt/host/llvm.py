@@ -45,9 +45,6 @@ _LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 # Whether `quick_compilation` is in effect.
 _quick: ContextVar[bool] = ContextVar("quick", default=False)
 
-# Value of LLVM's option opt-bisect-limit that limits nothing.
-_ALL_PASSES = 2**31 - 1
-
 
 class LLVMNotFoundError(ImportError):
     """No usable LLVM library; the message says how to install one."""
@@ -105,11 +102,13 @@ def named(name: str) -> Choice:
 def choose(environment: list[Path], system: list[Path]) -> Choice:
     """Return the library to load of those found, see `libraries`, or raise `LLVMNotFoundError`."""
     for paths, where in ((environment, "Python environment"), (system, "system")):
-        # max() keeps the search order on ties.
-        path = max(paths, key=_known_version, default=None)
-        if path is not None and _known_version(path):
-            return Choice(path, f"found in the {where}, known to work", major_version(path))
-    found = _describe([*environment, *system])
+        path = max(paths, key=_known_version, default=Path())  # the first one on ties
+        if version := _known_version(path):
+            return Choice(path, f"found in the {where}, known to work", version)
+    texts = [f"{path} (LLVM {major_version(path) or 'of unknown version'})" for path in environment + system]
+    found = (
+        f"found only {'; '.join(texts)} (to try a newer one, set {VARIABLE})" if texts else "none was found"
+    )
     if cuda_driver():
         return _without_llvm(found)
     known = ", ".join(map(str, KNOWN_GOOD))
@@ -174,7 +173,7 @@ def quick_compilation():
         set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
         yield
     finally:
-        set_options(b"-opt-bisect-limit=%d" % _ALL_PASSES)
+        set_options(b"-opt-bisect-limit=%d" % (2**31 - 1))  # limits nothing
         _quick.reset(before)
 
 
@@ -240,12 +239,3 @@ def remedy() -> str:
     else:
         return f"Install LLVM 19 and set {VARIABLE} to the path of its shared library."
     return f"Mend it with: {command}"
-
-
-def _describe(paths: Iterable[Path]) -> str:
-    """List the libraries found, which are rejected for their versions."""
-    versions = ((path, major_version(path) or "of unknown version") for path in paths)
-    texts = [f"{path} (LLVM {version})" for path, version in versions]
-    return (
-        f"found only {'; '.join(texts)} (to try a newer one, set {VARIABLE})" if texts else "none was found"
-    )
