@@ -20,7 +20,7 @@ MOST = {
     "files": 941,
     "run": 1234,
     "scene sampling": 777,
-    "host": 927,
+    "host": 917,
     "sensors": 912,
     "": 1550,  # top files
 }
