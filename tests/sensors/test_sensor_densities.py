@@ -158,7 +158,7 @@ def test_importance_integrates_to_the_weight(name):
     away and uniform about the sensor; of parallel sensors over a square across their direction.
     Tolerance: five standard errors, which are below 3 %, plus 2e-3 for points that are not at infinity.
     """
-    _, _, camera, u = prepared(name)
+    _, sensor, camera, u = prepared(name)
     lens, choice = mi.Point2f(u[2], u[3]), mi.Point2f(u[6], u[7])
     if name in PARALLEL:
         start = start_of(camera, u)
@@ -169,6 +169,11 @@ def test_importance_integrates_to_the_weight(name):
             frame.s * mi.Float(u[0] - 0.5) + frame.t * mi.Float(u[1] - 0.5)
         )
         measure = side**2
+    elif name in CAMERAS:  # from a cone about the axis
+        cos = np.cos(np.deg2rad(50))
+        local = mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), mi.Float(cos))
+        p = sensor.world_transform() @ mi.Point3f(local * 3000)
+        measure = 2 * np.pi * (1 - cos)
     else:
         # From all directions, so that views of a batch that look elsewhere are seen too.
         middle = mi.Point3f(0, 1.5, 3)
