@@ -424,24 +424,12 @@ def test_a_lamp_of_glass_does_not_light_itself(bsdf, parameters):
     (6 to 10 % too bright; 3.5 % in `path`). Expected: a sphere alone that shines outwards shows its radiance
     and nothing else, whatever it is made of: the image of a black one, with the same seed, to 1e-3 of its
     mean (rays through the sphere meet nothing)."""
-    eye = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
+    base = {"type": "scene", "sensor": perspective((0, 0, 4), (0, 0, 0))}
+    ball = {"type": "sphere", "radius": 0.6, "emitter": {"type": "area", "radiance": 3.0}}
     means = []
     for material in (bsdf, {"type": "diffuse", "reflectance": 0.0}):
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "sensor": {"type": "perspective", "film": film, "to_world": eye},
-                "ball": {
-                    "type": "sphere",
-                    "radius": 0.6,
-                    "bsdf": material,
-                    "emitter": {"type": "area", "radiance": 3.0},
-                },
-            }
-        )
-        integrator = mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters)
-        means.append(np.array(integrator.render(scene, spp=256, seed=1)).mean())
+        scene = mi.load_dict(base | {"ball": ball | {"bsdf": material}})
+        means.append(np.array(integrator(max_depth=4, **parameters).render(scene, spp=256, seed=1)).mean())
     assert abs(means[0] / means[1] - 1) < 1e-3, means
 
 
@@ -519,6 +507,7 @@ def test_hide_emitters_and_alpha(hide, lamp):
         assert b[..., 3].min() < 0.9
 
 
+WAVES = np.float32(0.1 * np.sin(np.linspace(0, 20, 32)))[:, None, None] * np.ones((1, 32, 1), np.float32)
 SURFACES = {
     "mask": lambda: {"type": "mask", "opacity": 0.5, "bsdf": grey(0.7)},
     "null": lambda: {"type": "null"},
@@ -543,15 +532,7 @@ SURFACES = {
     "textured": lambda: {"type": "diffuse", "reflectance": texture()},
     "bump map": lambda: {
         "type": "bumpmap",
-        "texture": {
-            "type": "bitmap",
-            "raw": True,
-            "bitmap": mi.Bitmap(
-                (0.1 * np.sin(np.linspace(0, 20, 32))[:, None, None] * np.ones((32, 32, 1))).astype(
-                    np.float32
-                )
-            ),
-        },
+        "texture": {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(WAVES)},
         "bsdf": grey(0.6)["bsdf"],
     },
 }
@@ -756,10 +737,8 @@ def test_every_reconstruction_filter(rfilter, border):
     too. Expected: equals `path` per pixel in tiles of 2x2. Tolerance: the confidence interval, below
     4 %. Statistic: Welch, 10 seeds a side.
     """
-    scene = mi.load_dict(
-        room(perspective(rfilter=rfilter, sample_border=border)) | {"lamp": EMITTERS["sphere"]()}
-    )
-    same_image(scene, 0.04, max_depth=3, size=2)
+    sensor = perspective(rfilter=rfilter, sample_border=border)
+    same_image(mi.load_dict(room(sensor) | {"lamp": EMITTERS["sphere"]()}), 0.04, max_depth=3, size=2)
 
 
 @pytest.mark.parametrize(
@@ -790,12 +769,8 @@ def test_component_formats(component, tmp_path):
     bitmap = mi.Bitmap(str(path))
     assert str(bitmap.component_format()).lower().endswith(component)
     if component != "uint32":
-        np.testing.assert_allclose(
-            np.array(bitmap.convert(component_format=mi.Struct.Type.Float32)),
-            image,
-            rtol=1e-3,
-            atol=1e-3,
-        )
+        found = np.array(bitmap.convert(component_format=mi.Struct.Type.Float32))
+        np.testing.assert_allclose(found, image, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("bsdf", ["plastic", "dielectric", "roughconductor"])

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 5055, "tests": 43465}
+OUTSIDE = {"scripts": 5055, "tests": 43445}
 MOST_WORDS = 28878
 
 
