@@ -25,7 +25,7 @@ MOST = {
     "": 1550,  # top files
 }
 OUTSIDE = {"scripts": 5055, "tests": 43445}
-MOST_WORDS = 28878
+MOST_WORDS = 28871
 
 
 def _lines(files):

@@ -72,6 +72,9 @@ KINDS: dict[str, type[Group]] = {
     "TimedSunskyEmitter": InfiniteEmitters,
 }
 
+# Mitsuba's own classes, which have all calls; others may lack ``sample_position``.
+MITSUBAS = frozenset(KINDS)
+
 # In the order of dispatch in a kernel.
 GROUPS: tuple[type[Group], ...] = (
     *dict.fromkeys(KINDS.values()),
@@ -89,8 +92,7 @@ def group_of(emitter) -> type[Group]:
 
 
 def is_third_party(class_name: str) -> bool:
-    """Whether a class may lack calls that Mitsuba's own have, as ``sample_position``."""
-    return class_name not in KINDS
+    return class_name not in MITSUBAS
 
 
 def third_party_elsewhere(scene) -> int:
