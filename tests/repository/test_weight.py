@@ -12,7 +12,7 @@ MOST = {
     "measure": 7449,
     "transport merging guided_emission": 5700,
     "planning": 1732,
-    "emitters": 2382,
+    "emitters": 2379,
     "cli": 1810,
     "media": 1349,
     "geometry": 1615,

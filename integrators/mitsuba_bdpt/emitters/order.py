@@ -12,10 +12,7 @@ import mitsuba as mi
 
 
 def in_order(scene: mi.Scene) -> list[mi.Emitter]:
-    """Return the emitters as the scene has them, but those on meshes by the ids of these.
-
-    Those of equal ids are in the order of their places.
-    """
+    """Return the emitters as the scene has them, but those on meshes by the ids, then places, of these."""
     emitters = scene.emitters()
     shapes = [emitter.get_shape() for emitter in emitters]
     slots = [i for i, shape in enumerate(shapes) if shape is not None and shape.is_mesh()]

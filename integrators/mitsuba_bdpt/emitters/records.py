@@ -85,7 +85,6 @@ class Factor:
 
     @staticmethod
     def whole() -> Factor:
-        """The guide's density applies to all of the emission."""
         return Factor(mi.Float(1), mi.Float(0))
 
 

@@ -85,7 +85,6 @@ class Mask:
 def inverse_table(pointers):
     """Emitter index by the index of its pointer in Dr.Jit's registry."""
     ids = dr.reinterpret_array(mi.UInt32, pointers).numpy()
-    found = [0] * (int(ids.max()) + 1)
-    for index, number in enumerate(ids):
-        found[int(number)] = index
-    return mi.UInt32(found)
+    found = np.zeros(int(ids.max()) + 1, int)
+    found[ids] = range(len(ids))
+    return mi.UInt32(found.tolist())

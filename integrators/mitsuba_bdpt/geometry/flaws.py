@@ -24,7 +24,7 @@ _FLAT = (mi.ShapeType.Rectangle.value, mi.ShapeType.Disk.value)
 
 
 class Flaw(Enum):
-    """A flaw of a shape: message."""
+    """What a flaw of a shape is, what it means for the image, and what to do."""
 
     NOT_FINITE = (
         "has NaN or infinity in its parameters; rays miss it, or parts of it, and the image is without "
