@@ -5,9 +5,11 @@ import itertools
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.planning.unsampled_light import UnsampledLight
 from mitsuba_bdpt.run.rendering import Render
+from mitsuba_bdpt.transport.photons.aim import Aim
 
 
 def room(ids, order=None):
@@ -53,6 +55,23 @@ def test_a_seed_has_one_image_in_every_load():
     assert images[0].mean() > 0.01
     for image in images[1:]:
         np.testing.assert_allclose(image, images[0], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_photons_are_aimed_at_one_order_of_shapes(order):
+    """Rationale: the spheres were in the order of the load, so that a seed had other photons in each process.
+    Expected: they are in the order of their places."""
+    glass = {
+        f"glass{i}": {
+            "type": "cube",
+            "to_world": mi.ScalarTransform4f().translate([i, -i, 0]).scale(0.1),
+            "bsdf": {"type": "dielectric"},
+        }
+        for i in order
+    }
+    scene = mi.load_dict({"type": "scene", "lamp": {"type": "point"}} | glass, optimize=False)
+    centres = [float(sphere.center.x[0]) for sphere in Aim.of(scene, Emitters(scene)).spheres]
+    assert np.allclose(centres, [0, 1, 2])
 
 
 def test_light_groups_are_those_of_the_tables():

@@ -129,4 +129,5 @@ def _specular_boxes(scene: mi.Scene, near_specular: Sequence[mi.BSDF]) -> list:
 
     grouped = any(chosen(shape) for shape in grouped_shapes(scene))
     found = (box_of(s) for s in scene.shapes() if (grouped if is_instance(s) else chosen(s)))
-    return [box for box in found if box is not None]
+    # By place: Mitsuba's order of meshes differs between loads.
+    return sorted((box for box in found if box is not None), key=lambda box: [*box.min, *box.max])
