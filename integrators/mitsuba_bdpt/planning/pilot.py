@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,8 +35,6 @@ from .configuration import CANDIDATES
 from .moments import GuidableLight, Moments
 
 if TYPE_CHECKING:
-    from ..guided_emission import EmissionStatistics
-
     # One number for each of the last candidates; a camera sample has one by name of a part of its row.
     Row = list[mi.Float64]
     Total = dict[str, Row | mi.UInt32]
@@ -75,7 +73,7 @@ class Pilot:
     rarest: float
     direct: float = 1.0
     media: bool = False
-    emission: EmissionStatistics | None = None
+    emission: Any = None  # `guided_emission.EmissionStatistics`
     alpha = False
 
     def __post_init__(self):
