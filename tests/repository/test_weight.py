@@ -10,8 +10,8 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 7449,
-    "transport merging guided_emission": 5700,
-    "planning": 1732,
+    "transport merging guided_emission": 5701,
+    "planning": 1730,
     "emitters": 2379,
     "cli": 1810,
     "media": 1349,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 5055, "tests": 43445}
-MOST_WORDS = 28871
+OUTSIDE = {"scripts": 3093, "tests": 43464}
+MOST_WORDS = 29058
 
 
 def _lines(files):
