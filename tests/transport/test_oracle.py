@@ -578,7 +578,7 @@ class Guide(guided_hits.Guiding):
         self.start = self.at
         if self.at:
             total, counters = state
-            given = total, counters.non_finite, counters.aimed, counters.guided
+            given = total, counters.non_finite, counters.guided
             with mock.patch.object(dr, "while_loop", python_loop(self.at)):
                 guided_hits._follow_one(kernel_, self, z, stream, shared, add, given)
         scene.at = at

@@ -93,7 +93,7 @@ class EmissionStatistics:
 
 @dataclass(frozen=True)
 class Learnt:
-    """Fitted ``tables``, or None without gain, and what they leave of second moments.
+    """Fitted ``tables``, or None without gain, and the ratios of second moments with and without them.
 
     ``variance_ratio``: of strategies whose light subpath chooses the emission; ``whole``: of all strategies.
     """
@@ -198,9 +198,9 @@ def _light_side(statistics: np.ndarray, density: np.ndarray) -> np.ndarray:
 
 
 def _left(statistics: np.ndarray, density: np.ndarray, guided: np.ndarray) -> np.ndarray:
-    """What tables ``guided`` by their densities leave of second moments, shape (2, 2).
+    """Ratios of second moments with and without the tables that are ``guided``, shape (2, 2).
 
-    Times l and whole; of all cells, and of all but `WORST` of the nonempty ones.
+    Rows: times l, and whole; columns: of all cells, and of all but `WORST` of the nonempty ones.
     """
     whole = (statistics[..., :CLASSES] / _totals(density)).sum(axis=-1)
     before = [statistics[..., CLASSES + i] for i in range(BEFORE)]

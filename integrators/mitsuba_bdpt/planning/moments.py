@@ -79,7 +79,7 @@ class Moments:
     * ``errors``, shape (2, `GROUPS`, candidates): relative squared error per sample and pixel, first the mean
       of many renders, then that of a typical one, in which contributions that fewer than `TRIMMED` of the
       pixels receive are missing.
-    * ``guidable``: both of s = 0 by SDS paths on which photons can guide it, which are in no other figure.
+    * ``guidable``: both errors of s = 0 on SDS paths that photons can guide, which no other field includes.
     * ``mean`` of the image over the colours, without directly seen emitters; the median of the groups' means.
     * ``rays``: rays and connections per camera sample by kind, with one light subpath each.
     * ``non_finite``: number of non-finite values, counted as zero.

@@ -35,7 +35,7 @@ from .configuration import CANDIDATES
 from .moments import GuidableLight, Moments
 
 if TYPE_CHECKING:
-    # One number for each of the last candidates; a camera sample has one by name of a part of its row.
+    # Row: a number for each candidate, or for the last ones; Total: rows of a camera sample by part.
     Row = list[mi.Float64]
     Total = dict[str, Row | mi.UInt32]
 

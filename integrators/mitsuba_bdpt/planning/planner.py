@@ -103,10 +103,10 @@ class Planner:
         return self.table
 
     def _piloted(self) -> _Result:
-        """Result of a pilot, whose samples leave out light for guided s = 0.
+        """Result of a pilot whose samples leave out the light that photons can guide.
 
-        Other strategies sample near-specular paths too: where they are to do so, and this light matters, they
-        are measured again, with it.
+        Other strategies sample near-specular paths too: where guiding is not chosen and this light matters, a
+        second pilot includes it.
         """
         prepared, full, guidable = self.prepared, self.full, None
         # Its gain is predicted where that takes little of the render.

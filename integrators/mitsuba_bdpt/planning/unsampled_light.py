@@ -70,8 +70,8 @@ class UnsampledLight:
     """Unsampled and undersampled light: mean over the film by emitter index.
 
     ``objects``: names of the shapes through which most of it is seen, or whose near-specular lobes leave it
-    undersampled. ``never``: share of it of which no sample is expected; ``few``: light of which more samples
-    are expected, but few, over it.
+    undersampled. ``never``: share of it of which no sample is expected; ``few``: light of up to one expected
+    sample per pixel that is not undersampled, relative to it.
     """
 
     colours: dict[int, np.ndarray]
@@ -204,7 +204,7 @@ def estimate(
 
 
 def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, fewest: int) -> GuidableLight:
-    """SDS light that photons can guide s = 0 to find, in a render by ``plan``; ``fewest``: `FEWEST_HITS`."""
+    """SDS light that photons can guide s = 0 to find; ``fewest``: `FEWEST_HITS`, or 0."""
     names = components.merging.GUIDABLE
     rarest = fewest / int(prepared.camera.region.size.prod())
     policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)

@@ -102,7 +102,7 @@ def _arrays(arrays: dict, name: str) -> dict:
 
 
 # Version of the stored format; increase with every change.
-FORMAT = 11
+FORMAT = 12
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:

@@ -19,9 +19,9 @@ def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
 
 
 def newest_coefficient(kernel: Kernel, vertex, adjoint: bool, beside_merges: bool = False) -> mis.Coefficient:
-    """kappa of the newest alternative's class at ``vertex``, for s >= 1; ``beside_merges``: see `mis`.
+    """kappa of the newest alternative at ``vertex``, for s >= 1; s = 0 differs: `techniques.hit_emitter`.
 
-    s = 0 differs, see `techniques.hit_emitter`.
+    ``beside_merges``: kappa' instead, for comparisons with merges (docs/method/sds_paths.md).
     """
     if adjoint:
         first = where_lit(kernel, kernel.space.allows_next_event(vertex))
@@ -42,10 +42,9 @@ def has_lobe(kernel: Kernel, vertex) -> mi.Bool:
 
 
 def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
-    """Mask: the diffuse ``vertex`` of an SDS path, if the other subpath matches.
+    """Mask: ``vertex`` may be the diffuse one of an SDS path, as far as its side knows.
 
-    No edge up to it is connected by a strategy in use, its event is not delta, it lies on a surface, and the
-    path may have a further edge.
+    It has a lobe (`has_lobe`), and no strategy in use connects an edge up to it.
     """
     newest, state = newest_coefficient(kernel, vertex, adjoint), vertex.sds
     if state is None or state.specular is None:
@@ -57,7 +56,7 @@ def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
 
 
 def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
-    """Other strategies on the side of a ``vertex`` that one of coefficient ``own`` connects.
+    """Other strategies on the side of ``vertex``, which a strategy of coefficient ``own`` connects.
 
     Returns `mis.alternatives`, and the merges up to the vertex, see `mis.merges`.
     """
@@ -76,8 +75,8 @@ def merges_before_end(
 ) -> mis.PartialSum:
     """Merges before the end of a subpath, on an emitter or the sensor.
 
-    ``pdf``: density of the end and of the direction from there; ``coefficient``: that of the rival that
-    connects the last edge, times the density of the end if ``pdf`` contains it.
+    ``pdf``: density of the end and of the direction from there; ``coefficient``: kappa' of the last edge,
+    times the density of the end if ``pdf`` contains it.
     """
     if not kernel.sds.merges:
         return 0

@@ -26,9 +26,8 @@ class Counters:
     * ``non_finite``: values that count as zero: contributions (s = 1 and t <= 1 if visible, inner ones before
       visibility), subpaths that end with a non-finite throughput, colours, features.
     * With media ``segments`` of edges and connections, with a ray each; tentative ``collisions`` in grids.
-    * With merging closest hits of photon subpaths (``photon``), stored ``photons``, and ``merges``: camera
-      vertices near a photon. With guiding the same of photons, guided camera vertices (``aimed``), and
-      closest hits that followed (``guided``).
+    * With merging or guiding closest hits of photon subpaths (``photon``), stored ``photons``; with merging
+      ``merges``, camera vertices near a photon; with guiding all rays of guided subpaths (``guided``).
 
     Records are added, never changed: Dr.Jit's loops would not see it.
     """
@@ -47,7 +46,6 @@ class Counters:
     photon: mi.UInt32 | None = None
     photons: mi.UInt32 | None = None
     merges: mi.UInt32 | None = None
-    aimed: mi.UInt32 | None = None
     guided: mi.UInt32 | None = None
 
     @staticmethod
@@ -108,13 +106,12 @@ class Contribution:
     """Estimate of one strategy.
 
     ``value``: unweighted spectrum; ``weight`` in [0, 1]; ``s``, ``t``: numbers of light and camera vertices;
-    ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`; ``position`` on the film in pixels, None
-    for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and ``weight`` exclude
-    the connected edge until its ``shadow_ray`` is traced (`seen`), for which ``sides`` are the arguments of
-    `mis.Heuristic.weigh`.
-    ``emission``: of `Kernel.cells`, for pilots. ``towards``: direction in which light reaches the
-    sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0, ``path_layer`` of the path (see
-    `path_layers`), None without such layers.
+    ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`, or ``merge``; ``position`` on the film in
+    pixels, None for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and
+    ``weight`` exclude the connected edge until its ``shadow_ray`` is traced (`seen`), for which ``sides`` are
+    the arguments of `mis.Heuristic.weigh`. ``emission``: of `Kernel.cells`, for pilots. ``towards``:
+    direction in which light reaches the sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0,
+    ``path_layer`` of the path (see `path_layers`), None without such layers.
     """
 
     value: mi.Spectrum

@@ -118,7 +118,7 @@ class Kernel:
         self.reach = u32(reach)
         after = 0 if plan.arrival else 1 if plan.splat else 2  # edges that the class adds to a light subpath
         self.last_light = u32(max(reach - after, 0))
-        # Longest merged path: weights of merges do not tell s = 0 and s = 1, alone beyond, from the others.
+        # Most edges of a merged path: weights of merges assume all strategies, not s = 0 and s = 1 alone.
         self.last_merged = self.reach if plan.light else self.max_depth
         self.camera_paths = u32(plan.camera_paths)
         self.kappa = _coefficients(plan, isinstance(heuristic, mis.ByClass))

@@ -27,8 +27,8 @@ A lane, with y_0 on the emitter and z_0 on the sensor::
 Each strategy i of a path adds w_i f / (n_i p_i), with n_i its number of samples per camera sample: the light
 subpaths per camera subpath for t <= 1, else 1. Weights: `mis`, docs/method/method.md. Where S does not divide
 the batch's pixels, only the estimate's n_i is exact: weights need only sum to 1. Classes that the plan leaves
-out have kappa = 0 and are not recorded. A pilot has several light subpaths per camera sample, most without
-one; its estimates are those of one each.
+out have kappa = 0 and are not recorded. A pilot traces several light subpaths per camera sample, all but one
+without camera subpath; its estimates are those of one each.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
 
 
 def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
-    """Trace the light subpaths of these lanes; returns the lanes."""
+    """Trace the light subpaths of these lanes; returns the lanes, and counters."""
     place_in_sequence = place.index(index)
     stream, shared = subpaths.begin_lane(kernel, place_in_sequence)
     path = light_path.allocate_light_path(kernel, dr.width(index))
@@ -162,9 +162,9 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
         # All purposes are in use (`points`); CHANNEL at vertex 0 chooses the channel.
         u = kernel.points.draw_1d("light", stream, Purpose.CHANNEL, 1)
         path = replace(path, thinning=light_path.Thinning.begin(u))
-    # t = 0 samples SDS paths; other strategies do so with near-specular events.
-    near_specular = kernel.sds.merges or kernel.sds.near_specular
-    sds = kernel.sds if plan.arrival or near_specular else PhotonStrategy()
+    # Of SDS paths of delta events t = 0 alone; merges and near-specular events concern all strategies.
+    by_all = kernel.sds.merges or kernel.sds.near_specular
+    sds = kernel.sds if plan.arrival or by_all else PhotonStrategy()
     begun, side = subpaths.light_subpath(kernel, e, stream, shared, sds)
     state = path, counted_by_light(kernel)
     (path, counted), walk = random_walk(kernel, side, begun, visit, state)

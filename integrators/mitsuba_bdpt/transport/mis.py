@@ -9,9 +9,10 @@ the weight of any strategy follows:
 * ``d_vc``: all older alternatives, over that density and the reverse density (solid angle) of the vertex
   before the last.
 
-With vertex merging two further numbers, ``d_vm`` and ``d_vm_newest``, stand for the merges at older vertices
-and the newest (eqs. 38, 39, times eta); a path is merged where V, the sum of kappa p of its merges, is at
-least B times S, that of all other strategies. See docs/method/sds_paths.md.
+With vertex merging ``d_vm`` and ``d_vm_newest`` stand for the merges at older vertices and at the newest
+(eqs. 36, 55, times eta). A path is merged where V, the sum of kappa p of its merges, is at least B times S,
+that of all other strategies. With photon guiding ``d_vm`` of light subpaths stands for guided s = 0. Symbols
+as in docs/method/sds_paths.md.
 
 Differences from the report: (1) Each strategy class has a coefficient kappa in every weight,
 w_i = kappa_i p_i / sum_j kappa_j p_j. A vertex does not know the class of its newest alternative, so kappa is
@@ -74,7 +75,7 @@ def is_used(coefficient: Coefficient):
 
 
 def is_absent(x: PartialSum) -> bool:
-    """Whether ``x`` is that of classes of strategies that are not in use."""
+    """Whether ``x`` is the Python number 0, of classes of strategies that are not in use."""
     return isinstance(x, (int, float)) and x == 0
 
 
@@ -219,14 +220,14 @@ def scattered_guided(h: Heuristic, partial: Partial, step: Step, guided: Partial
 
 
 def exceeds(merges: PartialSum, others: PartialSum):
-    """Mask: V counts beside S, or a merge beside the connection of an edge at its vertex, in one scale."""
+    """Mask: V >= B S, or kappa eta >= B c for the connection of an edge at the merged vertex."""
     return merges >= MERGE_DOMINATED * others
 
 
 def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev_w: mi.Float) -> PartialSum:
-    """Merges at vertices before the last, as `alternatives` without its ``pdf_a``.
+    """O: merges at vertices before the last.
 
-    ``connection``: ``d_vcm`` times its coefficient, of the edge to the last vertex.
+    ``connection``: c, ``d_vcm`` times kappa' of the edge to the last vertex.
     """
     newest = h.scale(partial.d_vm_newest, pdf_rev_w)
     older = h.scale(partial.d_vm, pdf_rev_w)
@@ -234,11 +235,10 @@ def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev
 
 
 def scattered_merges(h: Heuristic, partial: Partial, step: Step, ratio: mi.Float, rival: Coefficient):
-    """``d_vm`` and ``d_vm_newest`` after an event where a merge has this ``ratio``.
+    """``d_vm`` and ``d_vm_newest`` after an event (eqs. 36, 55).
 
-    ``ratio``: kappa times the number of photon subpaths times the area of the disc; ``rival``: coefficient of
-    the class that connects the edge to the vertex. Next to a delta event no edge is connected: the newest
-    merge counts.
+    ``ratio``: kappa eta, with eta the number of photon subpaths times the area of the disc; ``rival``: kappa'
+    of the edge to the vertex. Next to a delta event no edge is connected: the newest merge counts.
     """
     connection, before = h.scale(partial.d_vcm, rival), h.combine(partial.d_vm, partial.d_vm_newest)
     older = older_merges(h, partial, connection, step.pdf_rev_w)
@@ -255,10 +255,10 @@ def merges(
     own: Coefficient,
     ratio: mi.Float,
 ) -> PartialSum:
-    """Merges at the vertices of a subpath whose last vertex is connected, as `alternatives`.
+    """Part of V of a connection: merges at the vertices of one subpath, whose last vertex is connected.
 
-    ``coefficient`` and ``own``: of the rivals that connect the edges to it and from it; ``ratio`` of a merge
-    there: see `scattered_merges`.
+    ``coefficient`` and ``own``: kappa' of the edges to and from that vertex; ``pdf_rev_w``, ``pdf_a``: as in
+    `alternatives`; ``ratio``: kappa eta there.
     """
     connection = h.scale(partial.d_vcm, coefficient)
     there = h.scale(ratio, pdf_a)
@@ -282,10 +282,10 @@ def alternatives(
 def weigh_merge(
     h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple, connections: PartialSum
 ) -> mi.Float:
-    """Weight of a merge of this ``ratio`` (see `scattered_merges`); 0 where merges do not dominate.
+    """Weight of a merge with this ``ratio``, kappa eta (eqs. 37-39); 0 where merges do not dominate.
 
-    ``light`` and ``camera`` subpath: `Partial`, its ``d_vcm`` times the coefficient of the rival that
-    connects the last edge, ``pdf_rev_w`` of that edge; ``connections``: sum of both.
+    ``light`` and ``camera`` subpath: `Partial`, c and ``pdf_rev_w`` of its last edge; ``connections``: sum of
+    ``d_vcm`` times kappa of both last edges.
     """
     older, v = 0, ratio
     for partial, connection, pdf_rev_w in (light, camera):

@@ -22,14 +22,13 @@ FEWEST_EDGES = 3
 
 @dataclass
 class State:
-    """What a walk knows of an SDS path; None where it is not needed.
+    """State of a subpath that may be part of an SDS path; fields that are not needed are None.
 
-    ``isolated``: no edge is connectible; ``only_delta``, on subpaths with guiding: all events were delta;
-    ``guided``, on camera subpaths with guiding: the densities of guided directions over those of the BSDF;
-    ``survived``, on photon subpaths with merging: the probability with which `PhotonStrategy.survival` let
-    it go on. Where near-specular events count as specular ``specular``: the last event was; on camera
-    subpaths ``diffuse``: one was not; ``newest``: as ``guided``, of the last vertex, which is not in that: it
-    does not guide if the next vertex is the end.
+    ``isolated``: no edge is connectible; ``only_delta``, with guiding: all events were delta; ``guided``, on
+    camera subpaths with guiding: r, the guide's densities over the BSDF's; ``survived``, on photon
+    subpaths with merging: product of `PhotonStrategy.survival`. Where near-specular events count as specular:
+    ``specular``, the last event was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term
+    of the last vertex, not in ``guided``: that vertex does not guide if the next one is the end.
     """
 
     isolated: Any = None
@@ -118,7 +117,7 @@ class Advice:
 
 
 class PhotonStrategy:
-    """A further strategy for SDS paths. Each method is a hook; here it adds nothing.
+    """A further strategy for SDS paths: hooks of the kernel, which add nothing here.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
     subpaths use, or None; ``merges``: it merges vertices, and `ratio` and `survival` are defined;

@@ -70,7 +70,7 @@ def emission(kernel: Kernel, stream, shared):
 
 
 def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tuple[Walk, Side]:
-    """A light subpath on its first edge; ``sds``: the strategy beside t = 0 in weights on SDS paths."""
+    """A light subpath on its first edge (eqs. 31, 32); ``sds``: the strategy beside t = 0 on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
     broken = not_finite(active, e.weight)
@@ -138,7 +138,7 @@ def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
 
 
 def _first_partial(kernel: Kernel, start):
-    """Partial sums of a camera subpath's first edge: t = 1 is newest, t = 0 older."""
+    """Partial sums of a camera subpath's first edge (eqs. 31, 32): t = 1 is newest, t = 0 older."""
     h = kernel.heuristic
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)
     if not (mis.is_absent(kernel.kappa.splat) and mis.is_absent(kernel.kappa.inner)):

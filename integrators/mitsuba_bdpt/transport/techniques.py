@@ -77,8 +77,8 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
 def _beside_guided(kernel: Kernel, guided, on_sds_path, sides: tuple, alone, own: mis.Coefficient) -> tuple:
     """Light and camera ``sides`` of s = 0 or s = 1, where near-specular events count as specular.
 
-    On an SDS path the only alternatives are the other of the two, ``alone``, and both from a direction by the
-    guide, ``guided`` times as dense. ``own``: coefficient of the strategy.
+    The only alternatives on an SDS path are the other of the two, ``alone``, and both guided, at r times the
+    density (``guided``). ``own``: coefficient of the strategy.
     """
     h = kernel.heuristic
     if guided is not None:
@@ -251,14 +251,14 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
     rival = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_count)
-    merged = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
+    merges = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
     if kernel.sds.near_specular:
         active &= ~walk.sds.is_sds_path(walk.edges, newest)
     elif walk.sds is not None:
-        merges = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
-        # The last edge is not connected either.
-        light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, merges))
-    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=merged)
+        # Guided s = 0, of SDS paths: on these the last edge is not connectible either.
+        guided = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
+        light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, guided))
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=merges)
     if z.surroundings is not None and kernel.emitters.at_infinity:
         straight = active & emission.infinite & directly
         active &= ~straight | kernel.space.clear(z.surroundings, kernel.sensor_medium, straight)

@@ -35,7 +35,7 @@ class Walk:
       edge; ``eta``: product of relative indices of refraction (1 if nothing refracts).
     * ``seen``: a non-null event happened; ``broken``: ended by a non-finite throughput or shading frame;
       ``edge``: its state along an edge, None without media.
-    * ``sds``: None without a further strategy for SDS paths; ``layer``: see `path_layers`, None without.
+    * ``sds``: None where the strategy for SDS paths needs none; ``layer``: see `path_layers`, None without.
 
     Constants along a subpath are in `Side`: Dr.Jit records a loop twice if its state contains them.
     """
@@ -159,10 +159,10 @@ class Side:
     """Constants of a subpath, which distinguish the two kinds.
 
     ``stream`` of its random numbers; ``shared``: time and wavelengths; ``adjoint``: light travels with the
-    walk; ``alpha``: the film needs to know whether a non-null event happened; ``isolated``: the subpath ends
-    once an edge is connectible, see `sds.State`; ``only_specular``: it ends at an event that is not delta and
-    has a smaller density from one side (1 / sr; 0: at none, infinity: at each).
-    Functions:
+    walk; ``last_edge``: most edges; ``sds``: hooks; ``alpha``: the film stores whether a non-null event
+    happened; ``isolated``: the subpath ends once an edge is connectible, see `sds.State`; ``only_specular``:
+    it ends at an event that is not delta and has a density below this from one side (1 / sr; 0: at none,
+    infinity: at each). Functions:
 
     * ``complete``, of the first vertex of a light subpath: density of next-event estimation in ``d_vcm``.
     * ``connect``, of each vertex: the endpoint to connect it with (`emitters.Direct`, or the result of

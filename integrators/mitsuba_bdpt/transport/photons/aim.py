@@ -2,7 +2,7 @@
 
 They are uniform in cones about bounding spheres of the shapes with specular lobes (over all directions from
 within one). Light from infinity is not aimed: its emission disks cover details (`emitters.disks`). Uniform
-environments emit no photons: s = 0 samples their light well.
+environments emit no photons, but for merging: s = 0 samples their light well.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Photon-guided BSDF sampling: samples SDS paths by hitting an emitter (s = 0).
 
-From a diffuse vertex a second direction is sampled from the density p_g of a `photon_guide.Guide` and
-followed through specular events only. All densities but those of the direction cancel: guided s = 0 over
-s = 0 is p_g / p_bsdf. Estimates times weights are f over a sum of densities, the same for all techniques of a
-path (with the balance heuristic), so that guided subpaths have the throughput and the weight of s = 0 by the
-BSDF. See docs/method/sds_paths.md and docs/method/near_specular.md.
+From a diffuse vertex n further directions (`plan.GUIDED`) are sampled from the density p_g of a
+`photon_guide.Guide` and followed through specular events only. All densities but those of the direction
+cancel: guided s = 0 over s = 0 by the BSDF is n p_g / p_bsdf. Under the balance heuristic a guided subpath
+has the throughput and the weight of one by the BSDF, since each technique of a path contributes f over the
+same sum of densities. See docs/method/sds_paths.md and docs/method/near_specular.md.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SEED = 0x5BD1E995
 class Guiding(PhotonStrategy):
     """Photon-guided BSDF sampling by a ``guide``; ``near_specular``: through near-specular events too."""
 
-    counters = ("aimed", "guided")
+    counters = ("guided",)
 
     def __init__(self, guide: photon_guide.Guide, near_specular: bool):
         self.guide, self.near_specular = guide, near_specular
@@ -77,14 +77,14 @@ class Guiding(PhotonStrategy):
     def visit(self, kernel, z, walk, stream, shared, add, state):
         """Trace guided subpaths from ``z`` where the guide is active."""
         total, counters = state
-        total, lost, aimed, traced = dr.if_stmt(
-            (z, total, counters.non_finite, counters.aimed, counters.guided),
+        total, lost, traced = dr.if_stmt(
+            (z, total, counters.non_finite, counters.guided),
             z.advice.active,
             lambda z, *state: _follow_all(kernel, self, z, stream, shared, add, state),
             lambda z, *state: state,
             label="guided subpaths",
         )
-        return total, replace(counters, non_finite=lost, aimed=aimed, guided=traced)
+        return total, replace(counters, non_finite=lost, guided=traced)
 
 
 class _Guided(PhotonStrategy):
@@ -94,7 +94,7 @@ class _Guided(PhotonStrategy):
         self.guiding, self.near_specular = guiding, guiding.near_specular
 
     def advise(self, kernel, adjoint, vertex, walk, step) -> Advice:
-        """Only further vertices of a path of specular events guide too."""
+        """Further vertices guide too where all events are specular."""
         possible = is_sds_vertex(kernel, vertex, adjoint)
         possible &= is_specular(step) & ~vertex.sds.diffuse
         return self.guiding._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
@@ -161,7 +161,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
         )
         return total, lost, traced
 
-    total, lost, aimed, traced = state
+    total, lost, traced = state
     walk = _begun(kernel, guiding, z, numbers, shared)
     first = walk.edges
     side = Side(
@@ -177,7 +177,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     begun = walk.active
     (total, lost, traced), walk = random_walk(kernel, side, walk, visit, (total, lost, traced))
     traced += dr.select(begun, walk.edges - first, 0)
-    return total, lost + one(walk.broken), aimed + one(begun), traced
+    return total, lost + one(walk.broken), traced
 
 
 def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared) -> Walk:
@@ -190,7 +190,7 @@ def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared)
     f = bsdf.evaluate(z.bsdf, z.si, local, active, kernel.traits)
     newest = newest_coefficient(kernel, z, adjoint=False)
     active &= f.pdf_fwd_w > 0
-    if guiding.near_specular:  # of a diffuse vertex and those after it the former guides
+    if guiding.near_specular:  # a diffuse vertex guides, specular ones after it do not
         specular = is_specular(f)
         active &= ~(specular & z.sds.diffuse)
     ratio = h.start(dr.select(active, pdf / f.pdf_fwd_w, 0))

@@ -56,7 +56,7 @@ class PhotonPolicy:
 
 
 class GuidePhotons(PhotonPolicy):
-    """Stores the first vertex of a non-specular event, if s = 0 can sample the path through it."""
+    """Stores vertices with a lobe up to the first non-specular event, if s = 0 can sample the path."""
 
     def __init__(self, near_specular: bool):
         self.only_specular = GUIDED if near_specular else math.inf
