@@ -245,7 +245,7 @@ def test_a_reference_of_another_dictionary_is_made_anew(here, capsys):
         "mine: the scene has changed since its reference at 8 and depth 3 was made; making one anew" in said
     )
     call = "measure.make_reference(SceneDict('mine', ...), resolution=8, max_depth=3, spp=4, seconds=600)"
-    assert call in said and len([*Path("project/references").glob("mine_8_3_earlier_*.exr")]) == 1
+    assert call in said and len([*Path("project/references").glob("mine_*.exr")]) == 1
 
 
 @pytest.mark.parametrize("name", ["reference", "compare", "equal-time", "pyramid", "sweep"])

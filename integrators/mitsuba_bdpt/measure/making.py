@@ -49,7 +49,6 @@ from .reference import (
     load_reference,
     make_command,
     means_of,
-    put_aside,
     reference_path,
     source_digest,
     write,
@@ -248,29 +247,26 @@ def make(job: Job) -> tuple[Reference, bool]:
     """Render until the reference is good enough or the time is over, and store it.
 
     Returns it, and whether it is good enough. A reference cut short by time does not replace a better one of
-    the same light. One of another version of the scene is kept, see `put_aside`.
+    the same light and version of the scene.
     """
     check(job)
     recipe = Recipe.of(job.project, job.scene.name)
     check_writable(job.path)
-    outdated = is_outdated(job.path, job.scene_sha256)
     if recipe.radiance is None and job.is_missing:
-        print(_announced(job, outdated), flush=True)
+        print(_announced(job), flush=True)
     reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
     stored = None if reached else job.stored
     if stored is not None and stored.merged == reference.merged and stored.error < reference.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
         return stored, False
-    if outdated:
-        print(f"{job.scene.name}: the reference before is now {str(put_aside(job.path))!r}", flush=True)
     write(job.path, reference)
     return reference, reached
 
 
-def _announced(job: Job, outdated: bool) -> str:
+def _announced(job: Job) -> str:
     """Return the message before a new reference is rendered."""
     where = f"{job.resolution} and depth {job.depth}"
-    if outdated:
+    if job.path.is_file():
         why = f"the scene has changed since its reference at {where} was made; making one anew"
     else:
         why = f"no reference at {where} yet; making one"

@@ -2,13 +2,12 @@
 
 Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
 two halves of its samples (difference.R ...), a sample of its own error, and the provenance as JSON in the
-header, with the data of bias checks. `making` makes them; `put_aside` keeps those of earlier scenes.
+header, with the data of bias checks. `making` makes them.
 """
 
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -112,15 +111,6 @@ def header_of(path: Path) -> dict[str, Any]:
 def is_outdated(path: Path, scene_sha256: str) -> bool:
     """Return whether the reference is of another version of the scene."""
     return header_of(path).get("scene_sha256", scene_sha256) != scene_sha256
-
-
-def put_aside(path: Path) -> Path:
-    """Rename an outdated reference after its version of the scene; keeps a better one of that name."""
-    kept = header_of(path)
-    earlier = path.with_name(f"{path.stem}_earlier_{kept['scene_sha256'][:8]}{path.suffix}")
-    if header_of(earlier).get("spp", 0) <= kept.get("spp", 0):
-        os.replace(path, earlier)
-    return earlier
 
 
 def too_few(name: str, make: str) -> str:
