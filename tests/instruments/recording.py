@@ -26,7 +26,7 @@ from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import connections, kernel
 from mitsuba_bdpt.transport.batch import Batch
 from mitsuba_bdpt.transport.contribution import Counters
-from mitsuba_bdpt.transport.inputs import Kernel, Observer
+from mitsuba_bdpt.transport.inputs import Observer, TraceContext
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
@@ -45,7 +45,7 @@ def float64(x) -> np.ndarray:
 class Launch:
     """The arguments of `kernel.trace`, with the kernel as it was then, and the width of the film."""
 
-    kernel: Kernel
+    kernel: TraceContext
     batch: Batch
     points: Points
     spp: int
@@ -276,7 +276,7 @@ class _Subpath:
 
 
 @contextlib.contextmanager
-def stepwise(traced: Kernel):
+def stepwise(traced: TraceContext):
     """Dr.Jit runs loops and branches of a kernel step by step, so that their state can be read.
 
     As for a render the cycle collector is paused, and calls too go step by step where an emitter, of this

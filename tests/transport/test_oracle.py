@@ -551,9 +551,9 @@ def python_loop(times):
 
 
 class Inputs(SimpleNamespace):
-    """Stand-in for `inputs.Kernel`."""
+    """Stand-in for `inputs.TraceContext`."""
 
-    replaced, bound = inputs.Kernel.replaced, inputs.Kernel.bound
+    replaced, bound = inputs.TraceContext.replaced, inputs.TraceContext.bound
 
 
 class Guide(guided_hits.Guiding):

@@ -15,7 +15,7 @@ from .media import OTHER_LOBES, Media, coefficients, depth_of, interaction, of_d
 
 if TYPE_CHECKING:
     from ..sampling.points import Stream
-    from ..transport.inputs import Kernel
+    from ..transport.inputs import TraceContext
     from ..transport.walk import Side, Vertex, Walk
     from .space import Space
 
@@ -80,7 +80,7 @@ class Landing:
     throughput: mi.Spectrum
 
 
-def begin(space: Space, kernel: Kernel, side: str, stream: Stream, ray: mi.Ray3f, emission=None) -> Edge:
+def begin(space: Space, kernel: TraceContext, side: str, stream: Stream, ray, emission=None) -> Edge:
     media, points = space.media, kernel.points
     medium = kernel.sensor_medium if emission is None else kernel.light_media.at(emission)
     channel = ratio = None
@@ -102,7 +102,7 @@ def begin(space: Space, kernel: Kernel, side: str, stream: Stream, ray: mi.Ray3f
     )
 
 
-def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> tuple:
+def arrive(space: Space, kernel: TraceContext, side: Side, walk: Walk) -> tuple:
     """Follow the edge of a ``walk`` to its end, a surface or a collision."""
     active = walk.active
     ray = mi.Ray3f(walk.o, walk.d, side.shared.time, side.shared.wavelengths)
@@ -128,7 +128,7 @@ def arrive(space: Space, kernel: Kernel, side: Side, walk: Walk) -> tuple:
 
 
 def depart(
-    space: Space, kernel: Kernel, side: Side, vertex: Vertex, passes: mi.Bool, ray: mi.Ray3f
+    space: Space, kernel: TraceContext, side: Side, vertex: Vertex, passes: mi.Bool, ray: mi.Ray3f
 ) -> tuple[Edge, mi.Ray3f]:
     """The edge along ``ray`` after an event, and its ray; the edge goes on where it ``passes``."""
     before = vertex.edge

@@ -25,7 +25,7 @@ from ..sampling.reservoir import offer
 from ..transport import bsdf, mis, path_layers, spectra
 from ..transport.alternatives import newest_connection
 from ..transport.contribution import Contribution, one, size_of
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.sds import PhotonStrategy, State
@@ -90,7 +90,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         survived = dr.minimum(state.survived, _probability(partial.d_vc, dr.maximum(self.ratio(p), median)))
         return survived / state.survived, State(survived=survived)
 
-    def may_merge(self, kernel: Kernel, vertex, connection: mis.PartialSum) -> mi.Bool:
+    def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
         """Mask: a merge at ``vertex`` may count, as far as its side knows.
 
         ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
@@ -98,7 +98,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
         return possible & mis.exceeds(self.ratio(vertex.si.p), connection)
 
-    def kept(self, kernel: Kernel, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
+    def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
         return dr.minimum(_probability(d_vc, self.ratio(vertex.si.p)) / survived, 1)
@@ -114,7 +114,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         asks = self.may_merge(kernel, z, _rival(kernel, z))
         return asks & (sequential(word)[0] < self.kept(kernel, z))
 
-    def merged(self, kernel: Kernel, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
+    def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
         light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
@@ -147,7 +147,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return total, replace(counters, non_finite=lost, merges=merges)
 
 
-def _rival(kernel: Kernel, z: Vertex) -> mis.PartialSum:
+def _rival(kernel: TraceContext, z: Vertex) -> mis.PartialSum:
     """The connection of the edge to the camera vertex ``z``, in comparisons with merges."""
     return newest_connection(kernel, z, adjoint=False, beside_merges=True)
 
@@ -227,7 +227,7 @@ class Sample:
     number: mi.Float
 
 
-def sample(kernel: Kernel, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
+def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
     """Draw a photon near the camera vertex ``z`` by flux.
 
     Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.

@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..host.introspection import named
 from ..sampling.points import Points
 from ..settings import Settings
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
@@ -66,7 +66,7 @@ class Passes:
         self._radius, self._pixels = settings.internals.merging_radius, pixels
 
     def trace(
-        self, kernel: Kernel, points: Points, samples: int, done: int, start: mi.Float | None
+        self, kernel: TraceContext, points: Points, samples: int, done: int, start: mi.Float | None
     ) -> tuple[Merging, mi.UInt64]:
         """Trace the photons of a pass; returns its strategy, and counters.
 
@@ -96,7 +96,7 @@ def photons_of_pass(samples: int, pixels: float, radius: float) -> int:
 
 
 def trace(
-    kernel: Kernel, merging: Merging, aim: Aim, points: Points, count: int
+    kernel: TraceContext, merging: Merging, aim: Aim, points: Points, count: int
 ) -> tuple[Merging, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns ``merging`` with photons, and counters."""
     kernel = kernel.replaced(sds=merging, last_light=kernel.last_merged)

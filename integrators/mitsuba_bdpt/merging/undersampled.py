@@ -12,7 +12,7 @@ import mitsuba as mi
 
 from ..transport import mis
 from ..transport.alternatives import has_lobe, is_sds_vertex, newest_connection
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.near_specular import NARROW, is_narrow
 from ..transport.photons.guided_hits import Unguided
 from ..transport.walk import Vertex
@@ -63,7 +63,7 @@ class Undersampled(Unsampled):
         dr.scatter_add(self.sums, size, kind, active & dr.isfinite(size) & ~(expected >= KINDS[-1]))
         return active & ~(expected >= FEWEST)  # NaN counts
 
-    def expected(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
+    def expected(self, kernel: TraceContext, merging: Merging, z: Vertex, found: Sample) -> mi.Float:
         """Expected number of samples per pixel of the merged path and its neighbours.
 
         Area A of the footprints of all strategies at ``z``, from the partial sums of both subpaths, times the

@@ -17,7 +17,7 @@ from ..sampling.points import Points
 from ..transport import spectra, subpaths
 from ..transport.alternatives import is_sds_vertex
 from ..transport.batch import Batch, Places
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon_pass import PhotonPolicy
@@ -71,21 +71,21 @@ class Unsampled(PhotonPolicy):
     def stored(self, kernel, y, stream):
         return is_sds_vertex(kernel, y, adjoint=True), 1.0
 
-    def begin_camera(self, kernel: Kernel, walk: Walk, side: Side) -> tuple[Walk, Side]:
+    def begin_camera(self, kernel: TraceContext, walk: Walk, side: Side) -> tuple[Walk, Side]:
         """The camera subpath ``walk`` on its first edge."""
         return walk, replace(side, connect=None, only_specular=self.only_specular)
 
-    def is_merged(self, kernel: Kernel, z: Vertex) -> mi.Bool:
+    def is_merged(self, kernel: TraceContext, z: Vertex) -> mi.Bool:
         """Mask: a camera subpath may merge at ``z``."""
         return is_sds_vertex(kernel, z, adjoint=False)
 
-    def missing(self, kernel: Kernel, merging: Merging, z: Vertex, found: Sample, position) -> mi.Bool:
+    def missing(self, kernel: TraceContext, merging: Merging, z: Vertex, found: Sample, position) -> mi.Bool:
         """Mask: the merge ``found`` at ``z`` counts; ``position`` of the camera sample on the film."""
         return found.active
 
 
 def estimate(
-    kernel: Kernel,
+    kernel: TraceContext,
     batch: Batch,
     count: int,
     photon_points: Points,
@@ -111,7 +111,7 @@ def estimate(
     return Estimate(*found, traced.broken)
 
 
-def _merged(kernel: Kernel, merging: Merging, batch: Batch, policy: Unsampled) -> tuple:
+def _merged(kernel: TraceContext, merging: Merging, batch: Batch, policy: Unsampled) -> tuple:
     """`Estimate` up to ``through``."""
     lane = dr.arange(mi.UInt32, batch.size)
     place = Places(kernel, batch, batch.samples)

@@ -24,7 +24,7 @@ from ..settings import Settings
 from ..transport import connections, mis
 from ..transport.batch import Batch
 from ..transport.contribution import COUNTERS, Contribution, Counters
-from ..transport.inputs import Kernel, Shared
+from ..transport.inputs import Shared, TraceContext
 from ..transport.kernel import Lane, trace
 from ..transport.photons.guided_hits import Unguided
 from ..transport.plan import Plan
@@ -87,7 +87,9 @@ class Pilot:
         evaluated: Total = {"evaluated": mi.UInt32(0)} if self.media else {}
         return {name: [mi.Float64(0) for _ in range(n)] for name, n in moments.SUMS.items()} | evaluated
 
-    def add(self, kernel: Kernel, c: Contribution, total: Total, start: CameraStart, shared: Shared) -> Total:
+    def add(
+        self, kernel: TraceContext, c: Contribution, total: Total, start: CameraStart, shared: Shared
+    ) -> Total:
         """Accumulate a contribution with t >= 2."""
         size = _size(c)
         self._add_emission(c, size, start.position, c.active)
@@ -95,7 +97,7 @@ class Pilot:
         return total | {name: _sums(total[name], more) for name, more in new.items()}
 
     def connect(
-        self, kernel: Kernel, z: Vertex, lane: Lane, stream: Stream, total: Total, start: CameraStart
+        self, kernel: TraceContext, z: Vertex, lane: Lane, stream: Stream, total: Total, start: CameraStart
     ) -> tuple[Total, Counters]:
         """Connect the camera vertex ``z`` with all light vertices of its lane."""
 
@@ -131,7 +133,7 @@ class Pilot:
             found["evaluated"] = total["evaluated"] + counted.evaluated
         return total | found, counted
 
-    def splat(self, kernel: Kernel, c: Contribution, shared: Shared, stream: Stream) -> Counters:
+    def splat(self, kernel: TraceContext, c: Contribution, shared: Shared, stream: Stream) -> Counters:
         """Accumulate a contribution with t <= 1."""
         size, lanes, tile = _size(c), self.batch.lanes, self.region.tile(c.position, moments.FINE)
         row = moments.group(dr.arange(mi.UInt32, lanes)) * moments.FINE**2 + tile
@@ -140,7 +142,9 @@ class Pilot:
         self._add_emission(c, size * np.sqrt(self.batch.size / lanes), c.position, c.active)
         return Counters()
 
-    def end(self, kernel: Kernel, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool) -> Counters:
+    def end(
+        self, kernel: TraceContext, lane: Lane, sample: CameraSample, total: Total, seen: mi.Bool
+    ) -> Counters:
         """Accumulate a camera sample."""
         slot = dr.arange(mi.UInt32, self.batch.lanes)
         tile, evaluated = self.region.tile(sample.start.position, moments.FINE), total.get("evaluated", 0)
@@ -224,7 +228,7 @@ def measure(
     everything = replace(CANDIDATES[-1].plan(plan), merging=False, roulette=False)
     if plan.connections != "none":
         everything = replace(everything, connections="all")
-    kernel = Kernel(prepared, everything, settings, mis.ByClass())
+    kernel = TraceContext(prepared, everything, settings, mis.ByClass())
     if everything.guidable and (prepared.delta if guidable is None else guidable.second.any()):
         kernel = kernel.replaced(sds=Unguided(kernel.near_specular and guidable is not None))
     region, emission = prepared.camera.region, None

@@ -11,6 +11,7 @@ from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport.plan import GUIDED, Plan
+from ..transport.sds import FEWEST_EDGES
 from .budget import EVEN
 
 
@@ -148,10 +149,6 @@ def _why_not_merging(prepared: PreparedScene, direct: bool) -> str:
     return ""
 
 
-# Least number of edges of an SDS path: lamp, glass, a vertex, the sensor.
-SHORTEST = 3
-
-
 def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, direct: bool) -> str:
     """Why s = 0 cannot be guided, or does not gain by it; empty if neither."""
     if prepared.space is not None:
@@ -160,7 +157,7 @@ def _why_not_guided(prepared: PreparedScene, settings: Settings, hit: bool, dire
         return "strategy images show each strategy by itself, and it is another s=0"
     if not hit:
         return "no emitter that a ray can hit"
-    if settings.max_depth < SHORTEST:
+    if settings.max_depth < FEWEST_EDGES:
         return f"max_depth={settings.max_depth} allows no such path"
     return _why_not_merging(prepared, direct)
 

@@ -26,11 +26,11 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
 from ..transport.batch import Batch
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.photons.aim import Aim
 from ..transport.plan import Plan
+from ..transport.sds import FEWEST_EDGES
 from .moments import FINE, GuidableLight
-from .possible import SHORTEST
 
 if TYPE_CHECKING:
     from ..merging import Estimate, Unsampled
@@ -161,7 +161,7 @@ def is_undersampling_possible(prepared: PreparedScene, plan: Plan, settings: Set
     """Whether near-specular lobes, or a sensor that light subpaths must hit, may leave light undersampled."""
     sharp = prepared.narrowest >= NARROW or (prepared.delta and plan.hit and not plan.guided)
     by_arrival = plan.arrival and _has_sds_paths(prepared)
-    return settings.max_depth >= SHORTEST and ((sharp and prepared.has_small_emitter) or by_arrival)
+    return settings.max_depth >= FEWEST_EDGES and ((sharp and prepared.has_small_emitter) or by_arrival)
 
 
 def _has_sds_paths(prepared: PreparedScene) -> bool:
@@ -227,7 +227,7 @@ def _merged(
     sharp = policy.only_specular < math.inf
     with gc_paused(), evaluated_mode(prepared.emitters.evaluated):
         plan = replace(plan, kappa_light=1.0, kappa_direct=1.0)
-        kernel = Kernel(prepared, plan, settings, mis.Heuristic("balance"))
+        kernel = TraceContext(prepared, plan, settings, mis.Heuristic("balance"))
         traits = prepared.traits if sharp else prepared.traits.of_delta_lobes()
         kernel = kernel.replaced(traits=traits, last_merged=kernel.max_depth)
         aim = Aim.of(prepared.scene, kernel.emitters, prepared.near_specular if sharp else ())

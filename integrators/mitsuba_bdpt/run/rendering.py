@@ -34,7 +34,7 @@ from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
 from ..transport.batch import strip_count
-from ..transport.inputs import Kernel
+from ..transport.inputs import TraceContext
 from ..transport.kernel import trace
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
@@ -235,8 +235,8 @@ class Render:
         if self.kernel.plan is not self.plan:
             self.kernel = self._kernel()
 
-    def _kernel(self) -> Kernel:
-        kernel = Kernel(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
+    def _kernel(self) -> TraceContext:
+        kernel = TraceContext(self.prepared, self.plan, self.settings, mis.Heuristic(self.settings.heuristic))
         if self.planner.threshold and self.plan.roulette:
             kernel = kernel.with_threshold(dr.opaque(mi.Float64, self.planner.threshold))
         if self.light_groups is not None:

@@ -9,16 +9,18 @@ from __future__ import annotations
 import mitsuba as mi
 
 from . import mis
-from .inputs import Kernel
+from .inputs import TraceContext
 
 
-def where_lit(kernel: Kernel, lit: mi.Bool | None) -> mis.Coefficient:
+def where_lit(kernel: TraceContext, lit: mi.Bool | None) -> mis.Coefficient:
     """kappa of next-event estimation where ``lit`` (None: everywhere), else 0."""
     direct = kernel.kappa.direct
     return direct if lit is None else mis.choose(lit, direct, 0)
 
 
-def newest_coefficient(kernel: Kernel, vertex, adjoint: bool, beside_merges: bool = False) -> mis.Coefficient:
+def newest_coefficient(
+    kernel: TraceContext, vertex, adjoint: bool, beside_merges: bool = False
+) -> mis.Coefficient:
     """kappa of the newest alternative at ``vertex``, for s >= 1; s = 0 differs: `techniques.hit_emitter`.
 
     ``beside_merges``: kappa' instead, for comparisons with merges (docs/method/sds_paths.md).
@@ -30,18 +32,20 @@ def newest_coefficient(kernel: Kernel, vertex, adjoint: bool, beside_merges: boo
     return mis.choose(vertex.edges == 1, first, kernel.kappa.inner)
 
 
-def newest_connection(kernel: Kernel, vertex, adjoint: bool, beside_merges: bool = False) -> mis.PartialSum:
+def newest_connection(
+    kernel: TraceContext, vertex, adjoint: bool, beside_merges: bool = False
+) -> mis.PartialSum:
     """The newest alternative at ``vertex``: ``d_vcm`` times `newest_coefficient`."""
     newest = newest_coefficient(kernel, vertex, adjoint, beside_merges)
     return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
 
 
-def has_lobe(kernel: Kernel, vertex) -> mi.Bool:
+def has_lobe(kernel: TraceContext, vertex) -> mi.Bool:
     """Mask: a ``vertex`` on a surface whose event is not always delta; the path may have a further edge."""
     return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth) & ~vertex.volume
 
 
-def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
+def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
     """Mask: ``vertex`` may be the diffuse one of an SDS path, as far as its side knows.
 
     It has a lobe (`has_lobe`), and no strategy in use connects an edge up to it.
@@ -55,7 +59,7 @@ def is_sds_vertex(kernel: Kernel, vertex, adjoint: bool) -> mi.Bool:
     return possible if state is None else possible & state.isolated
 
 
-def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
+def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
     """Other strategies on the side of ``vertex``, which a strategy of coefficient ``own`` connects.
 
     Returns `mis.alternatives`, and the merges up to the vertex, see `mis.merges`.
@@ -71,7 +75,7 @@ def side_of(kernel: Kernel, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Co
 
 
 def merges_before_end(
-    kernel: Kernel, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
+    kernel: TraceContext, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
 ) -> mis.PartialSum:
     """Merges before the end of a subpath, on an emitter or the sensor.
 

@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..sampling import sobol
-from .inputs import Kernel
+from .inputs import TraceContext
 
 # Samples of a pixel that a launch sums in single precision; further ones have sums of their own (strips).
 # Bounds the rounding error, which is systematic (relative error 4e-6 at 2^12, 5e-5 at 2^16).
@@ -61,7 +61,7 @@ class Batch:
 class Places:
     """Maps camera samples of a batch to pixels and to indices in the image's sequence."""
 
-    def __init__(self, kernel: Kernel, batch: Batch, spp: int):
+    def __init__(self, kernel: TraceContext, batch: Batch, spp: int):
         self._camera = kernel.camera
         self._first_pixel = dr.opaque(mi.UInt32, batch.first_pixel)
         self._spread = dr.opaque(mi.UInt64, batch.spread) if batch.spread else None

@@ -20,7 +20,7 @@ from .contribution import (
     roulette,
     size_of,
 )
-from .inputs import Kernel
+from .inputs import TraceContext
 from .light_path import LightPath, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
 from .sds import connects_sds_path
@@ -28,7 +28,7 @@ from .vacuum import ShadowRay
 from .walk import PathVertex, Vertex
 
 
-def inner(kernel: Kernel, z: Vertex, y: PathVertex) -> Contribution:
+def inner(kernel: TraceContext, z: Vertex, y: PathVertex) -> Contribution:
     """s, t >= 2: connect two vertices, before visibility (eqs. 40, 41).
 
     ``active`` where the contribution is nonzero. Throughputs contain the edges to the vertices; that of ``y``
@@ -66,7 +66,7 @@ def inner(kernel: Kernel, z: Vertex, y: PathVertex) -> Contribution:
 
 
 @dr.syntax
-def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, total, add):
+def connect_all(kernel: TraceContext, z: Vertex, path: LightPath, stream: Stream, total, add):
     """Connect ``z`` with every stored light vertex, with a shadow ray each.
 
     ``add(contribution, seen, total)`` accumulates a contribution, before and after visibility, and returns
@@ -88,7 +88,7 @@ def connect_all(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream, tota
     return total, counters + Counters(shadow_inner=nonzero, evaluated=candidates, zero=candidates - nonzero)
 
 
-def connect_one(kernel: Kernel, z: Vertex, path: LightPath, stream: Stream) -> Contribution:
+def connect_one(kernel: TraceContext, z: Vertex, path: LightPath, stream: Stream) -> Contribution:
     """Connect ``z`` with one light vertex, drawn by weighted unshadowed contribution.
 
     Estimates the sum over all vertices; its weight is part of the value.
@@ -144,7 +144,7 @@ class _Drawn:
 
 
 @dr.syntax
-def _draw(kernel: Kernel, z: Vertex, path: LightPath, u) -> _Drawn:
+def _draw(kernel: TraceContext, z: Vertex, path: LightPath, u) -> _Drawn:
     """Draw one of the inner connections of ``z`` in proportion to its size."""
     candidates, small = candidate_count(kernel, z, path), kernel.shape_errors.small
     slot, value, total = mi.UInt32(0), dr.zeros(mi.Spectrum), mi.Float(0)
@@ -178,7 +178,7 @@ def _draw(kernel: Kernel, z: Vertex, path: LightPath, u) -> _Drawn:
 
 
 @dr.syntax
-def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, u, stream: Stream) -> _Drawn:
+def _draw_by_guess(kernel: TraceContext, z: Vertex, path: LightPath, u, stream: Stream) -> _Drawn:
     """Like `_draw`, from several light subpaths, by approximate size (`proxy_vertices.guess`).
 
     Evaluates only the BSDFs of the drawn connection. Draws uniformly with probability `EVENLY`, and where all
@@ -218,23 +218,23 @@ def _draw_by_guess(kernel: Kernel, z: Vertex, path: LightPath, u, stream: Stream
     return _Drawn(value, size_of(value), end, left, counted, c.light_group, c.path_layer)
 
 
-def _as_drawn(kernel: Kernel, z: Vertex, y: PathVertex, c: Contribution) -> Contribution:
+def _as_drawn(kernel: TraceContext, z: Vertex, y: PathVertex, c: Contribution) -> Contribution:
     """The connection ``c`` as drawn: in media with an approximate transmittance."""
     return replace(c, value=c.value * kernel.space.guessed(z, y.si.p - z.si.p))
 
 
-def _seen(kernel: Kernel, z: Vertex, c: Contribution, ray: mi.Ray3f, own, stream: Stream, number):
+def _seen(kernel: TraceContext, z: Vertex, c: Contribution, ray: mi.Ray3f, own, stream: Stream, number):
     """The connection ``c`` of ``z`` after its shadow ray; ``number``: of its random numbers, from 1."""
     return kernel.space.seen(kernel, replace(c, shadow_ray=ShadowRay(ray, stream, z, ray.d, number, own)))
 
 
-def _shadow_ray(kernel: Kernel, z: Vertex, y: PathVertex) -> tuple[mi.Ray3f, rays.Own | None]:
+def _shadow_ray(kernel: TraceContext, z: Vertex, y: PathVertex) -> tuple[mi.Ray3f, rays.Own | None]:
     """Shadow ray from ``z`` to the light vertex ``y``, see `rays.shadow_ray`."""
     met = rounding.met(y.si.shape, y.si.instance)
     return rays.shadow_ray(kernel.shape_errors, z.anchor, y.anchor, met, z.si)
 
 
-def candidate_count(kernel: Kernel, z: Vertex, path: LightPath) -> mi.UInt32:
+def candidate_count(kernel: TraceContext, z: Vertex, path: LightPath) -> mi.UInt32:
     """Number of light vertices to connect with ``z``; slot i holds y_{i+1} or a later one.
 
     With media (null events are no edges), or several light subpaths, slots may hold vertices of one number.

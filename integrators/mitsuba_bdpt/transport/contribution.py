@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..emitters.records import Cell
 from . import spectra
-from .inputs import Kernel
+from .inputs import TraceContext
 from .vacuum import ShadowRay
 
 # Least survival probability of roulette: random numbers are multiples of 2^-24.
@@ -84,7 +84,7 @@ def one(mask: mi.Bool) -> mi.UInt32:
     return dr.select(mask, mi.UInt32(1), mi.UInt32(0))
 
 
-def counted_by_light(kernel: Kernel) -> Counters:
+def counted_by_light(kernel: TraceContext) -> Counters:
     """Counters of the vertices of light subpaths."""
     plan = kernel.plan
     names = ["shadow_t1"] * plan.splat + ["rouletted"] * (plan.splat and plan.roulette)
@@ -92,7 +92,7 @@ def counted_by_light(kernel: Kernel) -> Counters:
     return Counters.zeros(*names, *kernel.space.counters)
 
 
-def counted_by_camera(kernel: Kernel) -> Counters:
+def counted_by_camera(kernel: TraceContext) -> Counters:
     """Counters of the vertices of camera subpaths."""
     plan = kernel.plan
     one, inner = plan.connections == "one", plan.connections != "none"
@@ -109,7 +109,7 @@ class Contribution:
     ``shares``: see `mis.ByClass`; ``kind``: class in `mis.CLASSES`, or ``merge``; ``position`` on the film in
     pixels, None for the lane's own pixel (t >= 2); ``counted``: `Counters`. With media ``value`` and
     ``weight`` exclude the connected edge until its ``shadow_ray`` is traced (`seen`), for which ``sides`` are
-    the arguments of `mis.Heuristic.weigh`. ``emission``: of `Kernel.cells`, for pilots. ``towards``:
+    the arguments of `mis.Heuristic.weigh`. ``emission``: of `TraceContext.cells`, for pilots. ``towards``:
     direction in which light reaches the sensor, None for t >= 2 (`CameraStart`). ``light_group`` of y_0,
     ``path_layer`` of the path (see `path_layers`), None without such layers.
     """
@@ -140,7 +140,7 @@ class Contribution:
         return dr.select(self.active, self.value * self.weight, 0)
 
 
-def seen(kernel: Kernel, c: Contribution) -> Contribution:
+def seen(kernel: TraceContext, c: Contribution) -> Contribution:
     """``c`` after its shadow ray, if any; all contributions pass here before the sink."""
     return drop_non_finite(c if c.shadow_ray is None else kernel.space.seen(kernel, c))
 
@@ -152,7 +152,7 @@ def drop_non_finite(c: Contribution) -> Contribution:
 
 
 def roulette(
-    kernel: Kernel, value: mi.Spectrum, u: mi.Float, active: mi.Bool
+    kernel: TraceContext, value: mi.Spectrum, u: mi.Float, active: mi.Bool
 ) -> tuple[mi.Bool, mi.Float, Counters]:
     """Roulette on a weighted contribution; returns the survival mask, its probability, and `Counters`."""
     if not kernel.plan.roulette:

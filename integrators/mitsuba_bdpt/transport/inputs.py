@@ -80,7 +80,7 @@ class Observer:
         """An inner connection was drawn; ``end``: light vertex or end of the shadow ray."""
 
 
-class Kernel:
+class TraceContext:
     """Inputs of a pass besides its batch. Holds the scene for one render only.
 
     Constant once made: `replaced` and the methods ``with_...`` return another.
@@ -131,13 +131,15 @@ class Kernel:
         self.path_layers = False
         self.cells: Cells | None = None
 
-    def replaced(self, **changes) -> Kernel:
+    def replaced(self, **changes) -> TraceContext:
         """A copy in which these attributes have other values."""
         other = copy(self)
         vars(other).update(changes)
         return other
 
-    def bound(self, points: Points, count_light: float = 1.0, observer: Observer | None = None) -> Kernel:
+    def bound(
+        self, points: Points, count_light: float = 1.0, observer: Observer | None = None
+    ) -> TraceContext:
         """The kernel for one batch with its ``points``.
 
         ``count_light``: exact number of light subpaths per camera subpath; divides estimates of t <= 1.
@@ -145,11 +147,11 @@ class Kernel:
         count = dr.opaque(mi.Float, count_light)
         return self.replaced(points=points, count_light=count, observer=observer or Observer())
 
-    def with_light_groups(self, groups: LightGroups) -> Kernel:
+    def with_light_groups(self, groups: LightGroups) -> TraceContext:
         """The kernel whose contributions store their light group."""
         return self.replaced(light_groups=groups, emitters=self.emitters.with_indices())
 
-    def with_path_layers(self) -> Kernel:
+    def with_path_layers(self) -> TraceContext:
         """The kernel whose contributions store their path layer, for which events need both densities."""
         return self.replaced(path_layers=True, traits=replace(self.traits, reverse=True))
 
@@ -157,7 +159,7 @@ class Kernel:
         """The light group of the emitter ``index``; None without such layers."""
         return None if self.light_groups is None else self.light_groups.at(index, active)
 
-    def with_threshold(self, size: mi.Float64) -> Kernel:
+    def with_threshold(self, size: mi.Float64) -> TraceContext:
         """The kernel with the roulette threshold ``size`` (``Float64`` of width 1), 0 for none.
 
         Rounded to a power of two, so that the order of atomic sums rarely changes a decision.
@@ -178,7 +180,7 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
             return mi.Vector4f(*(1.0 if name == kind else 0.0 for name in mis.CLASSES))
         return dr.opaque(mi.Float, value)
 
-    count = 1 / plan.camera_paths_per_light_path if plan.light else 0.0  # nominal, see `Kernel.bound`
+    count = 1 / plan.camera_paths_per_light_path if plan.light else 0.0  # nominal, see `TraceContext.bound`
     light = count * plan.kappa_light
     return Coefficients(
         hit=entry("hit", 1, plan.hit),

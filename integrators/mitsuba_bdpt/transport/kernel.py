@@ -43,7 +43,7 @@ from ..sampling.points import Points, Purpose
 from . import contribution, light_path, subpaths, techniques
 from .batch import Batch, Places, Sharing
 from .contribution import Counters, counted_by_camera, counted_by_light
-from .inputs import Kernel, Observer, Shared
+from .inputs import Observer, Shared, TraceContext
 from .sds import PhotonStrategy
 from .walk import random_walk
 
@@ -59,7 +59,7 @@ class Lane:
 
 
 def trace(
-    kernel: Kernel,
+    kernel: TraceContext,
     sink,
     batch: Batch,
     points: Points,
@@ -91,14 +91,14 @@ def trace(
     return (of_light + of_camera).summed()
 
 
-def shared_by(kernel: Kernel, batch: Batch, points: Points) -> Sharing:
+def shared_by(kernel: TraceContext, batch: Batch, points: Points) -> Sharing:
     """Which camera samples of a batch share a light subpath; none in a pilot."""
     if batch.spread:
         return Sharing(batch.lanes, 1, 1, points.seed)
     return Sharing(batch.pixels, batch.samples, kernel.plan.camera_paths, points.seed)
 
 
-def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
+def _begin(kernel: TraceContext, sink, place: Places, index) -> tuple[Lane, Counters]:
     """Trace the light subpaths of these lanes; returns the lanes, and counters."""
     place_in_sequence = place.index(index)
     stream, shared = subpaths.begin_lane(kernel, place_in_sequence)
@@ -112,7 +112,7 @@ def _begin(kernel: Kernel, sink, place: Places, index) -> tuple[Lane, Counters]:
 
 
 @dr.syntax
-def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path):
+def _light_subpaths(kernel: TraceContext, sink, place: mi.UInt64, index, shared, path):
     """Trace the light subpaths of a lane one after the other, see `_light_subpath`."""
     counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel)
     number, count = mi.UInt32(0), kernel.plan.joined
@@ -131,7 +131,7 @@ def _light_subpaths(kernel: Kernel, sink, place: mi.UInt64, index, shared, path)
 # -- the light subpath ------------------------------------------------------------------------
 
 
-def _light_subpath(kernel: Kernel, sink, stream, shared, path):
+def _light_subpath(kernel: TraceContext, sink, stream, shared, path):
     """Trace a light subpath; returns the stored vertices, the counters, and in a pilot the emission."""
     plan = kernel.plan
     e = subpaths.emission(kernel, stream, shared)
@@ -176,7 +176,7 @@ def _light_subpath(kernel: Kernel, sink, stream, shared, path):
 
 
 @dr.syntax
-def _camera_paths(kernel: Kernel, slot_of, trace_sample) -> Counters:
+def _camera_paths(kernel: TraceContext, slot_of, trace_sample) -> Counters:
     """Call ``trace_sample`` for each camera sample of the lane (`Sharing.slots`); returns the counters."""
     counters = Counters.zeros("camera") + counted_by_camera(kernel)
     number = mi.UInt32(0)
@@ -190,7 +190,7 @@ def _camera_paths(kernel: Kernel, slot_of, trace_sample) -> Counters:
     return counters
 
 
-def _camera_subpath(kernel: Kernel, sink, lane: Lane, slot, active) -> Counters:
+def _camera_subpath(kernel: TraceContext, sink, lane: Lane, slot, active) -> Counters:
     """Trace a camera subpath and connect it with the lane's light subpath."""
     plan, shared = kernel.plan, lane.shared
     sample, begun, side = subpaths.camera_subpath(kernel, lane.place, shared, slot, active, sink.alpha)

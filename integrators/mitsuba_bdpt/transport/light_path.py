@@ -11,7 +11,7 @@ import mitsuba as mi
 from ..geometry import polarization, rays
 from . import mis
 from .contribution import one
-from .inputs import KEPT, Kernel
+from .inputs import KEPT, TraceContext
 from .proxy_vertices import Diffuse, Lobe, ProxyVertex
 from .sds import State
 from .walk import PathVertex, Vertex
@@ -73,7 +73,7 @@ class LightPath:
         return "proxy" in self.entries
 
 
-def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
+def allocate_light_path(kernel: TraceContext, lanes: int) -> LightPath:
     """Local memory for stored vertices; without Bool (LLVM code generation aborts)."""
     several, groups = kernel.plan.joined > 1, kernel.light_groups is not None
     types = {
@@ -101,7 +101,7 @@ def allocate_light_path(kernel: Kernel, lanes: int) -> LightPath:
     )
 
 
-def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
+def store_light_vertex(kernel: TraceContext, vertex: Vertex, path: LightPath):
     """Store a light vertex if inner connections can use it."""
     keep = vertex.hit & (vertex.edges + 2 <= kernel.reach) & vertex.connectible()
     throughput, slot = mi.Spectrum(vertex.throughput / vertex.cos), path.count
@@ -131,7 +131,7 @@ def store_light_vertex(kernel: Kernel, vertex: Vertex, path: LightPath):
 
 
 def read_light_vertex(
-    kernel: Kernel, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
+    kernel: TraceContext, path: LightPath, slot: mi.UInt32, active: mi.Bool | bool = True
 ) -> PathVertex:
     """Stored vertex ``slot``; zeros where not ``active``, since slots may be unset."""
     e = {name: local.read(slot, active) for name, local in path.entries.items()}

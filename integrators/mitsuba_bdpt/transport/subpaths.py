@@ -15,7 +15,7 @@ from ..sampling.points import Purpose, Stream
 from ..sensors.records import CameraStart
 from . import mis, spectra, techniques
 from .batch import Places
-from .inputs import Kernel, Shared
+from .inputs import Shared, TraceContext
 from .sds import PhotonStrategy
 from .walk import Side, Walk, not_finite
 
@@ -31,7 +31,7 @@ class CameraSample:
     strip: mi.UInt32
 
 
-def begin_lane(kernel: Kernel, index: mi.UInt64) -> tuple[Stream, Shared]:
+def begin_lane(kernel: TraceContext, index: mi.UInt64) -> tuple[Stream, Shared]:
     """Random numbers of the light subpath ``index``, and time and wavelengths of its lane's subpaths."""
     sensor, points = kernel.camera.sensor, kernel.points
     stream = points.stream("light", index)
@@ -54,7 +54,7 @@ def begin_lane(kernel: Kernel, index: mi.UInt64) -> tuple[Stream, Shared]:
 # -- the light subpath -------------------------------------------------------------------------
 
 
-def emission(kernel: Kernel, stream, shared):
+def emission(kernel: TraceContext, stream, shared):
     """Sample y_0 and the first direction, an `emitters.Emission`."""
     points = kernel.points
     e = kernel.emitters.sample_emission(
@@ -69,7 +69,7 @@ def emission(kernel: Kernel, stream, shared):
     return e
 
 
-def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tuple[Walk, Side]:
+def light_subpath(kernel: TraceContext, e, stream, shared, sds: PhotonStrategy) -> tuple[Walk, Side]:
     """A light subpath on its first edge (eqs. 31, 32); ``sds``: the strategy beside t = 0 on SDS paths."""
     h = kernel.heuristic
     active = ~spectra.is_zero(e.weight) & (kernel.last_light >= 1)
@@ -99,7 +99,7 @@ def light_subpath(kernel: Kernel, e, stream, shared, sds: PhotonStrategy) -> tup
 
 
 def camera_subpath(
-    kernel: Kernel, place: Places, shared, slot, active, alpha=False
+    kernel: TraceContext, place: Places, shared, slot, active, alpha=False
 ) -> tuple[CameraSample, Walk, Side]:
     """Sample z_0 and the first direction; returns the sample, and its camera subpath on the first edge."""
     points = kernel.points
@@ -125,7 +125,7 @@ def camera_subpath(
     return sample, walk, side
 
 
-def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
+def _camera_walk(kernel: TraceContext, sample: CameraSample, active) -> Walk:
     start, ray = sample.start, sample.start.ray
     edge = kernel.space.begin(kernel, "camera", sample.stream, ray)
     if kernel.plan.hide_emitters and edge is None:
@@ -137,7 +137,7 @@ def _camera_walk(kernel: Kernel, sample: CameraSample, active) -> Walk:
     return kernel.sds.begin_camera(kernel, walk)
 
 
-def _first_partial(kernel: Kernel, start):
+def _first_partial(kernel: TraceContext, start):
     """Partial sums of a camera subpath's first edge (eqs. 31, 32): t = 1 is newest, t = 0 older."""
     h = kernel.heuristic
     arrival = h.scale(h.start(start.arrival), kernel.kappa.arrival)

@@ -20,13 +20,13 @@ from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, spectra
 from .alternatives import merges_before_end, side_of, where_lit
 from .contribution import Contribution, Counters, one, roulette
-from .inputs import Kernel
+from .inputs import TraceContext
 from .sds import PhotonStrategy, connects_sds_path
 from .vacuum import ShadowRay
 from .walk import Vertex
 
 
-def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
+def sees_emitter(kernel: TraceContext, z: Vertex) -> mi.Bool:
     """Mask: the camera subpath has hit a visible emitter."""
     active = z.active & (z.si.emitter(kernel.scene) != dr.zeros(mi.EmitterPtr))
     if kernel.plan.hide_emitters:  # as in `volpath`; in `path` the environment is behind null surfaces too
@@ -34,7 +34,7 @@ def sees_emitter(kernel: Kernel, z: Vertex) -> mi.Bool:
     return active & ~z.volume
 
 
-def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
+def hit_emitter(kernel: TraceContext, z: Vertex, sds: PhotonStrategy) -> Contribution:
     """s = 0: the subpath has hit an emitter (eqs. 42, 43); ``sds``: the strategy beside it on SDS paths."""
     h, emitters = kernel.heuristic, kernel.emitters
     t = z.edges + 1
@@ -74,7 +74,9 @@ def hit_emitter(kernel: Kernel, z: Vertex, sds: PhotonStrategy) -> Contribution:
     return c
 
 
-def _beside_guided(kernel: Kernel, guided, on_sds_path, sides: tuple, alone, own: mis.Coefficient) -> tuple:
+def _beside_guided(
+    kernel: TraceContext, guided, on_sds_path, sides: tuple, alone, own: mis.Coefficient
+) -> tuple:
     """Light and camera ``sides`` of s = 0 or s = 1, where near-specular events count as specular.
 
     The only alternatives on an SDS path are the other of the two, ``alone``, and both guided, at r times the
@@ -94,7 +96,7 @@ def _known(value, *pdfs):
     return dr.select(finite, value, dr.nan)
 
 
-def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
+def choose_emitter(kernel: TraceContext, z: Vertex, stream: Stream) -> tuple[Direct, bsdf.Target]:
     """Sample an emitter for the camera vertex ``z``; returns it and its `bsdf.Target`."""
     active = z.hit & (z.edges + 1 <= kernel.max_depth) & z.connectible()
     active &= kernel.space.allows_next_event(z)
@@ -103,7 +105,7 @@ def choose_emitter(kernel: Kernel, z: Vertex, stream: Stream) -> tuple[Direct, b
     return e, bsdf.Target(z.si.to_local(e.d), active & ~spectra.is_zero(e.weight))
 
 
-def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -> Contribution:
+def next_event(kernel: TraceContext, z: Vertex, stream: Stream, sds: PhotonStrategy) -> Contribution:
     """s = 1: connect ``z`` with a sampled emitter point (eqs. 44, 45); ``sds`` as in `hit_emitter`."""
     h, e, f, active = kernel.heuristic, z.endpoint, z.f, z.endpoint_active
     k = z.edges + 1
@@ -139,7 +141,9 @@ def next_event(kernel: Kernel, z: Vertex, stream: Stream, sds: PhotonStrategy) -
     )
 
 
-def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active: mi.Bool) -> Contribution:
+def connect_endpoints(
+    kernel: TraceContext, emission: Emission, stream: Stream, active: mi.Bool
+) -> Contribution:
     """(1,1): connect a sampled emitter point with the sensor."""
     h = kernel.heuristic
     u = _sensor_points(kernel, stream)
@@ -182,7 +186,7 @@ def connect_endpoints(kernel: Kernel, emission: Emission, stream: Stream, active
     return replace(c, towards=connection.d, path_layer=layer, shadow_ray=ShadowRay(ray, stream))
 
 
-def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
+def look_at_sensor(kernel: TraceContext, y: Vertex, stream: Stream) -> tuple[CameraConnection, bsdf.Target]:
     """Sample a connection of the light vertex ``y`` with the sensor; returns it and its `bsdf.Target`."""
     active = y.hit & y.connectible() & (y.edges + 1 <= kernel.reach)
     connection = kernel.camera.connect(y.si.p, *_sensor_points(kernel, stream, y.event))
@@ -194,7 +198,7 @@ def look_at_sensor(kernel: Kernel, y: Vertex, stream: Stream) -> tuple[CameraCon
     return connection, bsdf.Target(y.si.to_local(connection.d), active, cos_ratio)
 
 
-def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
+def splat(kernel: TraceContext, y: Vertex, stream: Stream) -> Contribution:
     """t = 1: connect a light vertex with `look_at_sensor`'s point (eqs. 46, 47)."""
     h, connection, f = kernel.heuristic, y.endpoint, y.f
     to_area = y.cosine(connection.d) / connection.dist2
@@ -221,7 +225,7 @@ def splat(kernel: Kernel, y: Vertex, stream: Stream) -> Contribution:
     return replace(c, path_layer=path_layers.joined(path_layers.EMISSION, of_light))
 
 
-def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
+def hit_sensor(kernel: TraceContext, emission, y: Vertex, walk) -> Contribution:
     """t = 0: the last edge of a light subpath hits the sensor.
 
     ``walk`` as before its arrival at ``y``. The vertex on the sensor replaces ``y``, whose densities are
@@ -267,7 +271,7 @@ def hit_sensor(kernel: Kernel, emission, y: Vertex, walk) -> Contribution:
     return replace(c, path_layer=path_layers.joined(path_layers.EMISSION, walk.layer))
 
 
-def _sensor_points(kernel: Kernel, stream, edges=0):
+def _sensor_points(kernel: TraceContext, stream, edges=0):
     """Random points of the connection of light vertex ``edges`` with the sensor."""
     u_lens = kernel.points.draw_2d("light", stream, Purpose.LENS, edges)
     if not kernel.camera.needs_film_sample:

@@ -20,7 +20,7 @@ from ..sensors.records import CameraConnection
 from . import bsdf, mis, path_layers, scattering, spectra
 from .alternatives import newest_coefficient
 from .contribution import Counters, one
-from .inputs import Kernel, Shared
+from .inputs import Shared, TraceContext
 from .near_specular import is_narrow
 from .sds import PhotonStrategy, State
 
@@ -56,7 +56,7 @@ class Walk:
     layer: mi.UInt32 | None = None
 
     @staticmethod
-    def begin(kernel: Kernel, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
+    def begin(kernel: TraceContext, pi, ray, previous, throughput, partial, active, edge=None) -> Walk:
         """A subpath on its first edge."""
         return Walk(
             pi=pi,
@@ -191,7 +191,7 @@ def not_finite(active: mi.Bool, throughput: mi.Spectrum, *directions: mi.Vector3
 
 
 @dr.syntax
-def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
+def random_walk(kernel: TraceContext, side: Side, walk: Walk, visit, state):
     """Follow ``walk`` to its end; returns ``state`` and the ended walk.
 
     ``visit(vertex, state, walk)`` returns the new state; ``walk`` as before its arrival.
@@ -212,7 +212,7 @@ def random_walk(kernel: Kernel, side: Side, walk: Walk, visit, state):
     return state, walk
 
 
-def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
+def _vertex(kernel: TraceContext, side: Side, walk: Walk) -> Vertex:
     """The vertex at the end of the edge; converts densities to the area measure."""
     h = kernel.heuristic
     si, ray, volume, throughput, edge = kernel.space.arrive(kernel, side, walk)
@@ -257,7 +257,7 @@ def _vertex(kernel: Kernel, side: Side, walk: Walk) -> Vertex:
     )
 
 
-def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
+def _interact(kernel: TraceContext, side: Side, walk: Walk, vertex: Vertex):
     """Sample the next direction, and connect ``vertex`` with an endpoint."""
     if not kernel.surfaces and kernel.space.phase is None:  # a virtual call needs a target
         return None
@@ -274,14 +274,14 @@ def _interact(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex):
     return step
 
 
-def _is_sampled(kernel: Kernel, side: Side, vertex: Vertex):
+def _is_sampled(kernel: TraceContext, side: Side, vertex: Vertex):
     """Mask: a direction is sampled at ``vertex``; at the last one as in `path` and `volpath`, for alpha."""
     # With media null events are no edges, so that subpaths go on after them.
     at_last = ~vertex.volume if side.alpha or kernel.has_media else mi.Bool(False)
     return vertex.hit & (at_last | (vertex.edges < side.last_edge))
 
 
-def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first: mi.Float) -> Walk:
+def _scatter(kernel: TraceContext, side: Side, walk: Walk, vertex: Vertex, step, first: mi.Float) -> Walk:
     """Take the ``step``, play roulette and trace the next edge; ``first``: size of the first throughput."""
     if step is None:
         return replace(walk, edges=walk.edges + 1, active=mi.Bool(False))
@@ -332,7 +332,7 @@ def _scatter(kernel: Kernel, side: Side, walk: Walk, vertex: Vertex, step, first
     )
 
 
-def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Float, useful):
+def _roulette(kernel: TraceContext, side: Side, walk: Walk, throughput, survive: mi.Float, useful):
     """Russian roulette of a subpath: its throughput, and whether it goes on.
 
     With probability ``survive``, from ``rr_depth`` on as in `path`, with media as in `volpath`; ``useful``:
@@ -345,7 +345,7 @@ def _roulette(kernel: Kernel, side: Side, walk: Walk, throughput, survive: mi.Fl
     return dr.select(playing, throughput / survive, throughput), ~playing | (u < survive)
 
 
-def _sds(kernel: Kernel, side: Side, vertex: Vertex, coefficient: mis.Coefficient, step):
+def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coefficient, step):
     """`Walk.sds`, and the partial sums ``d_vm`` and ``d_vm_newest``, after the event at ``vertex``.
 
     ``coefficient``: that of the class that connects the edge to it.

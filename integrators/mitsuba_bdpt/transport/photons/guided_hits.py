@@ -21,7 +21,7 @@ from ...sampling.points import Purpose, Stream
 from .. import bsdf, mis, path_layers, spectra, techniques
 from ..alternatives import is_sds_vertex, newest_coefficient
 from ..contribution import one
-from ..inputs import Kernel
+from ..inputs import TraceContext
 from ..near_specular import GUIDED
 from ..sds import Advice, PhotonStrategy, State, begun_near_specular, is_specular
 from ..walk import Side, Vertex, Walk, not_finite, random_walk
@@ -60,7 +60,7 @@ class Guiding(PhotonStrategy):
         possible = is_sds_vertex(kernel, vertex, adjoint)
         return self._evaluated(kernel, vertex, vertex.si.to_world(step.wo), possible)
 
-    def _evaluated(self, kernel: Kernel, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
+    def _evaluated(self, kernel: TraceContext, vertex: Vertex, d: mi.Vector3f, active: mi.Bool) -> Advice:
         def look(p, d):
             found = photon_guide.find(self.guide, p)
             return Advice(mi.Bool(True), found, self.density(kernel, p, found, d))
@@ -70,7 +70,7 @@ class Guiding(PhotonStrategy):
 
         return dr.if_stmt((mi.Point3f(vertex.si.p), d), active, look, nothing, label="guide")
 
-    def density(self, kernel: Kernel, p, found, d) -> mi.Float:
+    def density(self, kernel: TraceContext, p, found, d) -> mi.Float:
         """Density of ``d`` by the guide, times the number of guided samples."""
         return kernel.plan.guided * photon_guide.density(self.guide, p, found, d)
 
@@ -129,7 +129,7 @@ class Unguided(PhotonStrategy):
 
 
 @dr.syntax
-def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, shared, add, state):
+def _follow_all(kernel: TraceContext, guiding: Guiding, z: Vertex, stream: Stream, shared, add, state):
     number = mi.UInt32(0)
     while dr.hint(
         number < kernel.plan.guided,
@@ -143,7 +143,7 @@ def _follow_all(kernel: Kernel, guiding: Guiding, z: Vertex, stream: Stream, sha
     return state
 
 
-def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared, add, state):
+def _follow_one(kernel: TraceContext, guiding: Guiding, z: Vertex, numbers: Stream, shared, add, state):
     near_specular, guided = guiding.near_specular, _Guided(guiding)
     connects = near_specular and kernel.plan.direct
 
@@ -180,7 +180,7 @@ def _follow_one(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, sh
     return total, lost + one(walk.broken), traced
 
 
-def _begun(kernel: Kernel, guiding: Guiding, z: Vertex, numbers: Stream, shared) -> Walk:
+def _begun(kernel: TraceContext, guiding: Guiding, z: Vertex, numbers: Stream, shared) -> Walk:
     """A subpath that leaves ``z`` in a direction sampled from the guide."""
     h, p, points = kernel.heuristic, z.si.p, kernel.points
     u1 = points.draw_1d("camera", numbers, Purpose.LOBE, z.event)

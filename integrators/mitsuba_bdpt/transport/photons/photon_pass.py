@@ -13,7 +13,7 @@ from ...sampling.points import Points, Purpose, Stream
 from .. import spectra, subpaths
 from ..alternatives import is_sds_vertex, newest_connection
 from ..contribution import Counters, one
-from ..inputs import Kernel
+from ..inputs import TraceContext
 from ..near_specular import GUIDED
 from ..sds import PhotonStrategy, begun_near_specular
 from ..walk import Vertex, Walk, random_walk
@@ -46,11 +46,11 @@ class PhotonPolicy:
         """The emission with which a subpath begins, and `Photon.aim`, given what `Aim` sampled."""
         return e, aim
 
-    def begin(self, kernel: Kernel, e: Emission, walk: Walk) -> Walk:
+    def begin(self, kernel: TraceContext, e: Emission, walk: Walk) -> Walk:
         """The subpath ``walk`` on its first edge."""
         return walk
 
-    def stored(self, kernel: Kernel, y: Vertex, stream: Stream) -> tuple:
+    def stored(self, kernel: TraceContext, y: Vertex, stream: Stream) -> tuple:
         """Mask: ``y`` is stored; the probability of that."""
         raise NotImplementedError
 
@@ -82,14 +82,14 @@ class Traced:
     broken: mi.Bool
 
 
-def trace_guide(kernel: Kernel, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
+def trace_guide(kernel: TraceContext, aim: Aim, points: Points, count: int) -> tuple[Guide | None, mi.UInt64]:
     """Trace ``count`` photon subpaths; returns their guide (None without photons) and counters."""
     kernel = kernel.replaced(sds=PhotonStrategy(), last_light=kernel.max_depth)
     traced = trace(kernel, GuidePhotons(kernel.near_specular), aim, points, count)
     return Guide.of(traced.photons, traced.count) if traced.count else None, traced.counters
 
 
-def trace(kernel: Kernel, policy: PhotonPolicy, aim: Aim, points: Points, count: int) -> Traced:
+def trace(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, points: Points, count: int) -> Traced:
     """Trace ``count`` photon subpaths of up to ``kernel.last_light`` edges; ``kernel.sds`` in weights."""
     kernel = kernel.bound(points)
     capacity = max(int(count * _CAPACITY), 1)
@@ -100,7 +100,7 @@ def trace(kernel: Kernel, policy: PhotonPolicy, aim: Aim, points: Points, count:
         capacity = traced.count  # again, with more memory
 
 
-def _traced(kernel: Kernel, policy: PhotonPolicy, aim: Aim, count: int, out: Photon) -> Traced:
+def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, out: Photon) -> Traced:
     """Store photons in ``out``; `Traced.count` may exceed it."""
     number, most = dr.zeros(mi.UInt32, 1), dr.opaque(mi.UInt32, dr.width(out))
     lanes = dr.arange(mi.UInt32, count)
