@@ -319,11 +319,6 @@ def test_welch_leaves_out_rounding_and_lumps():
     assert found.continuous.tolist() == [False, True]
 
 
-def test_sidak():
-    """1 - (1 - 0.01)^3 = 0.029701."""
-    assert agreement.sidak([0.01, 0.5, 0.7]) == pytest.approx(0.029701, abs=1e-9)
-
-
 def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
     """Renders whose values are uniform in mean * [0.5, 1.5]: variance mean^2 / 12."""
     return mean * np.random.default_rng(seed).uniform(0.5, 1.5, (count, *shape))
@@ -472,10 +467,6 @@ def test_slope():
     found = analysis.slope(errors.keys(), errors.values())
     assert found.value == pytest.approx(-8.5 / 9.5, rel=1e-12)
     assert found.low < found.value < found.high
-    assert analysis.slope(errors.keys(), errors.values(), 0.5).low > found.low
-    scattered = np.random.default_rng(0).uniform(1, 2, (3, 6))
-    a, again, b = (analysis.slope([1, 2, 4], scattered, seed=seed) for seed in (0, 0, 1))
-    assert a == again and a.low != b.low and a.low == pytest.approx(b.low, abs=0.05 * (b.high - b.low))
 
 
 @quick
@@ -497,9 +488,9 @@ def test_slope_interval_covers():
     rng = np.random.default_rng(2)
     samples = np.array([4, 16, 64, 256])
     hits, widths = 0, []
-    for seed in range(200):
+    for _ in range(200):
         errors = np.exp(rng.normal(0, 0.3, (4, 5))) / samples[:, None]
-        found = analysis.slope(samples, errors, seed=seed)
+        found = analysis.slope(samples, errors)
         hits += found.low <= -1 <= found.high
         widths.append((found.high - found.low) ** 2)
     offsets = np.log(samples) - np.log(samples).mean()
@@ -527,11 +518,8 @@ def test_slope_refuses():
 
 def test_bootstrap_median():
     """Of 3, 1, 2 the median of a resample is 1 if two or three of it are 1: 3 * (1/9) * (2/3) + 1/27 =
-    7/27 = 26 %. So with tails of 25 % the interval is [1, 3], with tails of 30 % [2, 2]."""
-    assert analysis.bootstrap_median([3, 1, 2], 0.5) == Estimate(2, 1, 3)
-    assert analysis.bootstrap_median([3, 1, 2], 0.4) == Estimate(2, 2, 2)
-    # An even number of values: the mean of the two in the middle.
-    assert analysis.bootstrap_median([1, 2, 4, 50]).value == 3
+    7/27 = 26 %, above the tail of 2.5 %, so the interval is [1, 3]."""
+    assert analysis.bootstrap_median([3, 1, 2]) == Estimate(2, 1, 3)
     values = np.random.default_rng(0).normal(10, 1, 25)
     found = analysis.bootstrap_median(values)
     assert found == analysis.bootstrap_median(values)
@@ -540,8 +528,6 @@ def test_bootstrap_median():
     for bad in ([1.0], [1, np.nan], [[1, 2]]):
         with pytest.raises(ValueError, match="values"):
             analysis.bootstrap_median(bad)
-    with pytest.raises(ValueError, match="confidence=95 must be finite and between 0 and 1"):
-        analysis.bootstrap_median([1, 2, 3], 95)
 
 
 @quick

@@ -133,11 +133,6 @@ def sidak(p: ArrayLike) -> float:
     return float(-np.expm1(len(p) * np.log1p(-min(p.min(), 1 - 1e-16))))
 
 
-def _each(significance: float, count: int) -> float:
-    """Return the significance of each of ``count`` comparisons; inverse of `sidak`."""
-    return float(-np.expm1(np.log1p(-significance) / count))
-
-
 @dataclass(frozen=True)
 class BiasCheck:
     """Result of `compare_means`.
@@ -205,12 +200,6 @@ class Means:
         return math.isqrt(len(self.columns.mean) // 3 - 1)
 
 
-def _student(value, error, freedom, confidence) -> Estimate:
-    """Return ``value`` with Student's interval for its standard error."""
-    half = stats.t.isf((1 - confidence) / 2, freedom) * error
-    return Estimate(float(value), float(value - half), float(value + half))
-
-
 def missing_energy(image: Sample, reference: Sample) -> Estimate:
     """Return 1 - mean(image) / mean(reference) with its 95 % interval (m = 1).
 
@@ -247,7 +236,9 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
     found = welch(ours.columns, theirs.columns)
     worst = int(np.lexsort((-np.abs(found.value), found.p))[0])
     tile, channel = divmod(worst, 3)
-    family = sidak(found.p)
+    family, each = sidak(found.p), (1 - significance) ** (1 / len(found.p))
+    value, error, freedom = (float(of[worst]) for of in found[:3])
+    half = error * float(stats.t.isf((1 - each) / 2, freedom))
     return BiasCheck(
         passed=family >= significance,
         p=float(found.p[worst]),
@@ -255,11 +246,6 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
         comparisons=len(found.p),
         tile=divmod(tile, tiles) if tile < tiles**2 else None,
         channel=channel,
-        difference=_student(
-            found.value[worst],
-            found.error[worst],
-            found.freedom[worst],
-            1 - _each(significance, len(found.p)),
-        ),
+        difference=Estimate(value, value - half, value + half),
         missing=missing_energy(ours.whole, theirs.whole),
     )

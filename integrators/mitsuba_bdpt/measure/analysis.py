@@ -23,17 +23,15 @@ from .estimates import (
     FEWEST_WITH_INTERVAL,
     Bound,
     RelativeError,
+    bootstrap,
     bound_of_ratio,
     mean_differs,
     relative_error,
     seed_errors,
     unlike,
 )
-from .metrics import CONFIDENCE, Estimate, number_of, values_of
+from .metrics import Estimate, values_of
 from .record import Error, Row
-
-# Bootstrap resamples: the ends of a 95 % interval vary by 1 % of its width between seeds.
-RESAMPLES = 10_000
 
 # Names of the integrators that reports compare with, as in presets/benchmark.toml.
 RIVALS = ("path", "path multijitter")
@@ -54,22 +52,17 @@ class Unavailable(CommandError):
     """A figure that cannot be computed from the data; the text has the reason."""
 
 
-def slope(
-    samples: Iterable[float],
-    errors: Iterable[Iterable[float]],
-    confidence: float = CONFIDENCE,
-    seed: int = 0,
-) -> Estimate:
+def slope(samples: Iterable[float], errors: Iterable[Iterable[float]]) -> Estimate:
     """Exponent of error ~ samples^slope; -1 for squared errors of Monte Carlo.
 
     ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs; of a dict
     {spp: errors}, ``slope(runs.keys(), runs.values())``. Least squares of log(error) over log(samples), a
     point per run: sum (x - mean x) y / sum (x - mean x)^2.
 
-    The interval is from percentiles of `RESAMPLES` fits to runs drawn with replacement within each count.
-    Deviations from a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs: resampling k
-    values has only (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to the
-    Bootstrap, 1993, sections 9 and 13.
+    The 95 % interval is the `bootstrap`'s, of runs drawn with replacement within each count. Deviations from
+    a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs: resampling k values has only
+    (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993,
+    sections 9 and 13.
     """
     x = np.log(values_of("samples", samples, 2, 0))
     y = [np.log(values_of(f"errors[{i}]", row, 2, 0)) for i, row in enumerate(errors)]
@@ -80,32 +73,21 @@ def slope(
     if np.ptp(x) == 0:
         raise CommandError("samples are all the same; a slope needs at least two different counts.")
     weight = runs * offset / np.sum(runs * offset**2)
-    rng = np.random.default_rng(seed)
-    drawn = np.empty((RESAMPLES, len(y)))
-    for i, row in enumerate(y):
-        picked = row[rng.integers(len(row), size=(RESAMPLES, len(row)))].mean(1)
-        drawn[:, i] = row.mean() + (picked - row.mean()) * math.sqrt(len(row) / (len(row) - 1))
-    value = float(np.dot(weight, [row.mean() for row in y]))
-    return _percentiles(value, drawn @ weight, confidence)
+    wide = [row.mean() + (row - row.mean()) * math.sqrt(len(row) / (len(row) - 1)) for row in y]
+
+    def fitted(*rows: np.ndarray, axis: int = -1) -> Any:
+        return sum(w * row.mean(axis) for w, row in zip(weight, rows, strict=True))
+
+    return bootstrap(wide, fitted)
 
 
-def _percentiles(value: float, drawn: np.ndarray, confidence: float) -> Estimate:
-    tail = (1 - number_of("confidence", confidence, 0, 1)) / 2
-    low, high = np.quantile(drawn, [tail, 1 - tail])
-    return Estimate(value, float(low), float(high))
+def bootstrap_median(values: Iterable[float]) -> Estimate:
+    """Return the median of a few values and its 95 % bootstrap interval.
 
-
-def bootstrap_median(values: Iterable[float], confidence: float = CONFIDENCE, seed: int = 0) -> Estimate:
-    """Return the median of a few values and its bootstrap interval.
-
-    Percentiles of `RESAMPLES` medians of values drawn with replacement. The interval lies within the range of
-    the n values, which contains the median with probability 1 - 2^(1 - n): 94 % for 5, 99.8 % for 10. Source:
-    as `slope`, section 13.
+    It lies within the range of the n values, which contains the median with probability 1 - 2^(1 - n): 94 %
+    for 5, 99.8 % for 10. Source: as `slope`, section 13.
     """
-    given = values_of("values", values, 2)
-    rng = np.random.default_rng(seed)
-    drawn = given[rng.integers(len(given), size=(RESAMPLES, len(given)))]
-    return _percentiles(float(np.median(given)), np.median(drawn, axis=1), confidence)
+    return bootstrap([values_of("values", values, 2)], np.median)
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ Student's over seeds; the noise of the reference's image in the weights is not i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import stats
@@ -44,6 +44,9 @@ OWN: dict[Error, Literal["reference_rel_mse", "reference_rel_mse_trimmed"]] = {
 # Above this share of the measured error the reference's own error is not subtracted: the difference would be
 # mostly noise.
 SUBTRACTED = 0.9
+
+# Bootstrap resamples: the ends of a 95 % interval vary by 1 % of its width between seeds.
+RESAMPLES = 10_000
 
 # Fewest renders for which a 95 % interval is given; a range of fewer has their number beside it.
 FEWEST_WITH_INTERVAL = 5
@@ -122,8 +125,8 @@ def relative_error(rows: Sequence[Errors], error: Error, differs: bool) -> Relat
     return RelativeError(spread if is_variance else total, bound, len(rows), spread, squared_bias(rows))
 
 
-def mean_of(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate:
-    """Return the mean of positive values with Student's interval of its logarithm.
+def mean_of(values: Sequence[float]) -> Estimate:
+    """Return the mean of positive values with Student's 95 % interval of its logarithm.
 
     The standard error is the jackknife's. From 0 to infinity for a single value. The interval of few values
     with a long tail is too narrow: a rare value was not met.
@@ -132,20 +135,32 @@ def mean_of(values: Sequence[float], confidence: float = CONFIDENCE) -> Estimate
     value, n = float(given.mean()), len(given)
     if n == 1:
         return Estimate(value, 0.0, math.inf)
-    return _of_logarithm(value, (given.sum() - given) / (n - 1), confidence)
+    return _of_logarithm(value, (given.sum() - given) / (n - 1))
 
 
-def _of_logarithm(value: float, without: np.ndarray, confidence: float) -> Estimate:
+def _of_logarithm(value: float, without: np.ndarray) -> Estimate:
     """Return Student's interval of the logarithm of ``value``, of the estimates ``without`` each of n."""
-    student = _student(len(without) - 1, confidence)
     if without.min() <= 0:
-        half = student * _jackknife(without)
+        half = _half_width(without)
         return Estimate(value, max(value - half, 0.0), value + half)
-    factor = math.exp(min(student * _jackknife(np.log(without)), 700.0))
+    factor = math.exp(min(_half_width(np.log(without)), 700.0))
     return Estimate(value, value / factor, value * factor)
 
 
-def variance(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate:
+def _half_width(without: np.ndarray) -> float:
+    """Half of Student's interval, by the jackknife: of the estimates ``without`` each of n values."""
+    n = len(without)
+    return float(stats.t.isf((1 - CONFIDENCE) / 2, n - 1) * math.sqrt(n - 1) * without.std())
+
+
+def bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., Any]) -> Estimate:
+    """Return a statistic of independent ``samples``, and its 95 % interval: percentiles of resamples."""
+    how = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "method": "percentile", "rng": 0}
+    low, high = stats.bootstrap(samples, statistic, **how).confidence_interval
+    return Estimate(float(statistic(*samples)), float(low), float(high))
+
+
+def variance(rows: Sequence[Errors]) -> Estimate:
     """Return the variance relative to the reference, with a 95 % interval over seeds.
 
     Student's interval of the logarithm, whose standard error is the jackknife's; from 0 to infinity for two
@@ -155,7 +170,7 @@ def variance(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate
     value = float(_column(rows, "variance").mean())
     if without is None:
         return Estimate(value, 0.0, math.inf)
-    return _of_logarithm(value, without, confidence)
+    return _of_logarithm(value, without)
 
 
 def _variance_without(rows: Sequence[Errors]) -> np.ndarray | None:
@@ -168,7 +183,7 @@ def _variance_without(rows: Sequence[Errors]) -> np.ndarray | None:
     return ((n - 1) / n * spread.sum() - spread) / (n - 2)
 
 
-def squared_bias(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Estimate | None:
+def squared_bias(rows: Sequence[Errors]) -> Estimate | None:
     """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
 
     None for a single render; infinite interval for two. Value and interval may be negative.
@@ -181,18 +196,8 @@ def squared_bias(rows: Sequence[Errors], confidence: float = CONFIDENCE) -> Esti
     if variances is None:
         return Estimate(value, -math.inf, math.inf)
     without = (total.sum() - total) / (n - 1) - variances
-    half = _student(n - 1, confidence) * _jackknife(without)
+    half = _half_width(without)
     return Estimate(value, value - half, value + half)
-
-
-def _jackknife(without: np.ndarray) -> float:
-    """Return the standard error from the estimates ``without`` each of n values."""
-    n = len(without)
-    return math.sqrt((n - 1) / n * float(np.sum((without - without.mean()) ** 2)))
-
-
-def _student(freedom: int, confidence: float) -> float:
-    return float(stats.t.isf((1 - confidence) / 2, freedom))
 
 
 def mean_differs(rows: Sequence[Row], reference: Means) -> bool:
