@@ -21,13 +21,13 @@ from mitsuba_bdpt.measure.analysis import (
     Unavailable,
     cost,
     efficiency,
-    geometric_mean,
     summary,
 )
 from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL
 from mitsuba_bdpt.measure.record import Error
 from mitsuba_bdpt.measure.report import KINDS, pilot_percent
 from mitsuba_bdpt.measure.tables import met_text, ranged, ratio, table
+from scipy import stats
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def _mean_over_none(results: Results, scenes: list[str]) -> Measured:
                 continue
         if not medians:
             raise Unavailable("not rendered")
-        found[kind] = geometric_mean(medians)
+        found[kind] = float(stats.gmean(medians))
     text = ", ".join(f"{ratio(mean)} {kind}" for kind, mean in found.items())
     return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", list(found.values()))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.images import write_layers
-from mitsuba_bdpt.measure import crops, figures, paper, pyramid, report
+from mitsuba_bdpt.measure import crops, figures, report
 from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.estimates import RelativeError
@@ -85,29 +85,6 @@ def saved(monkeypatch, module):
     return found
 
 
-@pytest.mark.parametrize("plot", ["samples", "efficiency"])
-def test_what_looks_alike_is_one_entry(monkeypatch, plot):
-    """Rationale: `path`, and `volpath` of scenes with media, had an entry each with the same mark. Expected:
-    one entry of both, and the marks of all entries differ."""
-    found = results()
-    fog = {"path": "volpath", "path multijitter": "volpathmis"}
-    rows = [
-        row | {"method": fog.get(row["method"], row["method"])} if row["scene"] == "b" else row
-        for row in found.rows
-    ]
-    shown = saved(monkeypatch, figures)
-    figures.PLOTS[plot](replace(found, rows=rows), None, 1, found.scenes)
-    entries = shown[0].legends[0].legend_handles
-    before = "over " if plot == "efficiency" else ""
-    labels = [entry.get_label() for entry in entries]
-    assert f"{before}path / volpath" in labels and f"{before}path multijitter / volpathmis" in labels
-    looks = [
-        (entry.get_color(), entry.get_marker()) for entry in entries if entry.get_marker() not in ("", "None")
-    ]
-    named = [look for look, label in zip(looks, labels, strict=False) if label.startswith(before)]
-    assert len({*named}) == len(named)
-
-
 def test_windows_lie_where_errors_differ():
     """Expected: the first of two disjoint windows within the window of fireflies, the second at least a side
     apart, also where the largest errors fill more than one window; without room for that they only touch.
@@ -160,60 +137,6 @@ def test_crops_are_of_the_sweep(tmp_path):
     assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
 
 
-@pytest.mark.parametrize(
-    ("seeds", "label"),
-    [
-        ((8, 8), "95 % interval"),
-        ((5, 5), "95 % interval"),
-        ((2, 2), "range of 2 seeds"),
-        ((2, 4), "range of 2 to 4 seeds"),
-        ((2, 8), "95 % interval; range if n < 5"),
-    ],
-)
-def test_the_range_of_few_seeds_is_no_interval(monkeypatch, seeds, label):
-    """Rationale: the range of two seeds, which holds the median in half of cases, was called a 95 % interval.
-    Expected: it is called what it is, and by the number of seeds."""
-    found, most = results(), dict(zip(("a_caustic_with_a_long_name", "b"), seeds, strict=True))
-    kept = replace(found, rows=[row for row in found.rows if row["seed"] < most[row["scene"]]])
-    drawn = saved(monkeypatch, figures)
-    figures.efficiencies(kept, kept.rivals, None)
-    assert label in [text.get_text() for text in drawn[0].legends[0].get_texts()]
-
-
-def test_rows_of_a_pyramid_without_light_are_not_brightened(monkeypatch):
-    """Expected: the factor below k where a strategy of that row brings light, and k alone elsewhere."""
-    found = saved(monkeypatch, pyramid)
-    images = {(2, 0, 3): None, (2, 1, 2): None, (3, 1, 3): np.ones((9, 16, 3)), (3, 2, 2): None}
-    pyramid.draw(images, None, 0.0, 2)
-    assert [text.get_text() for text in found[0].texts] == ["$k=2$", "$k=3$\n4x"]
-
-
-def check_texts(figure):
-    """All text is inside of a figure, of 6 points or more, and none over another."""
-    texts = [t for t in figure.findobj(paper.plt.Text) if t.get_text().strip() and t.get_visible()]
-    labels = [t for a in figure.axes for axis in (a.xaxis, a.yaxis) for t in hidden(axis)]
-    texts = [t for t in texts if not any(t is label for label in labels)]
-    boxes = {t.get_text() + str(i): t.get_window_extent() for i, t in enumerate(texts)}
-    assert len(texts) > 8 and min(t.get_fontsize() for t in texts) >= 6
-    for (one, a), (other, b) in itertools.combinations(boxes.items(), 2):
-        across = min(a.x1, b.x1) - max(a.x0, b.x0)
-        along = min(a.y1, b.y1) - max(a.y0, b.y0)
-        assert across < 1 or along < 1, (one, other)
-    inside = figure.bbox.padded(1)
-    assert all(inside.contains(b.x0, b.y0) and inside.contains(b.x1, b.y1) for b in boxes.values())
-
-
-def hidden(axis):
-    """Labels of ticks outside of an axis' limits, which are not drawn."""
-    low, high = sorted(axis.get_view_interval())
-    return [
-        label
-        for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks())
-        for label in (tick.label1, tick.label2)
-        if not low <= tick.get_loc() <= high
-    ]
-
-
 def test_curves_are_raw_and_trimmed(monkeypatch):
     """Expected: of each integrator the means of raw errors, solid with markers, and of trimmed ones, half of
     them, dashed; hollow markers where the error is a lower bound; a line of slope -1."""
@@ -230,21 +153,6 @@ def test_curves_are_raw_and_trimmed(monkeypatch):
     x, y = next(line for line in axis.lines if line.get_color() == "black").get_data()
     assert y[1] / y[0] == pytest.approx(x[0] / x[1])
     assert axis.get_xscale() == axis.get_yscale() == "log"
-
-
-def test_one_budget_has_points(monkeypatch):
-    """Rationale: of a single budget the trimmed error was a line without length, without marker. Expected: a
-    marker for each integrator, raw and trimmed, and two labels at each axis."""
-    found = saved(monkeypatch, figures)
-    kept = results(("b",))
-    one = Results([row for row in kept.rows if row["budget"] == 16], kept.references, {})
-    figures.convergence(one, "spp", None, 1, ("b",))
-    (axis,) = found[0].axes
-    dashed = [line for line in axis.lines if line.get_linestyle() == "--"]
-    assert len(dashed) == len(METHODS) and all(line.get_marker() not in ("", "None") for line in dashed)
-    for side in (axis.xaxis, axis.yaxis):
-        low, high = sorted(side.get_view_interval())
-        assert sum(low <= tick <= high for tick in side.get_majorticklocs()) >= 2
 
 
 ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}
@@ -302,8 +210,7 @@ def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
 
 
 def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
-    """Expected: a warning with the height and the option that mends it; none for one scene. The scale of
-    errors has the same name at each width."""
+    """Expected: a warning with the height and the option that mends it; none for one scene."""
     kept, found = results(("a", "b")), saved(monkeypatch, crops)
     monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab")))
     monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
@@ -315,11 +222,6 @@ def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
         capsys.readouterr().out,
     )
     assert found[1].get_size_inches()[1] * 2.54 < figures.PAGE
-    crops.draw([block(3)], None, 1)
-    for figure in found:
-        names = [axis.get_xlabel() for axis in figure.axes if axis.get_xlabel()]
-        assert {" ".join(name.split()) for name in names} == {"squared relative error"}
-    check_texts(found[-1])
 
 
 @pytest.mark.parametrize("ending", ["pdf", "svg", "png"])

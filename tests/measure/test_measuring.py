@@ -3,7 +3,6 @@
 import errno
 import importlib.resources
 import importlib.util
-import io
 import re
 import shlex
 import subprocess
@@ -17,7 +16,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
-from mitsuba_bdpt.measure import equal_time, making, reference, report, showing, sweep, timing
+from mitsuba_bdpt.measure import equal_time, making, reference, report, sweep, timing
 from mitsuba_bdpt.measure.preset import Cells, read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
@@ -127,27 +126,6 @@ def test_other_commands_take_the_users_scene(here, capsys):
     assert "making one" not in out and "SmoothDiffuse" in out
     made = {path.name for path in (here / "project" / "renders").iterdir()}
     assert {"equal_time_room.png", "pyramid_room.exr", "pyramid_room_weighted.png"} <= made
-
-
-def test_a_terminal_sees_how_far_a_command_is(here, monkeypatch, capsys):
-    """Expected: a bar for the reference and for the renders of each command, with what is rendered last;
-    nothing on standard error where that is no terminal."""
-    shown, plain = io.StringIO(), showing.Console
-    terminal = {"file": shown, "force_terminal": True, "width": 200}
-    common = ["elsewhere/room.xml", "--resolution", "16", "--project", "project", "--spp", "2"]
-    compare = ["compare", "bdpt", "path", "--pairs", "1", "--scenes", *common]
-    for words, text in (
-        (["reference", *common, "--seconds", "60"], "room: seconds of the reference"),
-        (compare, "room, 2 spp, seed 1"),
-        (["equal-time", *common], "bdpt"),
-        (["pyramid", *common], "room: samples per pixel"),
-    ):
-        monkeypatch.setattr(showing, "Console", lambda **_: plain(**terminal))
-        assert main(words) == 0 and text in shown.getvalue()
-        shown.truncate(0)
-    monkeypatch.setattr(showing, "Console", plain)
-    capsys.readouterr()
-    assert main(compare) == 0 and not capsys.readouterr().err
 
 
 def test_the_first_integrator_may_be_any(here):

@@ -366,12 +366,6 @@ def test_references_that_half_precision_cannot_hold_are_refused(folder):
         reference.write(folder / "bright.exr", too_bright)
 
 
-def test_wide_scenes_stay_wide():
-    """Expected: 16:9 at any width."""
-    size = REPOSITORY.scene("veach_mis").load(128).sensors()[0].film().size()
-    assert [int(n) for n in size] == [128, 72]
-
-
 def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
     """Expected: the command that makes the reference is named, with its limit of time."""
     command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --seconds 600 "
@@ -561,27 +555,6 @@ def test_committed_references_are_of_their_scenes(path):
     assert resolution == "128" and kept["scene_sha256"] == REPOSITORY.scene(name).sha256
     assert kept.get("spp_per_render", making.PASS_SPP) == making.PASS_SPP
     assert kept.get("share", making.REFERENCE_SHARE) == making.REFERENCE_SHARE
-
-
-def test_files_are_replaced_at_once(folder, monkeypatch):
-    """Expected: if a process ends before the last step, the old file is still whole and nothing is left
-    beside it.
-    """
-    file = folder / "kept.json"
-    write_json(file, [1, 2])
-    before = making.Halves(folder / "sums.npz", "key")
-    before.add([np.ones((4, 4, 3))] * 2)
-
-    def killed(*args):
-        raise SystemExit
-
-    monkeypatch.setattr("os.replace", killed)
-    for write in (lambda: write_json(file, [3]), lambda: before.add([np.zeros((4, 4, 3))] * 2)):
-        with pytest.raises(SystemExit):
-            write()
-    assert not list(folder.glob(".*"))
-    assert json.loads(file.read_text()) == [1, 2]
-    assert making.Halves(folder / "sums.npz", "key").rounds == 1
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")

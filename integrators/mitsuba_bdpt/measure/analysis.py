@@ -227,10 +227,6 @@ def bias(rows: Sequence[Row], reference: Means) -> BiasCheck:
     return compare_means(Means.of([row["tile_means"] for row in best]), reference)
 
 
-def geometric_mean(values: Iterable[float]) -> float:
-    return math.exp(float(np.mean(np.log(list(values)))))
-
-
 def _paired_budgets(counts: Iterable[Counter[int]]) -> set[int]:
     """Return a scene's budgets of two renders each, of integrators with so many at any budget; else all."""
     found = list(counts)
