@@ -25,7 +25,7 @@ MOST = {
     "": 1550,  # top files
 }
 OUTSIDE = {"scripts": 3093, "tests": 43206}
-MOST_WORDS = 29058
+MOST_WORDS = 29200
 
 
 def _lines(files):
