@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7404,
+    "measure": 7301,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2379,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 3093, "tests": 43206}
-MOST_WORDS = 29200
+OUTSIDE = {"scripts": 3093, "tests": 43204}
+MOST_WORDS = 29122
 
 
 def _lines(files):

@@ -12,7 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -280,11 +280,8 @@ class Results:
     @cached_property
     def at_equal_samples(self) -> list[str]:
         """Integrators with the samples of the first one, not its seconds."""
-        return [name for name in self.methods[1:] if self._a_row(name).get("match") == "spp"]
-
-    def _a_row(self, method: str) -> Row:
-        """Return a row of an integrator."""
-        return next(row for row in self.rows if row["method"] == method)
+        found = {row["method"] for row in self.rows if row.get("match") == "spp"}
+        return [name for name in self.methods[1:] if name in found]
 
     @cached_property
     def standard(self) -> list[str]:
@@ -372,7 +369,13 @@ class Results:
 
     def lacks(self, scene: str, method: str) -> str:
         """Describe the energy that an integrator lacks in a scene; empty if the bias check finds nothing."""
-        return self._lacks(scene, method)
+        try:
+            check = self.bias(scene, method)
+        except Unavailable:
+            # Too few seeds for a check: only an image that is black where the reference is not fails.
+            rows = self.of(scene, method) if scene in self.references else []
+            return NOTHING if rows and not np.any([row["tile_means"] for row in rows]) else ""
+        return "" if check.passed else missing(check)
 
     def surplus(self, scene: str, method: str) -> Estimate:
         """Return the relative difference of the mean from the reference's, with its 95 % interval.
@@ -396,32 +399,10 @@ class Results:
 
         By the bias check, or by the renders of one budget alone, by default the deciding one.
         """
-        return self._differs(scene, method, budget or self.deciding)
-
-    @cached_property
-    def _lacks(self) -> Callable[[str, str], str]:
-        @cache
-        def found(scene: str, method: str) -> str:
-            try:
-                check = self.bias(scene, method)
-            except Unavailable:
-                # Too few seeds for a check: only an image that is black where the reference is not fails.
-                rows = self.of(scene, method) if scene in self.references else []
-                return NOTHING if rows and not np.any([row["tile_means"] for row in rows]) else ""
-            return "" if check.passed else missing(check)
-
-        return found
-
-    @cached_property
-    def _differs(self) -> Callable[[str, str, int], bool]:
-        @cache
-        def found(scene: str, method: str, budget: int) -> bool:
-            rows, reference = self.of(scene, method, budget), self.references.get(scene)
-            if reference is None or not rows:
-                return False
-            return bool(self.lacks(scene, method)) or mean_differs(rows, reference)
-
-        return found
+        rows, reference = self.of(scene, method, budget or self.deciding), self.references.get(scene)
+        if reference is None or not rows:
+            return False
+        return bool(self.lacks(scene, method)) or mean_differs(rows, reference)
 
     def error(
         self, scene: str, method: str, error: Error = "rel_mse_trimmed", budget: int | None = None

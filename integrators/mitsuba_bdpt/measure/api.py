@@ -78,9 +78,10 @@ def compare_at_equal_time(
     the renders, with their ``image``, ``seconds`` and ``rel_mse``.
     """
     from . import equal_time as module
+    from .tables import described
 
     asked = _options(available.EqualTime, options)
-    ways = {_called(plugin): _parameters(plugin) for plugin in integrators}
+    ways = {described(way): way for way in map(_parameters, integrators)}
     with _measured([scene], project) as (found, (name,)):
         return module.pictured(found, name, ways, asked)[1]
 
@@ -169,10 +170,3 @@ def _parameters(plugin: Plugin) -> dict[str, Any]:
     if not isinstance(found.get("type"), str):
         raise CommandError(f"integrator={plugin!r} must be a type or a dictionary with one")
     return found
-
-
-def _called(plugin: Plugin) -> str:
-    """Return the caption of an integrator."""
-    from .tables import described
-
-    return described(_parameters(plugin))

@@ -105,32 +105,24 @@ def line(
 def _figures(pairs: Sequence[Sequence[Measured]]) -> list[str]:
     """Return the cells of `HEADS` after the samples."""
     time = np.array([first["seconds"] / second["seconds"] for first, second in pairs])
-    error, raw = (_ratio(pairs, name) for name in ("rel_mse_trimmed", "rel_mse"))
-    low, middle, high = np.quantile(1 / (time * error.values), (0.25, 0.5, 0.75))
+    (error, *bounds), (raw, *raw_bounds) = (_ratio(pairs, name) for name in ("rel_mse_trimmed", "rel_mse"))
+    low, middle, high = np.quantile(1 / (time * error), (0.25, 0.5, 0.75))
     own = [[row["reference_rel_mse_trimmed"] / row["rel_mse_trimmed"] for row in pair] for pair in pairs]
     return [
         f"{np.median(time):.3g}",
-        f"{error.bound} {np.median(error.values):.3g}".lstrip(),
-        f"{raw.bound} {np.median(raw.values):.3g}".lstrip(),
-        f"{error.turned} {middle:.3g} ({low:.3g}–{high:.3g})".lstrip(),
-        f"{raw.turned} {np.median(1 / (time * raw.values)):.3g}".lstrip(),
+        f"{bounds[0]} {np.median(error):.3g}".lstrip(),
+        f"{raw_bounds[0]} {np.median(raw):.3g}".lstrip(),
+        f"{bounds[1]} {middle:.3g} ({low:.3g}–{high:.3g})".lstrip(),
+        f"{raw_bounds[1]} {np.median(1 / (time * raw)):.3g}".lstrip(),
         f"{100 * np.median(own, axis=0).max():.1f} %",
     ]
 
 
-@dataclass(frozen=True)
-class _Ratio:
-    """Ratios of errors, first over second, of each pair; their bound, and that of their reciprocals."""
-
-    values: np.ndarray
-    bound: Bound
-    turned: Bound
-
-
-def _ratio(pairs: Sequence[Sequence[Measured]], error: Error) -> _Ratio:
+def _ratio(pairs: Sequence[Sequence[Measured]], error: Error) -> tuple[np.ndarray, Bound, Bound]:
+    """Return ratios of errors of each pair, first over second; their bound, and their reciprocals'."""
     sides = [[pair[side] for pair in pairs] for side in (0, 1)]
     (first, over), (second, under) = (seed_errors(rows, error, differs=False) for rows in sides)
-    return _Ratio(np.divide(first, second), bound_of_ratio(over, under), bound_of_ratio(under, over))
+    return np.divide(first, second), bound_of_ratio(over, under), bound_of_ratio(under, over)
 
 
 def lines(

@@ -27,7 +27,6 @@ from .metrics import TRIM, rel_mse
 from .options import RESOLUTION, VARIANT, EqualTime
 from .paper import check_figure
 from .project import Project
-from .reference import Reference
 from .results import relative_errors
 from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers, samples_taken
 from .showing import steps
@@ -58,15 +57,6 @@ class Shot:
         return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {brief(self.error)} (trimmed)"
 
 
-def _against(kept: Reference, image: np.ndarray) -> RelativeError:
-    return relative_error([relative_errors(image, kept)], "rel_mse_trimmed", differs=False)
-
-
-def _against_image(target: np.ndarray, image: np.ndarray) -> RelativeError:
-    """Return the error against an image, whose own error is unknown: an upper bound."""
-    return RelativeError(mean_of([rel_mse(image, target, TRIM)]), "≤", 1)
-
-
 @dataclass(frozen=True)
 class Subject:
     """Scene, reference image, ``max_depth``, and the error of an image against the reference."""
@@ -85,7 +75,11 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
         job = Job(project, file, width, None, options.spp, seconds)
         kept = obtained(job)
         scene = file.load(job.resolution, options.sampler)
-        return Subject(scene, kept.image, job.depth, partial(_against, kept))
+
+        def error(image: np.ndarray) -> RelativeError:
+            return relative_error([relative_errors(image, kept)], "rel_mse_trimmed", differs=False)
+
+        return Subject(scene, kept.image, job.depth, error)
     (target,), _ = read_layers(options.reference, "")
     scene = file.load(options.resolution, options.sampler)
     width, height = (int(n) for n in choose_sensor(scene, 0).film().crop_size())
@@ -94,7 +88,11 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
             f"reference={str(options.reference)!r} has {target.shape[1]} x {target.shape[0]} pixels, the "
             f"film of {file.called} {width} x {height}; render it from this scene"
         )
-    return Subject(scene, target, depth_of(scene.integrator()), partial(_against_image, target))
+
+    def bound(image: np.ndarray) -> RelativeError:  # of an image, whose own error is unknown
+        return RelativeError(mean_of([rel_mse(image, target, TRIM)]), "≤", 1)
+
+    return Subject(scene, target, depth_of(scene.integrator()), bound)
 
 
 def seconds(scene, made, spp: int) -> float:

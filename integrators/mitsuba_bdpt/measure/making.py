@@ -9,10 +9,8 @@ where nothing else samples some light, or `path` (with media `volpath`) where th
 independent integrator. Windows in which few samples find the light have more samples; furnaces are known
 exactly.
 
-Files lie in the project's references/: EXR in half precision with the image (R, G, B), half the difference of
-the halves (difference.R ...), and the provenance as JSON in the header, with the data of bias checks. Sums in
-double precision are kept in renders/, from which a further run continues; without them it continues from the
-stored image, whose rounding is far below its error.
+`reference` describes the files. Sums in double precision are kept in renders/, from which a further run
+continues; without them it continues from the stored image, whose rounding is far below its error.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
 from .reference import (
     Reference,
-    is_outdated,
+    header_of,
     kept_of,
     load_reference,
     make_command,
@@ -204,7 +202,8 @@ class Job:
     @property
     def is_missing(self) -> bool:
         """Whether there is no reference of this version of the scene."""
-        return not self.path.is_file() or is_outdated(self.path, self.scene_sha256)
+        sha256 = self.scene_sha256
+        return not self.path.is_file() or header_of(self.path).get("scene_sha256", sha256) != sha256
 
     @property
     def stored(self) -> Reference | None:
@@ -357,9 +356,7 @@ class Halves:
             print(f"{self.path}: of another scene, integrator or number of samples; begun anew")
             return
         self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
-        self.columns, self.times = list(kept["columns"]), float(kept.get("times", 1.0))
-        whole = np.full((*self.sums.shape[1:3], 1), float(self.rounds))
-        self.counts = kept.get("counts", whole)
+        self.columns, self.times, self.counts = list(kept["columns"]), float(kept["times"]), kept["counts"]
         self.sources = set(kept["sources"].tolist())
         self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
 
@@ -487,10 +484,6 @@ def _loaded(way: dict) -> mi.Integrator:
     return integrator
 
 
-def _same(stored: Reference, **wanted) -> bool:
-    return all(stored.provenance.get(key) == value for key, value in wanted.items())
-
-
 def provenance_of(job: Job, **more: Any) -> dict[str, Any]:
     return {
         "scene": job.scene.name,
@@ -525,7 +518,8 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
     halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
     windows = [Window(job, share, sampler) for share in recipe.windows]
     stored = job.stored if halves.rounds == 0 else None
-    if stored is not None and _same(stored, integrator=parameters, sampler=sampler):
+    by_the_same = {"integrator": parameters, "sampler": sampler}.items()
+    if stored is not None and by_the_same <= stored.provenance.items():
         halves.go_on_from(stored, [window.slices for window in windows])
     spp = _fitting(job, scene, integrator, started) if job.rounds > 1 else PASS_SPP
     aim = AccuracyTarget(job, scene, by)

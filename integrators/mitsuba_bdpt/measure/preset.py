@@ -1,49 +1,7 @@
 """Presets: what a sweep renders, as TOML, or in Python as a dictionary of the same keys.
 
-Three lines are enough::
-
-    scenes = ["caustic.xml"]
-    spp = [4, 16, 64, 256]
-    seeds = 8
-
-`DEFAULTS` has the rest. Without ``scenes`` a preset is for those that the command names by ``--scenes``. All
-keys::
-
-    resolution = 128       # width; where it does not divide into tiles, the nearest that does
-    scenes = ["cornell_box", "rooms/*/scene.xml"]   # names in PROJECT/scenes, or files seen from PROJECT
-    spp = [4, 16, 64]      # samples per pixel of the first integrator: the budgets
-    seeds = [5, 16, 5]     # renders of each; one number for all
-    clock = "processor"    # the seconds that decide: "wall", the default, or "processor", on a busy machine
-    first_image = 3        # first images without kernel cache, each in a process of its own; default: 0
-
-    [[integrator]]         # the first one sets the time
-    type = "bdpt"
-
-    [[integrator]]
-    name = "path multijitter"
-    type = "path"
-    sampler = "multijitter"
-    match = "seconds"      # the default: as many samples as fit into the seconds of the first (the nearest
-                           # power of two, if the sampler is stratified); or "spp", the same samples
-    scenes = ["kitchen"]   # only there; default: in all
-    media = false          # only in scenes without media; true: only in those with; default: both
-    seeds = 5              # at most so many; default: all
-
-    [scene.cornell_box]    # where a scene differs: max_depth (default: the scene's own), spp, seeds
-    max_depth = 6
-
-    [more]                 # further seeds until the interval of a median is narrow enough
-    scenes = ["kitchen"]
-    integrators = ["bdpt", "path multijitter"]
-    spp = 64
-    seeds = [20, 60]       # at least, at most
-    width = 0.04           # of the 95 % interval of the ratio of efficiencies, in all pairs with the first
-
-    [probes]               # what else a render costs (`probes`): how often each is repeated
-    coldstart = 5
-
-Further keys of an integrator are parameters of the plugin. `Cells` are the renders of a scene, each named
-after all that determines it.
+docs/user/measuring_scenes.md describes the keys; `DEFAULTS` has what a preset need not say. `Cells` are the
+renders of a scene, each named after all that determines it.
 """
 
 from __future__ import annotations
@@ -52,6 +10,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -404,13 +363,10 @@ def software() -> dict:
 
 def machine() -> str:
     """Return processor and number of cores."""
-    names = [line.split(":", 1)[1].strip() for line in _cpuinfo() if line.startswith("model name")]
-    return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
-
-
-def _cpuinfo() -> list[str]:
     file = Path("/proc/cpuinfo")
-    return file.read_text(encoding="utf-8").splitlines() if file.exists() else []
+    text = file.read_text(encoding="utf-8") if file.exists() else ""
+    names = re.findall(r"^model name\s*: (.*)", text, re.MULTILINE)
+    return f"{names[0].strip() if names else platform.machine()}, {os.cpu_count()} cores"
 
 
 class Cells:

@@ -108,16 +108,6 @@ def header_of(path: Path) -> dict[str, Any]:
         return {}
 
 
-def is_outdated(path: Path, scene_sha256: str) -> bool:
-    """Return whether the reference is of another version of the scene."""
-    return header_of(path).get("scene_sha256", scene_sha256) != scene_sha256
-
-
-def too_few(name: str, make: str) -> str:
-    """Return the message about a reference without `Means`, with a remedy."""
-    return f"the reference of {name} has too few renders for a bias check; go on by {make}"
-
-
 def read_reference(path: Path) -> Reference:
     """Read a reference from a file; raises ``CommandError`` if it is none."""
     (image, difference), header = read_layers(path, "", "difference.")

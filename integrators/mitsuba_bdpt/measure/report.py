@@ -214,7 +214,8 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         try:
             verdict = _verdict(results.bias(scene, ours), made[scene].merged)
         except Unavailable as few:
-            verdict = said(_without_verdict, results, scene, ours, few)
+            why = str(few)
+            verdict = said(lambda: f"energy {_energy(results, scene, ours)} ({why}: no verdict)")
         return f"{verdict}, by {_maker(made[scene])}"
 
     columns: dict[str, Callable[[str], object]] = {
@@ -229,10 +230,6 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT}
     of[f"efficiency over {LIGHT_TRACER}"] = LIGHT_TRACER
     return by_scene(results.scenes, _rendered(results, columns, of))
-
-
-def _without_verdict(results: Results, scene: str, method: str, why: Unavailable) -> str:
-    return f"energy {_energy(results, scene, method)} ({why}: no verdict)"
 
 
 def _rendered(

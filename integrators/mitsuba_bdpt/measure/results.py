@@ -278,7 +278,7 @@ def missing_of(output: Path) -> dict[str, dict[str, str]]:
 COLUMNS: dict[str, Callable[[Row], object]] = {
     "scene": lambda row: row["scene"],
     "integrator": lambda row: row["method"],
-    "parameters": lambda row: _plain(row["parameters"]),
+    "parameters": lambda row: described(dict(sorted(json.loads(row["parameters"]).items()))),
     "sampler": lambda row: row["sampler"],
     "spp": lambda row: row["spp"],
     "seed": lambda row: row["seed"],
@@ -310,11 +310,6 @@ NUMBERS = (
     "max_depth",
 )
 """Further columns of rows.csv, named as in rows."""
-
-
-def _plain(parameters: str) -> str:
-    """Format parameters in JSON as TYPE KEY=VALUE ..."""
-    return described(dict(sorted(json.loads(parameters).items())))
 
 
 def named_image(row: Row) -> str:

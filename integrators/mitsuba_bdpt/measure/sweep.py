@@ -46,7 +46,7 @@ from .options import Sweep as SweepOptions
 from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
 from .record import Row
-from .reference import load_reference, make_command, too_few
+from .reference import load_reference, make_command
 from .results import (
     beside,
     cell_file,
@@ -511,7 +511,7 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     make = make_command(project, project.called(scene), resolution, depth, *words)
     found = []
     if load_reference(*cells.where()).means is None:
-        found.append(too_few(scene.name, make))
+        found.append(f"the reference of {scene.name} has too few renders for a bias check; go on by {make}")
     keys = dict.fromkeys((row["method"], row["budget"]) for row in rows)
     cells_of = {key: analysis.select(rows, method=key[0], budget=key[1]) for key in keys}
     poor = [key for key, at in cells_of.items() if seed_errors(at, "rel_mse_trimmed", False)[1]]
