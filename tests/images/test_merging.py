@@ -513,17 +513,10 @@ def test_no_light_is_called_lost_that_merging_finds(kind):
     assert method.statistics["unsampled_light"] == {}
 
 
-def test_merges_do_not_outweigh_what_is_better(monkeypatch):
-    """Rationale: all camera vertices in a disc meet the same photons; weighted as if these were independent,
-    merges under a sky had 183 times the variance of s = 0. Expected, with photons of the sky: at most 1.3
-    times that without merging, in the mean of the pixels (10 seeds: 2,304 degrees of freedom, of pixels that
-    have photons in common).
-    """
-    monkeypatch.setattr(possible, "EVEN", 0)
-    scene = mi.load_dict(under_glass({"type": "constant", "radiance": 1.0}))
-    # Nothing need be merged: s = 0 samples such paths.
-    a, b = (images(scene, 256, 10, merges=False, merging=on).var(0, ddof=1).mean() for on in (True, False))
-    assert 0 < a < 1.3 * b
+def test_camera_vertices_that_share_photons_are_not_independent():
+    """Expected: kappa of merges is one over the number of camera vertices in a disc, of at least one."""
+    assert merging.coefficient(16, 2.0) == pytest.approx(1 / (16 * np.pi * 2**2))
+    assert merging.coefficient(1, 0.25) == 1
 
 
 def test_strategy_image_of_merges(monkeypatch):
