@@ -17,7 +17,6 @@ import welch as st
 from mitsuba_bdpt.emitters.disks import BoundingSphere
 from mitsuba_bdpt.merging import merging, passes, wavelength_sets
 from mitsuba_bdpt.merging.radius import Footprints, after
-from mitsuba_bdpt.planning import possible
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import mis
