@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 3093, "tests": 43204}
-MOST_WORDS = 29122
+OUTSIDE = {"scripts": 3093, "tests": 43196}
+MOST_WORDS = 29134
 
 
 def _lines(files):
