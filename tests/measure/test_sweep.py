@@ -1199,7 +1199,7 @@ def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch
     preset = read_preset(preset_file(folder, text), REPOSITORY)
     cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
     monkeypatch.setattr(Clock, "timed", lambda self, cell, spp, seed: Timed(None, spp * PER[cell.method], 0))
-    monkeypatch.setattr(Clock, "compile_seconds", lambda self, cell, spp: None)
+    monkeypatch.setattr(Clock, "first_seconds", lambda self, cell, spp: None)
     for seconds, budget in ((0.016, 4), (1.6, 40), (None, 400)):
         bench = Clock(cells, folder / f"{budget}", seconds)
         assert bench.spp_of(cells.of(4, 1)[1]) == 16 and bench.spp_of(cells.of(400, 1)[1]) == 1600

@@ -172,17 +172,12 @@ def _relative_errors(image: Image, reference: Image, trim: float) -> tuple[np.nd
     """Return squared relative errors (n,), and the indices of those kept."""
     image, reference = pair_of(image, reference)
     error = ((image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))).ravel()
-    return error, _smallest(error, trim)
-
-
-def _smallest(errors: np.ndarray, trim: float) -> np.ndarray:
-    """Return the indices of ``errors`` without the share ``trim`` of the largest."""
     if trim != 0:
         trim = number_of("trim", trim, 0, 1)
-    keep = len(errors) - round(trim * len(errors))
+    keep = len(error) - round(trim * len(error))
     if keep == 0:
-        raise CommandError(f"trim={trim} leaves none of {len(errors)} values; choose a smaller share.")
-    return np.argpartition(errors, keep - 1)[:keep]
+        raise CommandError(f"trim={trim} leaves none of {len(error)} values; choose a smaller share.")
+    return error, np.argpartition(error, keep - 1)[:keep]
 
 
 def mape(image: Image, reference: Image) -> float:

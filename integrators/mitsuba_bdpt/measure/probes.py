@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from .options import VARIANT
@@ -55,24 +54,20 @@ print(memory.peak() / 2**30)
 """
 
 
-def numbers(
-    code: str, *arguments: str, environment: Mapping[str, str] | None = None, folder: Path | None = None
-) -> list[float]:
-    """Return the numbers that a new process prints, run in a ``folder``."""
+def numbers(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> list[float]:
+    """Return the numbers that a new process prints."""
     command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(
-        command, env=environment, capture_output=True, text=True, errors="replace", cwd=folder
-    )
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace")
     if done.returncode:
         raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
     return [float(word) for word in done.stdout.split() if _is_number(word)]
 
 
-def cold(code: str, *arguments: str, folder: Path | None = None) -> list[float]:
+def cold(code: str, *arguments: str) -> list[float]:
     """Like `numbers`, with an empty kernel cache."""
     with tempfile.TemporaryDirectory() as cache:
         empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
-        return numbers(code, *arguments, environment=empty, folder=folder)
+        return numbers(code, *arguments, environment=empty)
 
 
 def _is_number(word: str) -> bool:

@@ -25,12 +25,7 @@ from . import agreement, analysis, metrics
 from .preset import FIRST_SEED, Cell, Cells, Preset
 from .project import Project
 from .record import Errors, Row
-from .reference import (
-    Reference,
-    load_reference,
-    read_reference,
-    reference_path,
-)
+from .reference import Reference, load_reference, read_reference, reference_path
 from .scenes import MeasuredScene, digest
 from .tables import described
 
@@ -224,14 +219,17 @@ def lost(table: list[Row], output: Path) -> list[str]:
     keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
     kept = {tuple(row[key] for key in keys) for row in table}
     versions = {row["scene"]: row["scene_sha256"] for row in table}
-    edited = Counter(row["scene"] for row in before if _is_of_another(row, versions))
+
+    def is_edited(row: Row) -> bool:
+        return versions.get(row["scene"], row["scene_sha256"]) != row["scene_sha256"]
+
+    edited = Counter(row["scene"] for row in before if is_edited(row))
     told = [
         f"{name}: the scene has changed: {count} renders of it before are no longer in the tables, and used "
         "again if it is reverted"
         for name, count in edited.items()
     ]
-    before = [row for row in before if not _is_of_another(row, versions)]
-    gone = [row for row in before if tuple(row[key] for key in keys) not in kept]
+    gone = [row for row in before if not is_edited(row) and tuple(row[key] for key in keys) not in kept]
     if not gone:
         return told
     names = ", ".join(dict.fromkeys(f"{row['scene']} by {row['method']}" for row in gone))
@@ -248,11 +246,6 @@ def _before(output: Path) -> list[Row]:
         return _stored(output / "rows.parquet")
     except (FileNotFoundError, pyarrow.ArrowInvalid):
         return []
-
-
-def _is_of_another(row: Row, versions: Mapping[str, str]) -> bool:
-    """Return whether a row is of another version of its scene than that of ``versions``."""
-    return versions.get(row["scene"], row["scene_sha256"]) != row["scene_sha256"]
 
 
 def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:

@@ -79,7 +79,7 @@ class Bench:
     def __init__(self, cells: Cells, output: Path, seconds: float | None = None):
         self.cells, self.output, self.seconds = cells, output, seconds
         _, self._file, self._resolution, self._depth = cells.where()
-        self._scenes, self._integrators, self._compile, self._pilot, self._spp = {}, {}, {}, {}, {}
+        self._scenes, self._integrators, self._first, self._spp = {}, {}, {}, {}
 
     def scene(self, sampler: str):
         if sampler not in self._scenes:
@@ -95,30 +95,23 @@ class Bench:
         """Render with the integrator of a cell."""
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
-    def compile_seconds(self, cell: Cell, spp: int) -> float:
-        """Return the seconds of compiling an integrator's kernels.
+    def first_seconds(self, cell: Cell, spp: int) -> tuple[float, float]:
+        """Return the seconds of an integrator's first render for compiling and for pilots.
 
-        Less with a cache on disk. Mitsuba's integrators compile for each number of samples.
+        Less with a cache on disk. Mitsuba's integrators compile for each number of samples; later renders use
+        the pilots' cached results.
         """
         key = cell.method, spp
-        if key not in self._compile:
+        if key not in self._first:
             with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
                 dr.kernel_history_clear()
                 self.timed(cell, spp, 0)
                 kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+            compiled = sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
             statistics = getattr(self.integrator(cell), "statistics", None)
-            self._pilot[key] = statistics["seconds"]["pilot"] if statistics else 0.0
-            self._compile[key] = (
-                statistics["seconds"]["compile"]
-                if statistics
-                else sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
-            )
-        return self._compile[key]
-
-    def pilot_seconds(self, cell: Cell, spp: int) -> float:
-        """Return the seconds of the first render's pilots, whose results are then cached."""
-        self.compile_seconds(cell, spp)
-        return self._pilot[cell.method, spp]
+            own = statistics["seconds"] if statistics else {"compile": compiled, "pilot": 0.0}
+            self._first[key] = own["compile"], own["pilot"]
+        return self._first[key]
 
     def spp_of(self, cell: Cell) -> int:
         """Return the samples of a cell: its budget, or those for equal time."""
@@ -154,7 +147,7 @@ class Bench:
         """Return the seconds of a sample by the ``first`` integrator over those by a cell's."""
         sides = [(one, self._taken(one, budget)) for one in (first, cell)]
         for one, spp in sides:
-            self.compile_seconds(one, spp)
+            self.first_seconds(one, spp)
         turns = alternating([partial(self.timed, *side) for side in sides], CALIBRATIONS, is_warm=True)
         seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
         (_, ours), (_, theirs) = sides
@@ -172,7 +165,7 @@ class Bench:
             at = best
             sides = [(one, self._taken(one, at)) for one in (first, cell)]
             for side in sides:
-                self.compile_seconds(*side)
+                self.first_seconds(*side)
             of_a_sample = sum(self.timed(one, spp, 0).seconds / spp for one, spp in sides)
             best = max((b for b in budgets if (1 + CALIBRATIONS) * b * of_a_sample <= patience), default=at)
         return at
@@ -185,7 +178,7 @@ class Bench:
 def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
     """Render a cell; returns its row, without errors, and its image."""
     spp = bench.spp_of(cell)
-    compile_seconds = bench.compile_seconds(cell, spp)
+    compile_seconds, pilot_seconds = bench.first_seconds(cell, spp)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     image, seconds, cpu_seconds = bench.timed(cell, spp, cell.seed)
     statistics = getattr(bench.integrator(cell), "statistics", {})
@@ -202,7 +195,7 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "seconds_compile": compile_seconds,
-        "seconds_pilot": bench.pilot_seconds(cell, spp),
+        "seconds_pilot": pilot_seconds,
         "statistics": json.dumps(statistics),
         "decisions": json.dumps(statistics.get("decisions")),
     }
