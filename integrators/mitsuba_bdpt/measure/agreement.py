@@ -83,19 +83,6 @@ class Sample:
         return Sample(mean, np.broadcast_to(error, mean.shape), np.inf, np.ones_like(mean))
 
 
-def satterthwaite(variance_a, freedom_a, variance_b, freedom_b):
-    """Degrees of freedom of a sum of two estimated variances (Welch-Satterthwaite).
-
-    1 / (c^2 / n_a + (1 - c)^2 / n_b) with c = a / (a + b), and 1 where both are 0. Source: B. L. Welch,
-    Biometrika 34, 1947.
-    """
-    total = np.asarray(variance_a + variance_b, dtype=np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = variance_a / total
-        freedom = 1 / (share**2 / freedom_a + (1 - share) ** 2 / freedom_b)
-    return np.where(total > 0, freedom, 1.0)
-
-
 class Difference(NamedTuple):
     """Differences of the means of m quantities and their significance, each (m,).
 
@@ -114,14 +101,18 @@ def welch(a: Sample, b: Sample) -> Difference:
     """Welch's unequal-variances t-test; Student's where one side is known exactly.
 
     Two-sided: t = |a - b| / hypot(error_a, error_b). Differences within `ROUNDING` of the larger mean count
-    as none. p is 1 where both sides are nonzero in less than `NONZERO_SHARE` of the renders.
+    as none. p is 1 where both sides are nonzero in less than `NONZERO_SHARE` of the renders. Degrees of
+    freedom: 1 / (c^2 / n_a + (1 - c)^2 / n_b) with c = v_a / (v_a + v_b) of the variances of the means, and 1
+    where both are 0. Source: B. L. Welch, Biometrika 34, 1947.
     """
     error = np.hypot(a.error, b.error)
     gap = np.abs(a.mean - b.mean)
     floor = ROUNDING * np.maximum(np.abs(a.mean), np.abs(b.mean))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.where(error > 0, np.maximum(gap - floor, 0) / error, np.where(gap > floor, np.inf, 0))
-    freedom = satterthwaite(a.error**2, a.freedom, b.error**2, b.freedom)
+        share = a.error**2 / (a.error**2 + b.error**2)
+        freedom = 1 / (share**2 / a.freedom + (1 - share) ** 2 / b.freedom)
+    freedom = np.where(error > 0, freedom, 1.0)
     applies = np.maximum(a.nonzero, b.nonzero) >= NONZERO_SHARE
     p = np.where(applies, 2 * stats.t.sf(t, freedom), 1.0)
     return Difference(a.mean - b.mean, error, freedom, p, applies & (error > 10 * floor))
@@ -205,7 +196,7 @@ def missing_energy(image: Sample, reference: Sample) -> Estimate:
 
     Variance of the ratio to first order: v_x / r^2 + x^2 v_r / r^4. The interval is Banerjee's, of half width
     sqrt(t_x^2 v_x / r^2 + t_r^2 x^2 v_r / r^4) with Student's quantile of each side, which holds the value in
-    95 % of cases or more; with the degrees of freedom of `satterthwaite` it is 88 % for two renders. Source:
+    95 % of cases or more; with the degrees of freedom of `welch` it is 88 % for two renders. Source:
     S. K. Banerjee, Sankhya 22, 1960.
     """
     x, r = float(image.mean[0]), float(reference.mean[0])
