@@ -25,7 +25,7 @@ MOST = {
     "": 1550,  # top files
 }
 OUTSIDE = {"scripts": 3093, "tests": 43196}
-MOST_WORDS = 29134
+MOST_WORDS = 29141
 
 
 def _lines(files):
