@@ -91,8 +91,8 @@ LIGHTS = {
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
 def test_all_vertices_merged(light, kind, monkeypatch):
     """Rationale: with B = 0 every path is merged, also by diffuse surfaces alone, and no bound leaves out a
-    photon: every strategy shares every path with merges, from each kind of emitter with photons (an even sky has none) and to both kinds of
-    sensors. Expected: the tiles without merging, of a floor under rough glass of which connections find all.
+    photon: every strategy shares every path with merges, from each kind of emitter (but an even sky, which
+    emits none) and to both kinds of sensors. Expected: the tiles without merging, of a floor under rough glass of which connections find all.
     """
     described = under_glass(LIGHTS[light], plate=rough(0.35), kind=kind)
     if kind == "thinlens":
