@@ -92,7 +92,8 @@ LIGHTS = {
 def test_all_vertices_merged(light, kind, monkeypatch):
     """Rationale: with B = 0 every path is merged, also by diffuse surfaces alone, and no bound leaves out a
     photon: every strategy shares every path with merges, from each kind of emitter (but an even sky, which
-    emits none) and to both kinds of sensors. Expected: the tiles without merging, of a floor under rough glass of which connections find all.
+    emits none) and to both kinds of sensors. Expected: the tiles without merging, of a floor under
+    rough glass of which connections find all.
     """
     described = under_glass(LIGHTS[light], plate=rough(0.35), kind=kind)
     if kind == "thinlens":
