@@ -360,7 +360,7 @@ def test_steps_find_what_is_evaluated(name):
             p = stats.ttest_ind(carried[channel], found[channel], equal_var=False).pvalue
             ratio = carried[channel].mean() / max(found[channel].mean(), 1e-30)
             assert p > 1e-5 or not (found.any() or carried.any()), (
-                f"{take.__name__}, channel {channel}: steps / evaluation = {ratio:.4f}, p = {p:.1e}"
+                f"{end.__name__}, channel {channel}: steps / evaluation = {ratio:.4f}, p = {p:.1e}"
             )
 
 
