@@ -3,7 +3,7 @@
     python scripts/choices.py small_casters/point_cube cornell_box
     python scripts/choices.py --all -o results/choices.json    # every scene; goes on after an interruption
 
-For each scene those of the pilot's candidates that are possible there are rendered by hand (parameter
+For each scene those of the pilot's candidates that are possible there are rendered by hand (internal
 ``decisions``, with the tables of emission and the guided samples that the default has): first once with a
 seed of its own; those which are then among the best, or which pilots of `PILOT_SEEDS` seeds choose, with
 `SEEDS` seeds, as the default is, in turns, 128^2 (small_casters: their own film), 64 samples per pixel. A

@@ -16,8 +16,11 @@ from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 
+import choices
+import goals
 import repository
-from goals import goals_table
+import scale
+import stress
 from mitsuba_bdpt.measure.report import PARTS, Report
 from mitsuba_bdpt.measure.tables import replace_part
 
@@ -30,10 +33,9 @@ def benchmark() -> Report:
     return Report.of(repository.PROJECT, REPORTS / "benchmark")
 
 
-def _recorded(name: str, table: str) -> str:
-    """The ``table`` of a script, of its record in docs/reports."""
-    record = json.loads((REPORTS / f"{name}.json").read_text())
-    return getattr(__import__(name), table)(record)
+def _recorded(name: str, table: Callable[..., str]) -> str:
+    """The ``table`` of the record of a script in docs/reports."""
+    return table(json.loads((REPORTS / f"{name}.json").read_text()))
 
 
 def _whole() -> str:
@@ -43,13 +45,13 @@ def _whole() -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     **{name: lambda part=part: part(benchmark()) for name, part in PARTS.items()},
-    "goals": lambda: goals_table(benchmark().results),
+    "goals": lambda: goals.goals_table(benchmark().results),
     "benchmark": _whole,
-    "scale": partial(_recorded, "scale", "tables"),
-    "scale goals": partial(_recorded, "scale", "goals"),
-    "stress": partial(_recorded, "stress", "summary"),
-    "cases": partial(_recorded, "stress", "tables"),
-    "choices": partial(_recorded, "choices", "choices_table"),
+    "scale": partial(_recorded, "scale", scale.tables),
+    "scale goals": partial(_recorded, "scale", scale.goals),
+    "stress": partial(_recorded, "stress", stress.summary),
+    "cases": partial(_recorded, "stress", stress.tables),
+    "choices": partial(_recorded, "choices", choices.choices_table),
 }
 
 

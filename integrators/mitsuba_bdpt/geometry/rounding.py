@@ -29,8 +29,8 @@ LEAST_COSINE = 0.1
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
 
-# Largest gap before a small sphere, in radii, that shadow rays leave untested where none of so many rays from
-# the sphere meets another shape.
+# Shadow rays to a small sphere end up to this distance before it, in radii, if no other shape is nearer to
+# it; and the number of rays from the sphere that look for one.
 SHELL, _AROUND = 0.1, 256
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
