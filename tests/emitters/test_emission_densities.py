@@ -229,7 +229,7 @@ def test_spheres_that_to_world_turns(inwards, radiance):
     scene = mi.load_dict({"type": "scene", "lamp": ball | {"emitter": lamp, "sensor": meter}})
     emitters = Emitters(scene)
     (area,) = emitters.groups
-    assert area.any_inner == (inwards and radiance == "uniform")  # one with a texture samples that
+    assert area._any_inner == (inwards and radiance == "uniform")  # one with a texture samples that
     u = [mi.Float(v) for v in numbers(4)]
     like = dr.zeros(mi.Interaction3f)
     e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))

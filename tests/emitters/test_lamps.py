@@ -11,9 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.emitters import area, surfaces, textured
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.geometry import mitsubas_choices, quadrics, smooth_meshes
+from mitsuba_bdpt.geometry import mitsubas_choices, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
 from scene_parts import T, grey
 from scipy import stats
@@ -293,60 +292,8 @@ def test_a_fine_mesh_shines_like_any():
     check_sums(gap(lamp=ball_of_triangles((0, 1.5, 0), 0.6)), width=0.01)
 
 
-def dome(radiance, **keys):
-    """A flipped sphere that surrounds all."""
-    emitter = {"type": "area", "radiance": radiance}
-    to_world = T().translate([0, 1.5, 0]).scale(8)
-    return {"type": "sphere", "flip_normals": True, "to_world": to_world, "emitter": emitter} | keys
-
-
-LOCAL = textured._local
-
-# What could be taken for Mitsuba's choice, or once was: the lamp, where, and what is said in its place.
-MISTAKEN = {
-    "inside of a sphere": (
-        lambda: dome(2.0),
-        (quadrics.Sphere, "inner_radius", property(lambda sphere: 3 * sphere.radius)),
-        "% of the directions that Mitsuba .* samples of emitter",
-    ),
-    "map of a sphere": (
-        lambda: dome(peaked(50)),
-        (textured, "_local", lambda kind, uv: LOCAL(kind, mi.Point2f(1 - uv.x, uv.y))),
-        "% of the points that Mitsuba .* samples of emitter",
-    ),
-    "map of a disk": (
-        lambda: dome(peaked(50), type="disk"),
-        (textured, "_local", lambda kind, uv: LOCAL(kind, mi.Point2f(dr.sqrt(uv.x), uv.y))),
-        "% of the points that Mitsuba .* samples of emitter",
-    ),
-    "texture of a turned sphere": (
-        lambda: dome(peaked(50), flip_normals=False, to_world=T().rotate([1, 0, 0], 130).scale(0.3)),
-        (area, "is_mapped", lambda shape: False),
-        "% of the points that Mitsuba .* samples of emitter",
-    ),
-    "texture of a flipped rectangle": (
-        lambda: dome(peaked(50), type="rectangle"),
-        (area, "is_mapped", lambda shape: False),
-        "% of the points that Mitsuba .* samples of emitter",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", MISTAKEN)
-def test_a_choice_that_is_not_mitsubas_is_noticed(name, monkeypatch):
-    """Rationale: what is known of Mitsuba's samplers is true of one version, and was wrong before; the images
-    were, without a word. Expected: with the mistake planted an error that names the emitter and says what to
-    do, and none without."""
-    lamp, (module, attribute, wrong), message = MISTAKEN[name]
-    scene = gap(lamp=lamp())
-    Emitters(scene)
-    monkeypatch.setattr(module, attribute, wrong)
-    with pytest.raises(NotImplementedError, match=f"bdpt: .*{message}.*use integrator type 'path'"):
-        Emitters(scene)
-
-
 def test_another_table_of_faces_is_noticed(monkeypatch):
-    """Rationale: as above, for the faces of a mesh. Expected: an error with sums in double precision, and
+    """Rationale: the images were wrong without a word. Expected: an error with sums in double precision, and
     after an edit of the faces alone, after which Mitsuba keeps its areas; none once it has made them anew."""
     mesh = ball_of_triangles((0, 1.5, 0), 0.5)
     scene = gap(lamp=mesh)
@@ -393,67 +340,6 @@ def test_faces_are_chosen_as_mitsuba_chooses():
         tables, u = smooth_meshes.SmoothMeshes(meshes), mi.Float(u.astype(np.float32))
         found = tables._face(mi.UInt32(len(meshes) - 1), u, mi.Bool(True))
         assert dr.all(found - int(tables._first[len(meshes) - 1]) == chosen.sample(u))
-
-
-def test_nothing_is_sampled_where_nothing_is_repeated(monkeypatch):
-    """Expected: the comparison with Mitsuba does not run for 64 rectangles, spheres that shine outwards or a
-    cube; it runs once for each lamp that its texture samples."""
-    seen = []
-    monkeypatch.setattr(
-        area, "check_densities", lambda emitters, emitter, index, by_mitsuba=True: seen.append(index)
-    )
-    light = {"emitter": {"type": "area", "radiance": 2.0}}
-    lamps = {
-        f"lamp{i}": {"type": "rectangle", "to_world": T().translate([i, 0, 0])} | light for i in range(64)
-    }
-    Emitters(gap(**lamps, ball={"type": "sphere"} | light, box={"type": "cube"} | light))
-    assert not seen
-    screen = {"type": "rectangle", "emitter": {"type": "area", "radiance": peaked(2)}}
-    Emitters(gap(**lamps, screen=screen))
-    assert len(seen) == 1
-
-
-def test_the_comparison_does_not_grow_with_other_lamps(monkeypatch):
-    """Rationale: where each comparison records calls of all lamps, fifty lamps with pictures among a thousand
-    take seconds. Expected: beside 33 other lamps it calls as many as beside one, and two lamps with pictures
-    share a kernel."""
-    called, switch = [], textured.switch
-
-    def counted(owners, *arguments):
-        called.append(sum(owner is not None for owner in owners))
-        return switch(owners, *arguments)
-
-    for module in (textured, surfaces):
-        monkeypatch.setattr(module, "switch", counted)
-    picture = {"type": "sphere", "radius": 0.2, "emitter": {"type": "area", "radiance": peaked(2)}}
-    plain = {"type": "disk", "emitter": {"type": "area", "radiance": 2.0}}
-
-    def compared(others: int, pictures: int = 1):
-        lamps = {f"plain{i}": plain | {"to_world": T().translate([0, i, 9])} for i in range(others)}
-        lamps |= {f"picture{i}": picture | {"to_world": T().translate([i, 0, 5])} for i in range(pictures)}
-        scene = gap(**lamps)
-        called.clear()
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            Emitters(scene)
-            found = dr.kernel_history((dr.KernelType.JIT,))
-        return list(called), [k["hash"] for k in found if k["size"] == mitsubas_choices.CHECKED]
-
-    assert compared(33)[0] == compared(1)[0] != []
-    kernels = compared(1, pictures=2)[1]
-    assert len(kernels) == 2 and len(set(kernels)) == 1
-
-
-@pytest.mark.parametrize("placed", PLACED)
-@pytest.mark.parametrize("shape", ["rectangle", "disk", "sphere"])
-def test_fine_textures_far_away_are_no_mistake(shape, placed):
-    """Rationale: rounding is not what the comparison with Mitsuba is for. Expected: lamps of noise of 1024 x
-    2048 texels, bilinear or not, flipped or not, near the origin and far from it, raise nothing."""
-    noise = mi.Bitmap(np.random.default_rng(0).random((1024, 2048, 3), dtype=np.float32) ** 8)
-    for filter_type, flip, at in itertools.product(("nearest", "bilinear"), (False, True), (0, 1000)):
-        radiance = {"type": "bitmap", "bitmap": noise, "raw": True, "filter_type": filter_type}
-        lamp = {"type": shape, "flip_normals": flip, "to_world": T().translate([at, 0, 0]) @ PLACED[placed]}
-        Emitters(gap(lamp=lamp | {"emitter": {"type": "area", "radiance": radiance}}))
 
 
 @pytest.mark.parametrize("u", [0.4, 0.9])

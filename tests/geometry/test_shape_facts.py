@@ -5,12 +5,10 @@ import gc
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.emitters import area
 from mitsuba_bdpt.errors import UsageError
 from mitsuba_bdpt.geometry import boxes, quadrics, rounding, shape_facts, smooth_meshes
 from mitsuba_bdpt.host import notices
 from mitsuba_bdpt.host.jit import registered_emitters
-from rendered import same
 
 SHEAR = mi.ScalarTransform4f([[1, 0.5, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -82,52 +80,6 @@ def test_edited_shapes_are_asked_again(name, found):
     assert found.count("errors") == before + 1
     assert found.count("sphere") == spheres + (name == "ball.to_world")  # asked of two lamps
     np.testing.assert_allclose(after, image(fresh, 7), rtol=1e-4, atol=1e-5)
-
-
-def panels():
-    """A camera before three lamps with textures: a rectangle, a disk and a sphere."""
-    values = np.random.default_rng(0).random((4, 4, 3)).astype(np.float32)
-    scene = {"type": "scene", "sensor": {"type": "perspective", "near_clip": 0.1}}
-    scene["sensor"]["film"] = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
-    for number, kind in enumerate(("rectangle", "disk", "sphere")):
-        picture = {"type": "bitmap", "bitmap": mi.Bitmap(values), "raw": True, "id": f"picture{number}"}
-        place = mi.ScalarTransform4f().translate([number - 1, 0, 4]).rotate([0, 1, 0], 180).scale(0.4)
-        glow = {"type": "area", "radiance": picture}
-        scene[f"lamp{number}"] = {"type": kind, "to_world": place, "emitter": glow}
-    return mi.load_dict(scene, optimize=False)
-
-
-PANEL_EDITS = {
-    "lamp1.emitter.radiance.data": lambda v: 2 * v[::-1, :, :],
-    "lamp0.emitter.radiance.to_uv": lambda v: v @ mi.ScalarTransform3f().scale([2, 1]),
-    "lamp2.to_world": lambda v: v @ mi.ScalarTransform4f().scale(0.5),
-}
-
-
-@pytest.mark.parametrize("name", PANEL_EDITS)
-def test_textured_lamps_are_checked_once(name, monkeypatch):
-    """Rationale: the check takes a kernel for each lamp, most of a small render. Expected: it is not repeated
-    until its radiance or shape is edited, and the image is that of a scene that was never rendered before."""
-    checked, check = [], area.check_densities
-    monkeypatch.setattr(area, "check_densities", lambda *args: (checked.append(args[2]), check(*args)))
-    scene, fresh = panels(), panels()
-    for number in range(3):
-        image(scene, number)
-    before = len(checked)
-    assert 3 <= before <= 6  # again if the first render moved numbers into memory
-    image(scene, 3)
-    assert len(checked) == before
-    for edited in (scene, fresh):
-        parameters = mi.traverse(edited)
-        edit = PANEL_EDITS[name]
-        if name.endswith("data"):
-            parameters[name] = mi.TensorXf(np.ascontiguousarray(edit(np.array(parameters[name]))))
-        else:
-            parameters[name] = edit(parameters[name])
-        parameters.update()
-    after = image(scene, 7)
-    assert len(checked) == before + 1
-    assert same(after, image(fresh, 7))
 
 
 def test_what_cannot_be_rendered_is_said_each_time():

@@ -12,20 +12,20 @@ MOST = {
     "measure": 7268,
     "transport merging guided_emission": 5706,
     "planning": 1731,
-    "emitters": 2379,
+    "emitters": 2333,
     "cli": 1810,
     "media": 1349,
-    "geometry": 1615,
+    "geometry": 1518,
     "image": 1508,
     "files": 941,
     "run": 1234,
     "scene sampling": 777,
-    "host": 917,
+    "host": 856,
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 3093, "tests": 43196}
-MOST_WORDS = 29141
+OUTSIDE = {"scripts": 3090, "tests": 42936}
+MOST_WORDS = 29128
 
 
 def _lines(files):

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
-from functools import cache, partial
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import UnsupportedError, UsageError
 from ..geometry.boxes import scene_box
-from ..geometry.mitsubas_choices import (
-    TEXTURE_SAMPLED,
-    check_densities,
-    is_sampled_by_texture,
-    is_textured,
-)
+from ..geometry.mitsubas_choices import TEXTURE_SAMPLED, is_sampled_by_texture, is_textured
 from ..geometry.quadrics import Sphere, cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import LEAVES, children, named, number, own_parameters
-from ..host.notices import State
 from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
 from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Place
 from .surfaces import Surfaces
@@ -83,28 +76,6 @@ class _Table:
         return mi.Frame3f(self.s, self.t, self.n)
 
 
-class _Sampled(Enum):
-    """How points of an area light are sampled.
-
-    ``BY_TEXTURE`` by Mitsuba; ``BY_MAP`` by the texture in `TexturedPoints`; ``BY_SHAPE`` although textured.
-    """
-
-    UNIFORMLY = 0
-    BY_TEXTURE = 1
-    BY_MAP = 2
-    BY_SHAPE = 3
-
-    @staticmethod
-    def of(emitter, by_shapes: bool) -> _Sampled:
-        if not is_textured(emitter):
-            return _Sampled.UNIFORMLY
-        if not is_sampled_by_texture(emitter):
-            return _Sampled.BY_SHAPE
-        if is_mapped(emitter.get_shape()):
-            return _Sampled.BY_MAP
-        return _Sampled.BY_SHAPE if by_shapes else _Sampled.BY_TEXTURE
-
-
 class AreaEmitters(Group):
     """Area lights.
 
@@ -121,32 +92,24 @@ class AreaEmitters(Group):
     def tables(cls, emitter) -> int:
         return 1
 
-    def __init__(self, emitters, context: Context, checks: bool = True):
+    def __init__(self, emitters, context: Context):
         self._emitters, self._facts = emitters, context.facts
-        how = rows(emitters, None, lambda e: _Sampled.of(e, context.by_shapes))
-        self._by_texture = Mask(rows(how, None, lambda h: h is _Sampled.BY_TEXTURE))
-        self.redraws = rows(how, False, lambda h: h in (_Sampled.BY_MAP, _Sampled.BY_SHAPE))
+        how = rows(emitters, None, lambda e: _sampled(e, context.by_shapes))
+        self._by_texture = Mask(rows(how, None, lambda h: h == "texture"))
+        self.redraws = rows(how, False, lambda h: h in ("map", "shape"))
         self._redrawn = Mask([e and r for e, r in zip(emitters, self.redraws, strict=True)])
-        mapped = rows(how, None, lambda h: h is _Sampled.BY_MAP)
-        self._surfaces = Surfaces(emitters, context, self.redraws, mapped)
+        self._surfaces = Surfaces(emitters, context, self.redraws, rows(how, None, lambda h: h == "map"))
         pairs = list(zip(emitters, self._surfaces.spheres, strict=True))
         self._lights_itself = Mask([e and may_light_itself(e.get_shape(), s) for e, s in pairs])
         extent = 2 * scene_box(context.scene, context.facts.about).bounding_sphere().radius
         found = [_Sphere.of(e, s, extent) for e, s in pairs]
-        self.any_inner = any(sphere.inner_radius > 0 for sphere in found)
+        self._any_inner = any(sphere.inner_radius > 0 for sphere in found)
         self._seen_through = any(
             sphere.inner_radius > 0 and mi.has_flag(e.get_shape().bsdf().flags(), mi.BSDFFlags.Null)
             for sphere, e in zip(found, emitters, strict=True)
         )
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
-        asked = [
-            (emitter, sampled)
-            for emitter, sampled, sphere in zip(emitters, how, found, strict=True)
-            if sampled in (_Sampled.BY_TEXTURE, _Sampled.BY_MAP) or sphere.inner_radius > 0
-        ]
-        if checks and asked:
-            _check_densities(asked, context)
 
     # -- densities of points ----------------------------------------------------------------
 
@@ -184,7 +147,7 @@ class AreaEmitters(Group):
         ds.n = mi.Normal3f(ds.n * dr.select(dr.dot(ds.n, ds.d) > 0, -1.0, 1.0))
         by_area = self._redrawn.at(index, active)
         pdf_w = emitter.pdf_direction(it, ds, active & ~by_area)
-        if self.any_inner:
+        if self._any_inner:
             sphere = look_up(self._spheres, index, active)
             inside = dr.squared_norm(it.p - sphere.center) <= dr.square(sphere.inner_radius)
             by_area = by_area | (active & (sphere.inner_radius > 0) & inside)
@@ -204,11 +167,6 @@ class AreaEmitters(Group):
         """`quadrics.cone_pdf_w` of the emitter ``index``; 0 unless it is a small sphere."""
         sphere = look_up(self._spheres, index, active)
         return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
-
-    def points(self, emitter, index, u):
-        """Sample points of the ``emitter`` with this ``index``, as emission does."""
-        chosen = Chosen(emitter, index, mi.Float(1))
-        return self._surfaces.sample(chosen, u, dr.zeros(mi.Interaction3f), mi.Bool(True))[0]
 
     # -- directions of emission -------------------------------------------------------------
 
@@ -377,22 +335,18 @@ def _radiance_over_density(emitter, ds, pdf_w, si, active):
     return dr.select(pdf_w == 0, 0, emitter.eval(there, active) / pdf_w)
 
 
-def _check_densities(asked: list, context: Context):
-    """`check_densities` of emitters and their `_Sampled`, again after an edit of shape or radiance."""
+def _sampled(emitter, by_shapes: bool) -> str:
+    """How points of an area light are sampled: by Mitsuba ("uniformly", "texture"), or here ("map", "shape").
 
-    @cache
-    def group() -> AreaEmitters:
-        # Not that of all emitters, each of which would be part of the kernel. At least two: a switch, whose
-        # kernel lamps share.
-        return AreaEmitters([emitter for emitter, _ in asked + asked[:1]], context, checks=False)
-
-    def check(index: int):
-        emitter, how = asked[index]
-        check_densities(group(), emitter, index, how is not _Sampled.BY_MAP)
-
-    for index, (emitter, how) in enumerate(asked):
-        state = how, context.by_shapes, State.of([emitter])
-        context.facts.about("densities", partial(check, index), emitter.get_shape(), state=state)
+    "map": by the texture, in `TexturedPoints`; "shape": uniformly although textured.
+    """
+    if not is_textured(emitter):
+        return "uniformly"
+    if not is_sampled_by_texture(emitter):
+        return "shape"
+    if is_mapped(emitter.get_shape()):
+        return "map"
+    return "shape" if by_shapes else "texture"
 
 
 def _samples_points(emitter) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import mitsuba as mi
 
@@ -31,7 +31,7 @@ class ShapeFacts:
         self, scene: mi.Scene, marks: dict[int, Hashable] | None = None, before: ShapeFacts | None = None
     ):
         self._marks = marks or {}
-        self._found: dict[tuple, tuple[Hashable, object]] = {}
+        self._found: dict[tuple, Any] = {}
         if before is not None:
             same = {None, *(index for index, mark in self._marks.items() if before._marks.get(index) == mark)}
             self._found = {key: found for key, found in before._found.items() if same.issuperset(key[1:])}
@@ -54,19 +54,15 @@ class ShapeFacts:
             scene, sensor, "shapes", tuple(marks.items()), lambda: cls(scene, marks, before), most=1
         )[0]
 
-    def about(
-        self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None, state: Hashable = None
-    ) -> Found:
+    def about(self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None) -> Found:
         """Return the cached result of ``find()`` for a ``kind`` of fact and its ``shapes``.
 
-        It must depend on the own parameters of these and on ``state`` alone, of which the latest is cached;
-        errors are not.
+        It must depend on the own parameters of these alone; errors are not cached.
         """
         key = kind, *(None if shape is None else registry_id(shape) for shape in shapes)
-        known = self._found.get(key)
-        if known is None or known[0] != state:
-            known = self._found[key] = state, find()
-        return known[1]  # type: ignore[return-value]
+        if key not in self._found:
+            self._found[key] = find()
+        return self._found[key]
 
 
 def _mark(shape: mi.Shape) -> Hashable:

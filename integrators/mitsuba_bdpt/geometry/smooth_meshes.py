@@ -15,7 +15,10 @@ import numpy as np
 from ..errors import UsageError
 from ..host import renamed
 from ..host.introspection import named, own_parameters
-from .mitsubas_choices import CHECKED, OFF, spread_points
+from .mitsubas_choices import spread_points
+
+# Points that are checked; largest share that may differ by rounding.
+_CHECKED, _OFF = 4096, 0.05
 
 
 class SmoothMeshes:
@@ -54,14 +57,14 @@ class SmoothMeshes:
 
     def _check(self, index, owner, faces):
         """Raise ``UsageError`` unless Mitsuba's sampled points are in the faces' planes."""
-        u, shape = spread_points(CHECKED), owner.get_shape()
+        u, shape = spread_points(_CHECKED), owner.get_shape()
         p = np.array(shape.sample_position(0, u).p, dtype=np.float64).T
         face = np.array(self._face(mi.UInt32(index), u.y, mi.Bool(True))) - int(self._first[index])
         with np.errstate(invalid="ignore"):  # non-finite vertices
             height = np.abs(np.einsum("ij,ij->i", p - faces.corners[face], faces.normals[face]))
         # Points are rounded by about 2e-7; a neighbour's plane is further away up to 10^7 faces.
         off = np.mean(height > 2e-6 * np.abs(faces.corners).max())
-        if off > OFF:
+        if off > _OFF:
             raise UsageError(
                 f"{off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
                 "or measures, are not on the faces of its table of areas, which Mitsuba keeps after an edit "

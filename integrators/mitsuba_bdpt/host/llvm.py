@@ -1,30 +1,24 @@
-"""Choice of the LLVM library that Dr.Jit loads.
+"""The LLVM library that Dr.Jit loads.
 
-Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` once, on its first import. Mitsuba 3.9 rejects LLVM 14, and LLVM 15
-and 16 abort the process on machines with AVX-512, so `prepare` chooses before ``drjit`` is imported:
-
-1. the library that the user named in ``DRJIT_LIBLLVM_PATH``, as it is;
-2. the newest library of the Python environment whose version is known to work (the wheel
-   ``karellen-llvm-core``, conda), else of the system;
-3. none if there is a CUDA driver, whose variants need no LLVM.
-
-`quick_compilation` has LLVM compile kernels without its optional passes for a while.
+Dr.Jit reads ``DRJIT_LIBLLVM_PATH`` on its first import. `prepare` sets it to the library of the Python
+environment (the wheel ``karellen-llvm-core``, conda) unless the user has set it; without both, Dr.Jit
+searches the system. Mitsuba 3.9 rejects LLVM 14, and LLVM 15 and 16 abort the process on machines with
+AVX-512: a version below those known to work is an error, unless the user names it.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
-import functools
 import importlib.metadata
 import os
 import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable
-from contextvars import ContextVar
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -33,17 +27,7 @@ WHEEL = "karellen-llvm-core"
 KNOWN_GOOD = (19, 22, 23)
 """Major versions that passed this package's tests."""
 
-# Where Linux distributions and Homebrew install libLLVM, within the root directory.
-SYSTEM = (
-    *("usr/lib/x86_64-linux-gnu", "usr/lib/aarch64-linux-gnu", "usr/lib64", "usr/lib", "usr/local/lib"),
-    *("usr/lib/llvm*/lib", "usr/lib64/llvm*/lib*", "usr/lib/llvm/*/lib*"),
-    *("opt/homebrew/opt/llvm*/lib", "usr/local/opt/llvm*/lib"),
-)
-
 _LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
-
-# Whether `quick_compilation` is in effect.
-_quick: ContextVar[bool] = ContextVar("quick", default=False)
 
 
 class LLVMNotFoundError(ImportError):
@@ -52,9 +36,9 @@ class LLVMNotFoundError(ImportError):
 
 @dataclass(frozen=True)
 class Choice:
-    """The LLVM library in use; ``version`` is its major version, None if unknown.
+    """The LLVM library in use: its ``path``, None if Dr.Jit chose it, and major ``version``.
 
-    ``path`` is None where Dr.Jit was imported first, or LLVM is not used (``version`` None).
+    ``version`` is None where LLVM is not used.
     """
 
     path: Path | None
@@ -62,80 +46,68 @@ class Choice:
     version: int | None = None
 
     def __str__(self) -> str:
-        if self.path is None and self.version is None:
+        if self.version is None:
             return self.why
-        version = f"LLVM {self.version}" if self.version else "LLVM of unknown version"
-        return f"{version}, {self.path or 'loaded before'} ({self.why})"
+        return f"LLVM {self.version}, {self.path or 'without known path'} ({self.why})"
 
 
 def prepare() -> Choice:
-    """Choose a library and set ``DRJIT_LIBLLVM_PATH``, or check an imported Dr.Jit."""
-    if (drjit := sys.modules.get("drjit")) is not None:
-        mitsuba = sys.modules.get("mitsuba")
-        if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
-            return Choice(None, "the current variant runs on CUDA")
-        return check_loaded(drjit.detail.llvm_version())
-    finish_installation()
-    if name := os.environ.get(VARIABLE):
-        return named(name)
-    found = libraries()
-    choice = choose(*found)
-    if choice.path or any(found):
-        # Keeps Dr.Jit from loading an unusable library by itself.
-        os.environ[VARIABLE] = str(choice.path or os.devnull)
-    return choice
+    """Choose the library, import Dr.Jit, and check the version that it has loaded."""
+    mitsuba = sys.modules.get("mitsuba")
+    if mitsuba is not None and (mitsuba.variant() or "").startswith("cuda"):
+        return Choice(None, "the current variant runs on CUDA")
+    first = "drjit" not in sys.modules
+    path, why = _library() if first else (None, "loaded by drjit, which was imported first")
+    if path is not None:
+        os.environ[VARIABLE] = str(path)
+    version = import_module("drjit").detail.llvm_version()
+    return checked(version, path, why, first)
 
 
-def named(name: str) -> Choice:
-    """Return the library that `VARIABLE` names; none if it is ``os.devnull``, see `prepare`."""
-    path = Path(name)
-    if path.is_file():
-        return Choice(path, NAMED, major_version(path))
-    if name == os.devnull and cuda_driver():
-        return _without_llvm(f"{VARIABLE}={name} asks for none")
+def _library() -> tuple[Path | None, str]:
+    """Return the library to load, and why; None leaves the search to Dr.Jit."""
+    if not (name := os.environ.get(VARIABLE)):
+        finish_installation()
+        path = in_environment()
+        return path, "found in the Python environment" if path else "found by drjit in the system"
+    if Path(name).is_file():
+        return Path(name), NAMED
     raise LLVMNotFoundError(
         f"{VARIABLE}={name!r} names no file. Unset {VARIABLE} to let mitsuba_bdpt choose, "
         "or set it to the path of a libLLVM shared library."
     )
 
 
-def choose(environment: list[Path], system: list[Path]) -> Choice:
-    """Return the library to load of those found, see `libraries`, or raise `LLVMNotFoundError`."""
-    for paths, where in ((environment, "Python environment"), (system, "system")):
-        path = max(paths, key=_known_version, default=Path())  # the first one on ties
-        if version := _known_version(path):
-            return Choice(path, f"found in the {where}, known to work", version)
-    texts = [f"{path} (LLVM {major_version(path) or 'of unknown version'})" for path in environment + system]
-    found = (
-        f"found only {'; '.join(texts)} (to try a newer one, set {VARIABLE})" if texts else "none was found"
-    )
-    if cuda_driver():
-        return _without_llvm(found)
-    known = ", ".join(map(str, KNOWN_GOOD))
-    raise LLVMNotFoundError(f"No usable LLVM library: {found}. Versions known to work: {known}. {remedy()}")
+def in_environment() -> Path | None:
+    """Return the newest libLLVM of the Python environment whose version is known to work, else the newest."""
+    wheel = (file for found in importlib.metadata.distributions(name=WHEEL) for file in found.files or ())
+    folders = [Path(str(file.locate())).parent for file in wheel if _LIBRARY.fullmatch(file.name)]
+    files = (file for folder in (*folders, Path(sys.prefix) / "lib") for file in folder.glob("libLLVM*"))
+    return max((file for file in files if _LIBRARY.fullmatch(file.name)), key=_rank, default=None)
 
 
-def _known_version(path: Path) -> int:
-    """Return the major version of a library if it is known to work, else 0."""
-    version = major_version(path) or 0
-    return version if version in KNOWN_GOOD else 0
+def _rank(path: Path) -> tuple[bool, int]:
+    number = re.search(r"\d{2,}", path.resolve().name)
+    version = int(number[0]) if number else 0
+    return version in KNOWN_GOOD, version
 
 
-def _without_llvm(found: str) -> Choice:
-    return Choice(None, f"no usable LLVM ({found}): only variants of CUDA can be used")
+def checked(version: tuple[int, ...], path: Path | None, why: str, first: bool = True) -> Choice:
+    """Return the library of this ``version``, or raise `LLVMNotFoundError`.
 
-
-def check_loaded(version: tuple[int, ...]) -> Choice:
-    """Check the LLVM `version` of a Dr.Jit that was imported before this package.
-
-    `version`: result of ``drjit.detail.llvm_version()``, negative if there is none.
+    ``version``: result of ``drjit.detail.llvm_version()``, negative if none was loaded; ``first``: whether
+    this package imported Dr.Jit.
     """
-    if version[0] >= min(KNOWN_GOOD):
-        return Choice(None, "loaded by drjit, which was imported first", version[0])
-    if version[0] < 0 and cuda_driver():
-        return _without_llvm("drjit was imported first and found none")
+    loaded = version[0] >= 0
+    if version[0] >= min(KNOWN_GOOD) or (loaded and why == NAMED):
+        return Choice(path, why, version[0])
+    if not loaded and cuda_driver():
+        return Choice(None, "drjit found no usable LLVM: only variants of CUDA can be used")
     number = ".".join(map(str, version))
-    what = "found no usable LLVM" if version[0] < 0 else f"loaded LLVM {number}, which can abort the process"
+    what = f"loaded LLVM {number}, which can abort the process" if loaded else "found no usable LLVM"
+    if first:
+        known = ", ".join(map(str, KNOWN_GOOD))
+        raise LLVMNotFoundError(f"drjit {what}. Versions known to work: {known}. {remedy()}")
     raise LLVMNotFoundError(
         f"drjit was imported first and {what}. Import mitsuba_bdpt before drjit and mitsuba (where an import "
         f"sorter puts it below them: `import mitsuba_bdpt  # isort: skip`), or set {VARIABLE} to the path of "
@@ -160,39 +132,34 @@ def finish_installation() -> None:
 def quick_compilation():
     """Compile kernels without LLVM's optional passes: for kernels that run only briefly.
 
-    Results are the same; for times see experiments, "First images". Holds for the whole process, other
-    threads included, and Dr.Jit caches kernels as if they were compiled as usual. No effect within itself, or
-    with an LLVM library that this package was not tested with.
+    Results are the same; for times see experiments, "First images". Holds for the whole process, and Dr.Jit
+    caches kernels as if they were compiled as usual. No effect with untested versions of LLVM.
     """
     set_options = _option_setter()
-    if set_options is None or _quick.get():
-        yield
-        return
-    before = _quick.set(True)
+    set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
     try:
-        set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
         yield
     finally:
         set_options(b"-opt-bisect-limit=%d" % (2**31 - 1))  # limits nothing
-        _quick.reset(before)
 
 
-@functools.cache
-def _option_setter() -> Callable[..., None] | None:
-    """Return what sets options of the LLVM library in use; None if that is unknown or untested."""
-    path = Path(os.environ.get(VARIABLE, ""))
-    if not _known_version(path) or sys.modules["drjit"].detail.llvm_version()[0] != major_version(path):
-        return None
+def _option_setter() -> Callable[..., object]:
+    """Return what sets options of the LLVM library in use; `_no_options` for an untested version."""
     try:
-        parse = ctypes.CDLL(str(path)).LLVMParseCommandLineOptions  # of the copy that Dr.Jit has opened
+        parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
     except (OSError, AttributeError):
-        return None
+        return _no_options
+    if sys.modules["drjit"].detail.llvm_version()[0] not in KNOWN_GOOD:
+        return _no_options
 
     def set_options(*options: bytes) -> None:
         arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
         parse(len(arguments), arguments, b"")
 
     return set_options
+
+
+def _no_options(*options: bytes) -> None: ...
 
 
 def cuda_driver() -> bool:
@@ -204,38 +171,10 @@ def cuda_driver() -> bool:
     return True
 
 
-def major_version(path: Path) -> int | None:
-    """Read the major version from the name of a library or of its directory."""
-    for name in dict.fromkeys((path, path.resolve())):
-        match = re.search(r"libLLVM-(\d+)|libLLVM\.so\.(\d{2,})|libLLVM\.(\d{2,})", name.name)
-        match = match or re.search(r"/llvm[@/-]?(\d{2,})", name.parent.as_posix())
-        if match:
-            return int(next(group for group in match.groups() if group))
-    return None
-
-
-def libraries(root: Path = Path("/")) -> tuple[list[Path], list[Path]]:
-    """Return the libLLVM files of the Python environment, and of the system in ``root``, each once."""
-    wheel = (file for found in importlib.metadata.distributions(name=WHEEL) for file in found.files or ())
-    own = [Path(str(file.locate())).parent for file in wheel if _LIBRARY.fullmatch(file.name)]
-    folders = (folder for pattern in SYSTEM for folder in sorted(root.glob(pattern)))
-    return _libraries_in([*own, Path(sys.prefix) / "lib"]), _libraries_in(folders)
-
-
-def _libraries_in(folders: Iterable[Path]) -> list[Path]:
-    files = (file for folder in folders for file in sorted(folder.glob("libLLVM*")))
-    return list(dict.fromkeys(f.resolve() for f in files if f.is_file() and _LIBRARY.fullmatch(f.name)))
-
-
 def remedy() -> str:
     """Return the command that installs a usable LLVM on this machine."""
-    system, architecture = platform.system(), platform.machine()
-    if system == "Linux" and architecture == "x86_64":
-        command = f"python -m pip install '{WHEEL}==23.1.*'"
-    elif system == "Darwin":
-        command = "brew install llvm@19"
-    elif system == "Linux":
-        command = "apt install libllvm19"
-    else:
-        return f"Install LLVM 19 and set {VARIABLE} to the path of its shared library."
-    return f"Mend it with: {command}"
+    if (platform.system(), platform.machine()) == ("Linux", "x86_64"):
+        return f"Mend it with: python -m pip install '{WHEEL}==23.1.*'"
+    install = {"Linux": "apt install libllvm19", "Darwin": "brew install llvm"}
+    command = install.get(platform.system(), "install LLVM 19 or newer")
+    return f"Mend it with: {command}; set {VARIABLE} to the path of its shared library if it is not found."
