@@ -35,7 +35,7 @@ slow: $(INSTALLED)
 # What tests cost, in tests/support/costs.json, by which make test leaves them out.
 costs: $(INSTALLED)
 	echo '{}' > tests/support/costs.json
-	$(PYTEST) -m "not slow" --costs
+	$(PYTEST) -m "not slow and not stress" --costs
 
 # The images of the README and of docs/reports/figures.md.
 gallery: $(INSTALLED)
@@ -102,15 +102,13 @@ sweep: $(INSTALLED)
 	$(VENV)/bin/python scripts/report.py results/small
 	$(VENV)/bin/mitsuba-bdpt page results/small
 
-# What was tried to break it, under twenty minutes on two cores: docs/reports/stress.json.
+# Attempts to break the renderer, twenty minutes on two cores, and their record: docs/reports/stress.json.
 stress: $(INSTALLED)
-	$(VENV)/bin/python scripts/stress.py
+	$(PYTEST) -m stress --record tests/stress_cases
 
-# Whether a change keeps all images: scenes and stress cases beside those of another checkout, whose record of
-# stress cases is of its own source. make same BEFORE=../before
+# Whether a change keeps the images of all scenes, beside another checkout. make same BEFORE=../before
 same: $(INSTALLED)
 	$(VENV)/bin/python scripts/versus.py $(BEFORE) --same --pairs 1 --spp 16
-	$(VENV)/bin/python scripts/stress.py --same $(BEFORE)/docs/reports/stress.json
 
 # Planted bugs, and whether the tests see them: an hour.
 mutants: $(INSTALLED)

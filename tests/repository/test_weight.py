@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 3090, "tests": 42936}
-MOST_WORDS = 29128
+OUTSIDE = {"scripts": 2931, "tests": 42684}
+MOST_WORDS = 29103
 
 
 def _lines(files):

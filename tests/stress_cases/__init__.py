@@ -10,11 +10,7 @@ from .case import Case
 SECTIONS = (
     "place",
     "geometry",
-    "transport",
-    "spots",
-    "media",
     "weights",
-    "fireflies",
     "non_finite",
     "non_finite_shapes",
     "bad_input",

@@ -148,6 +148,15 @@ def down():
     return mi.ScalarTransform4f().look_at([0, 0.5, 0.3], [0, -0.3, -0.2], [0, 0, 1])
 
 
+def diffuse(reflectance: float):
+    """A number may be above 1, which a colour may not."""
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
+
+
+def area(radiance):
+    return {"type": "area", "radiance": radiance}
+
+
 def camera(**keys):
     film = {
         "type": "hdrfilm",
