@@ -16,6 +16,7 @@ import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
 from mitsuba_bdpt.cli.arguments import build_parser, main
+from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.measure import equal_time, making, reference, report, sweep, timing
 from mitsuba_bdpt.measure.preset import Cells, read_preset
 from mitsuba_bdpt.measure.project import Project
@@ -172,7 +173,7 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
         ("reference", "name a scene, or give --all"),
         ("reference --all", "there is no scene in 'scenes'; name the folder that has scenes/ by --project"),
         ("reference --all elsewhere/room.xml", "'elsewhere/room.xml' together with --all"),
-        ("reference elsewhere/room.xml --project badly", "by='light' of [room] must be one of"),
+        ("reference elsewhere/room.xml --project badly", "[room]: by='light'"),
     ],
 )
 def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
@@ -353,20 +354,17 @@ def test_recipes_say_what_makes_a_reference(here):
     assert maker() == "known answer"
     assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
     for wrong, message in (
-        ("windows = [[0, 0, 2, 1]]", "must be lists of four shares"),
-        ("radiance = { limit = 1.0 }", "must have the keys limit and lacks"),
-        ("window = 1", "window is not a key of"),
-        ("windows = 3", "windows=3 of .* must be lists of four shares"),
-        ('windows = [3, "x"]', "must be lists of four shares"),
-        ('by = "merging"\nmerging_radius = 0', "merging_radius=0 of .* must be a positive number"),
-        ("merging_radius = 0.5", "must be a positive number, and by='merging'"),
-        ("by = []", r"by=\[\] of .* must be one of"),
-        ("radiance = 3", "radiance=3 of .* must have the keys limit and lacks, numbers"),
-        ("radiance = { limit = true, lacks = 'x' }", "must have the keys limit and lacks, numbers"),
+        ("windows = [[0, 0, 2, 1]]", r"\[room\]: windows.0.2=2: .* less than or equal to 1"),
+        ("windows = [[0.5, 0, 0.5, 1]]", "must be left, top, right, bottom"),
+        ("windows = 3", "windows=3"),
+        ("window = 1", "window=1: there is no such key; did you mean windows"),
+        ('by = "merging"\nmerging_radius = 0', "merging_radius=0: .* greater than 0"),
+        ("merging_radius = 0.5", "merging_radius=0.5 needs by = 'merging'"),
+        ("radiance = { limit = true }", "radiance.limit=True: .* number; radiance.lacks=.*required"),
     ):
         recipe.write_text(f"[room]\n{wrong}\n")
-        with pytest.raises(ValueError, match=message):
-            making.Recipe.of(Project(here / "project"), "room")
+        with pytest.raises(CommandError, match=message):
+            making.recipe_of(Project(here / "project"), "room")
 
 
 @pytest.mark.parametrize("command", measuring.COMMANDS)

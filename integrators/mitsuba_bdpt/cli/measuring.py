@@ -17,7 +17,7 @@ from ..measure import options
 from . import mistakes
 from .values import property_, within
 
-NEEDED = ("colour", "flip_evaluator", "markdown_it", "matplotlib", "pyarrow", "scipy")
+NEEDED = ("colour", "flip_evaluator", "markdown_it", "matplotlib", "pyarrow", "pydantic", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
 
 

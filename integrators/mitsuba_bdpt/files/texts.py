@@ -28,13 +28,6 @@ def read_json(path: Path, remedy: str) -> Any:
         raise CommandError(f"{str(path)!r} is damaged ({error}); {remedy}") from error
 
 
-def table_of(path: Path, key: str, value: Any) -> dict[str, Any]:
-    """Return ``value`` if it is a table, else raise ``CommandError``."""
-    if not isinstance(value, dict):
-        raise CommandError(f"{path}: {key}={value!r} must be a table: write [{key}] and its keys below")
-    return cast(dict[str, Any], value)
-
-
 def list_of(path: Path, key: str, value: Any, kind: type, what: str) -> list[Any]:
     """Return ``value`` if it is a non-empty list of ``kind``, called ``what``."""
     found = cast(list[Any], value) if isinstance(value, list) else []
@@ -47,13 +40,6 @@ def text_of(path: Path, key: str, value: Any) -> str:
     """Return ``value`` if it is a non-empty text, else raise ``CommandError``."""
     if not isinstance(value, str) or not value:
         raise CommandError(f"{path}: {key}={value!r} must be a text in quotes that is not empty")
-    return value
-
-
-def whole_of(path: Path, key: str, value: Any) -> int:
-    """Return ``value`` if it is an integer of at least 1, else raise ``CommandError``."""
-    if type(value) is not int or value < 1:
-        raise CommandError(f"{path}: {key}={value!r} must be a whole number of at least 1")
     return value
 
 

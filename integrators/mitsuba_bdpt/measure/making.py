@@ -32,12 +32,12 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, message
-from ..files.texts import read_toml, table_of
 from ..files.whole import check_writable, replacing
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means, tile_columns
 from .metrics import TRIM, rel_mse
+from .models import Radiance, Recipe, read_table
 from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
 from .reference import (
@@ -61,12 +61,6 @@ WAYS = {
     "merging": EVERYTHING | {"merging": True, "spp_per_pass": 64},
 }
 """What makes references, see `_way`. Passes of so few samples have the most photons."""
-
-MERGING_RADIUS = 0.25
-"""Of "merging" unless the recipe says another one.
-
-Merging blurs, and the halves do not show it: docs/development/experiments.md has what is left.
-"""
 
 FOCUS_TIMES = 16  # times the samples of the rest, in windows
 
@@ -92,67 +86,9 @@ SUBTRACTED_SHARE = 0.1  # the same where the reference is made on the way
 MARGIN = 0.9  # of that share
 
 
-def _is_number(value) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_window(share) -> bool:
-    """Return whether ``share`` is (left, top, right, bottom) of a part of an image."""
-    if not isinstance(share, list) or len(share) != 4 or not all(map(_is_number, share)):
-        return False
-    return 0 <= share[0] < share[2] <= 1 and 0 <= share[1] < share[3] <= 1
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """How a scene's reference is made, from PROJECT/references/scenes.toml:
-
-        [glass_caustics]
-        by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
-                                    # "merging", where nothing else samples a part of the light
-        merging_radius = 0.125      # of "merging", in pixels; default: 0.25
-        windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
-
-        [furnace_point]
-        radiance = { limit = 1.0, lacks = 2.0 }   # known: limit - lacks / 2^max_depth in every pixel
-
-    Choose windows by the scene, not by observed noise, which would bias the image.
-    """
-
-    by: str = "bdpt"
-    merging_radius: float = MERGING_RADIUS
-    windows: tuple = ()
-    radiance: dict | None = None
-
-    @staticmethod
-    def of(project: Project, name: str) -> Recipe:
-        """Read the recipe of a scene; raises ``CommandError`` for an invalid one."""
-        file = project.references / "scenes.toml"
-        entry = table_of(file, name, (read_toml(file) if file.is_file() else {}).get(name, {}))
-        keys = {"by", "merging_radius", "windows", "radiance"}
-        if unknown := sorted(set(entry) - keys):
-            raise CommandError(f"{file}: {unknown[0]} is not a key of [{name}]; there are {sorted(keys)}")
-        if entry.get("by", "bdpt") not in tuple(WAYS):  # a list is not hashable
-            raise CommandError(f"{file}: by={entry['by']!r} of [{name}] must be one of {sorted(WAYS)}")
-        radius = entry.get("merging_radius", MERGING_RADIUS)
-        idle = "merging_radius" in entry and entry.get("by") != "merging"
-        if idle or not (_is_number(radius) and radius > 0):
-            raise CommandError(
-                f"{file}: merging_radius={radius!r} of [{name}] must be a positive number, and by='merging'"
-            )
-        windows = entry.get("windows", [])
-        if not isinstance(windows, list) or not all(map(_is_window, windows)):
-            raise CommandError(
-                f"{file}: windows={windows!r} of [{name}] must be lists of four shares, left, top, "
-                "right, bottom"
-            )
-        known = entry.get("radiance")
-        whole = isinstance(known, dict) and set(known) == {"limit", "lacks"}
-        if known is not None and not (whole and all(map(_is_number, known.values()))):
-            raise CommandError(
-                f"{file}: radiance={known!r} of [{name}] must have the keys limit and lacks, numbers"
-            )
-        return Recipe(entry.get("by", "bdpt"), radius, tuple(map(tuple, windows)), known)
+def recipe_of(project: Project, name: str) -> Recipe:
+    """Read the recipe of a scene; raises ``CommandError`` for an invalid one."""
+    return read_table(Recipe, project.references / "scenes.toml", name)
 
 
 @dataclass(frozen=True)
@@ -229,7 +165,7 @@ def obtained(job: Job) -> Reference:
 
 def check(job: Job) -> None:
     """Raise ``CommandError``, before rendering, if a reference cannot be made."""
-    Recipe.of(job.project, job.scene.name)
+    recipe_of(job.project, job.scene.name)
     check_size(job)
     try:
         if job.is_missing:
@@ -249,7 +185,7 @@ def make(job: Job) -> tuple[Reference, bool]:
     the same light and version of the scene.
     """
     check(job)
-    recipe = Recipe.of(job.project, job.scene.name)
+    recipe = recipe_of(job.project, job.scene.name)
     check_writable(job.path)
     if recipe.radiance is None and job.is_missing:
         print(_announced(job), flush=True)
@@ -466,7 +402,7 @@ class AccuracyTarget:
         )
 
 
-def _way(scene: MeasuredScene, by: str, merging_radius: float = MERGING_RADIUS) -> dict:
+def _way(scene: MeasuredScene, by: str, merging_radius: float = 0.25) -> dict:
     """Return the integrator's parameters for a key ``by`` of `WAYS`, for `_loaded`.
 
     ``merging_radius``: in pixels.
@@ -497,10 +433,10 @@ def provenance_of(job: Job, **more: Any) -> dict[str, Any]:
     }
 
 
-def _known(job: Job, radiance: dict) -> tuple[Reference, bool]:
+def _known(job: Job, radiance: Radiance) -> tuple[Reference, bool]:
     """Return a constant reference without error, and True."""
     width, height = job.scene.size(job.resolution)
-    value = radiance["limit"] - (radiance["lacks"] * 2.0**-job.depth if job.depth > 0 else 0.0)
+    value = radiance.limit - (radiance.lacks * 2.0**-job.depth if job.depth > 0 else 0.0)
     image = np.full((height, width, 3), value)
     provenance = provenance_of(job, integrator="known answer")
     return Reference(image, 0 * image, Means.known(image), provenance), True

@@ -17,10 +17,10 @@ import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from ..errors import CommandError, did_you_mean, listed
-from ..files.texts import read_toml, table_of, whole_of
+from ..files.texts import read_toml
+from .models import PresetFile, checked
 from .scenes import DictionaryScene, MeasuredScene, SceneFile
 
 PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
@@ -112,8 +112,9 @@ class Project:
 
         That of presets/benchmark.toml if it exists, else that of the scene's file.
         """
-        benchmark = self.root / "presets" / "benchmark.toml"
-        return depth_in(benchmark, read_toml(benchmark) if benchmark.is_file() else {}, scene)
+        file = self.root / "presets" / "benchmark.toml"
+        data = read_toml(file) if file.is_file() else {}
+        return checked(PresetFile, data, file).depth(scene.name, scene.max_depth)
 
     def preset(self, name: str) -> Path:
         """Return the path of a preset, by file or name; it may not exist."""
@@ -131,14 +132,3 @@ class Project:
 def name_of(file: Path) -> str:
     """Return the name of a scene file: that of its folder where all files are called scene.xml or so."""
     return file.resolve().parent.name if PLAIN.fullmatch(file.stem) else file.stem
-
-
-def depth_in(file: Path, preset: dict[str, Any], scene: MeasuredScene) -> int:
-    """Return the ``max_depth`` at which a preset from a TOML ``file`` renders a scene.
-
-    The preset's for the scene, else the preset's, else that of the scene's file. Raises ``CommandError`` for
-    an invalid value.
-    """
-    own = table_of(file, "scene", preset.get("scene", {})).get(scene.name, {})
-    merged = preset | table_of(file, f"scene.{scene.name}", own)
-    return whole_of(file, "max_depth", merged["max_depth"]) if "max_depth" in merged else scene.max_depth

@@ -378,7 +378,7 @@ class Sweep:
         """Render the missing first images of a scene, at its smallest budget."""
         for cell in cells.of(min(cells.subject.spp), FIRST_SEED):
             file = first_image_file(self.output, cell)
-            if not self.preset.first_images or file.exists():
+            if not self.preset.file.first_image or file.exists():
                 continue
             self._progress.begin(f"{cell.scene}, first image, {cell.method}")
             wanted = {
@@ -388,7 +388,7 @@ class Sweep:
                 **{key: getattr(cell, key) for key in ("resolution", "sampler", "max_depth")},
             }
             try:
-                taken = [probes.first_image(wanted) for _ in range(self.preset.first_images)]
+                taken = [probes.first_image(wanted) for _ in range(self.preset.file.first_image)]
                 write_json(file, [decided(one | {"clock": cell.clock}) for one in taken])
             except Exception as error:  # one render must not end the others
                 self._note(f"{cell.scene}, first image, {cell.method}", error)
@@ -396,7 +396,7 @@ class Sweep:
     def _probes(self):
         file = self.output / "probes.json"
         kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
-        for name, rounds in self.preset.probes.items():
+        for name, rounds in self.preset.file.probes.items():
             self._progress.begin(name)
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
             try:
@@ -454,19 +454,19 @@ class Sweep:
         more, seeds = cells.more, cells.fewest()
         if more is None:
             return []
-        while seeds < more.at_most and self._are_there(cells.further(seeds)):
+        while seeds < more.seeds[1] and self._are_there(cells.further(seeds)):
             seeds += 1
         found = [c for seed in range(seeds) for c in cells.further(seed)]
         if not self._are_there(found):
             return []  # a failed cell
         try:
-            names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.methods))
+            names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.integrators))
             widths = analysis.widths(decisive(read_rows(self.output, cells, found)), list(names))
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
         is_narrow = seeds >= FEWEST_WITH_INTERVAL and max(widths.values()) < more.width
-        if is_narrow or seeds == more.at_most:
+        if is_narrow or seeds == more.seeds[1]:
             return []
         missing = [c for c in cells.further(seeds) if not self._is_there(c)]
         if not self._tried.isdisjoint(keys := {c.key for c in missing}):

@@ -1,0 +1,221 @@
+"""Contents of the TOML files of a project: presets and recipes of references, checked by pydantic."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, ValidationError
+from pydantic import model_validator as validator
+
+from ..errors import CommandError, did_you_mean
+from ..files.texts import read_toml
+from .agreement import FEWEST_RUNS, TILES
+from .options import RESOLUTION
+
+Whole = Annotated[int, Field(strict=True, ge=1)]
+Text = Annotated[str, Field(min_length=1)]
+Names = Annotated[tuple[Text, ...], Field(min_length=1)]
+Numbers = Annotated[tuple[Whole, ...], Field(min_length=1)]
+Share = Annotated[float, Field(strict=True, ge=0, le=1)]
+
+
+class Model(BaseModel):
+    """Base of all tables: unknown keys and non-finite numbers are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+ModelT = TypeVar("ModelT", bound=Model)
+
+
+def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> ModelT:
+    """Return the model of ``data``; raises ``CommandError`` with ``where``, key, value and reason."""
+    try:
+        return kind.model_validate(data)
+    except ValidationError as error:
+        texts = "; ".join(_text(kind, found) for found in error.errors(include_url=False))
+        raise CommandError(f"{where}: {texts}") from error
+
+
+def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
+    """Describe an error of pydantic."""
+    key, value, text = ".".join(map(str, found["loc"])), found["input"], found["msg"]
+    if found["type"] == "extra_forbidden":
+        schema = kind.model_json_schema()
+        tables = schema, *schema.get("$defs", {}).values()
+        known = sorted({name for table in tables for name in table.get("properties", ())})
+        text = f"there is no such key; {did_you_mean(str(found['loc'][-1]), known)}".rstrip("; ")
+    return f"{key}={value!r}: {text}" if key else text.removeprefix("Value error, ")
+
+
+class Method(Model):
+    """An integrator of a preset.
+
+    Keys beside the fields are parameters of the plugin ``type``. ``sampler``: of the sensor; ``match``: equal
+    "spp" or "seconds" with the first; ``scenes``: where it is rendered; ``media``: whether these have
+    participating media (None: either); ``seeds``: at most so many per budget (None: all).
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, StrictBool | StrictInt | StrictFloat | str]
+
+    type: Text
+    name: Text = Field(default_factory=lambda data: data.get("type", ""))
+    sampler: Text = "independent"
+    match: Literal["seconds", "spp"] = "seconds"
+    scenes: Names | None = None
+    media: StrictBool | None = None
+    seeds: Whole | None = None
+
+    @property
+    def parameters(self) -> tuple[tuple[str, Any], ...]:
+        """The plugin's parameters, with ``type``, sorted by name."""
+        return tuple(sorted({"type": self.type, **(self.model_extra or {})}.items()))
+
+    @validator(mode="after")
+    def _check(self) -> Method:
+        if "max_depth" in (self.model_extra or {}):
+            raise ValueError("max_depth of one integrator would compare different images; set it for all")
+        return self
+
+
+class SceneKeys(Model):
+    """What a scene of a preset may set for itself: None as in the preset.
+
+    ``spp``: samples per pixel of each budget; ``seeds``: of all budgets, or of each.
+    """
+
+    max_depth: Whole | None = None
+    spp: Numbers | None = None
+    seeds: Whole | Numbers | None = None
+
+
+class More(Model):
+    """Further seeds of some ``integrators``, the first of the preset first, in some scenes at one budget.
+
+    ``seeds``: at least, at most; they end when the interval of the median ratio of efficiencies is narrower
+    than ``width``.
+    """
+
+    scenes: Names
+    integrators: Annotated[tuple[Text, ...], Field(min_length=2)]
+    spp: Whole
+    seeds: tuple[Annotated[int, Field(strict=True, ge=2)], Whole]
+    width: Annotated[float, Field(strict=True, gt=0, lt=1)]
+
+    @validator(mode="after")
+    def _check(self) -> More:
+        if self.seeds[0] > self.seeds[1]:
+            raise ValueError(f"seeds={list(self.seeds)} must be [at least, at most]")
+        return self
+
+
+class PresetFile(Model):
+    """A preset; by default the package's integrator and Mitsuba's path tracer in equal time.
+
+    ``clock``: whose seconds decide. ``first_image``: processes that render the first image of each scene and
+    integrator. ``scenes``: files, names or patterns; None where the command names them. ``probes``:
+    repetitions of each.
+    """
+
+    scenes: Names | None = None
+    resolution: Annotated[int, Field(strict=True, ge=TILES, multiple_of=TILES)] = RESOLUTION
+    max_depth: Whole | None = None
+    clock: Literal["wall", "processor"] = "wall"
+    first_image: Annotated[int, Field(strict=True, ge=0)] = 0
+    spp: Numbers = (4, 16, 64)
+    seeds: Whole | Numbers = FEWEST_RUNS
+    scene: dict[str, SceneKeys] = {}
+    integrator: Annotated[tuple[Method, ...], Field(min_length=1)] = (
+        Method(type="bdpt"),
+        Method(type="path", media=False),
+        Method(type="volpath", media=True),
+    )
+    more: More | None = None
+    probes: dict[Literal["coldstart", "memory"], Whole] = {}
+
+    def depth(self, scene: str, own: int) -> int:
+        """Return the ``max_depth`` of a scene: its table's, else the preset's, else the file's ``own``."""
+        return self.scene.get(scene, SceneKeys()).max_depth or self.max_depth or own
+
+    def budgets(self, scene: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return samples per pixel and seeds of each budget of a scene."""
+        own = self.scene.get(scene, SceneKeys())
+        spp, seeds = own.spp or self.spp, own.seeds or self.seeds
+        return spp, seeds if isinstance(seeds, tuple) else (seeds,) * len(spp)
+
+    @validator(mode="after")
+    def _check(self) -> PresetFile:
+        for scene in ("", *self.scene):
+            spp, seeds = self.budgets(scene)
+            if len(set(spp)) < len(spp) or len(seeds) != len(spp):
+                of = f" of {scene}" if scene else ""
+                raise ValueError(f"spp={list(spp)}{of} must differ, and seeds={list(seeds)} be as many")
+        first, names = self.integrator[0], [method.name for method in self.integrator]
+        if len(set(names)) < len(names):
+            raise ValueError(f"two integrators have the same name: {', '.join(names)}")
+        given = first.model_fields_set
+        if given & {"scenes", "media", "seeds"} or ("match" in given and first.match == "seconds"):
+            raise ValueError(
+                f"the first integrator, {first.name!r}, sets the time of the others; it takes neither "
+                "scenes nor media nor seeds nor match = 'seconds'"
+            )
+        if self.more is not None:
+            self._check_more(self.more, names)
+        return self
+
+    def _check_more(self, more: More, names: list[str]) -> None:
+        if unknown := [name for name in more.integrators if name not in names]:
+            raise ValueError(f"{unknown[0]!r} of [more] integrators is not in the preset")
+        if more.integrators[0] != names[0]:
+            raise ValueError(f"integrators of [more] must be the first one, {names[0]!r}, and its rivals")
+        for method in self.integrator:
+            if method.name in more.integrators and (method.scenes or method.seeds):
+                raise ValueError(f"{method.name!r} of [more] is limited by scenes or seeds of its own")
+
+
+class Radiance(Model):
+    """A radiance of every pixel that is known: limit - lacks / 2^max_depth."""
+
+    limit: Annotated[float, Field(strict=True)]
+    lacks: Annotated[float, Field(strict=True)]
+
+
+class Recipe(Model):
+    """How a scene's reference is made, from PROJECT/references/scenes.toml:
+
+        [glass_caustics]
+        by = "bdpt"                 # the default; or "path", where that (with media: `volpath`) converges, or
+                                    # "merging", where nothing else samples a part of the light
+        merging_radius = 0.125      # of "merging", in pixels; default: 0.25
+        windows = [[0.17, 0.57, 0.49, 0.89]]   # left, top, right, bottom, shares of the image: more samples
+
+        [furnace_point]
+        radiance = { limit = 1.0, lacks = 2.0 }   # known: limit - lacks / 2^max_depth in every pixel
+
+    Choose windows by the scene, not by observed noise, which would bias the image. Merging blurs, and the
+    halves do not show it: docs/development/experiments.md has what is left.
+    """
+
+    by: Literal["path", "bdpt", "merging"] = "bdpt"
+    merging_radius: Annotated[float, Field(strict=True, gt=0)] = 0.25
+    windows: tuple[tuple[Share, Share, Share, Share], ...] = ()
+    radiance: Radiance | None = None
+
+    @validator(mode="after")
+    def _check(self) -> Recipe:
+        if "merging_radius" in self.model_fields_set and self.by != "merging":
+            raise ValueError(f"merging_radius={self.merging_radius} needs by = 'merging'")
+        for window in self.windows:
+            left, top, right, bottom = window
+            if not (left < right and top < bottom):
+                raise ValueError(f"windows={list(window)} must be left, top, right, bottom")
+        return self
+
+
+def read_table(kind: type[ModelT], file: Path, name: str) -> ModelT:
+    """Return the table of this name in a TOML file; the defaults without file or table."""
+    tables = read_toml(file) if file.is_file() else {}
+    return checked(kind, tables.get(name, {}), f"{file}: [{name}]")
