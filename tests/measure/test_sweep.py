@@ -21,7 +21,7 @@ import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files import whole
-from mitsuba_bdpt.files.images import read_layers, write_layers
+from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import (
     agreement,
@@ -141,7 +141,7 @@ def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
     np.testing.assert_allclose(kept.means.columns.mean, agreement.tile_columns(kept.image), rtol=2e-3)
     np.testing.assert_allclose(kept.means.whole.error, made.means.whole.error, rtol=1e-6)
     assert kept.provenance["integrator"] == {"type": "path", "max_depth": 2}
-    assert kept.provenance["spp"] % 512 == 0 and kept.provenance["versions"]["mitsuba"].startswith("3.9")
+    assert kept.provenance["spp"] % 128 == 0 and kept.provenance["versions"]["mitsuba"].startswith("3.9")
 
 
 def test_furnaces_are_known_without_error(project, job):
@@ -153,30 +153,29 @@ def test_furnaces_are_known_without_error(project, job):
     assert kept.provenance["integrator"] == "known answer"
 
 
-def test_halves_estimate_the_error_of_their_mean(folder):
+def test_halves_estimate_the_error_of_their_mean():
     """Rationale: the halves differ by twice the standard error of their mean. Expected: for halves r + e and
     r - e the mean is r and the error that of r + e against r: e^2 / (r^2 + 0.01 r^2).
     """
-    halves = making.Halves(folder / "sums.npz", "key")
+    halves = making.Halves("box")
     r, e = np.full((4, 4, 3), 2.0), 0.1
     for _ in range(4):
         halves.add([r + e, r - e])
     made = halves.reference({})
     assert made.error == pytest.approx(e**2 / (4 * 1.01))
     assert made.means.columns.error == pytest.approx(e / np.sqrt(7))
-    again = making.Halves(folder / "sums.npz", "key")
-    assert again.rounds == 4 and again.reference({}).error == pytest.approx(made.error)
-    assert making.Halves(folder / "sums.npz", "another").rounds == 0
+    with pytest.raises(CommandError, match="box: round 4 has values that are not finite"):
+        halves.add([r, np.full((4, 4, 3), np.inf)])
+    assert halves.rounds == 4 and np.isfinite(halves.sums).all()
 
 
-def test_windows_of_halves_have_more_samples(folder):
+def test_windows_of_halves_have_more_samples():
     """Expected: each pixel is the mean of all renders it is in, weighted by their samples; the tile
     means are those of whole images alone.
     """
-    halves = making.Halves(folder / "sums.npz", "key")
+    halves = making.Halves("box")
     for value in (1.0, 3.0):
         halves.add([np.full((4, 4, 3), value)] * 2)
-    halves = making.Halves(folder / "sums.npz", "key")
     halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
     image, difference = halves.mean()
     expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
@@ -187,29 +186,25 @@ def test_windows_of_halves_have_more_samples(folder):
     assert halves.counts.min() == 2 and halves.counts.max() == 6
 
 
-def test_without_sums_the_stored_reference_is_where_a_run_goes_on(folder):
-    """Expected: the same image, error and tile means as by the run that kept its sums, up to half precision
-    (2^-11 of a value); seeds that were used do not come again; after another round all have one more.
+def test_a_run_goes_on_from_the_stored_reference(folder):
+    """Expected: the same image, error and tile means as by one run, up to half precision (2^-11 of a value);
+    seeds that were used do not come again.
     """
     rng = np.random.default_rng(3)
-    halves, window = making.Halves(folder / "sums.npz", "key"), (slice(0, 4), slice(4, 8))
+    halves, window = making.Halves("box"), (slice(0, 4), slice(4, 8))
     for _ in range(agreement.FEWEST_RUNS):
         halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
     halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
     spp = {name: round(2 * making.PASS_SPP * count) for name, count in (("spp", 8), ("spp_in_windows", 12))}
     reference.write(folder / "a.exr", halves.reference(spp | {"sources": ["x"]}))
-    (image, difference), header = read_layers(folder / "a.exr", "", "difference.")
-    kept = json.loads(header["provenance"])
-    stored = reference.Reference(image, difference, reference.means_of(kept["means"]), kept)
-    again = making.Halves(folder / "other.npz", "key")
-    again.go_on_from(stored, [window])
+    again = making.Halves("box")
+    again.go_on_from(reference.read_reference(folder / "a.exr"), [window])
     np.testing.assert_allclose(again.counts, halves.counts)
     assert again.rounds >= halves.rounds and "x" in again.sources
     more = rng.uniform(1, 2, (agreement.FEWEST_RUNS, 2, 16, 16, 3))
     for images in more:
         halves.add(images)
         again.add(images)
-    again = making.Halves(folder / "other.npz", "key")
     np.testing.assert_allclose(again.sums, halves.sums, rtol=2**-10)
     for name in ("mean", "error", "nonzero", "freedom"):
         for part in ("columns", "whole"):
@@ -246,24 +241,41 @@ def test_windows_cover_the_glass_and_show_the_same():
 
 
 def test_references_go_on_where_they_stopped(project, job):
-    """Expected: without time there is one round and it is not good enough; a second run adds to it; a third
-    has nothing to do.
+    """Expected: without time there are eight renders of 4 samples, which are not good enough; a second run
+    adds to them; a third has nothing to do.
     """
-    first, reached = making.make(job(2, seconds=0))
-    assert not reached and first.provenance["spp"] == 2 * making.PASS_SPP
-    assert reference_of(project, 2).means is None
-    second, reached = making.make(job(2))
-    assert reached and second.provenance["spp"] > first.provenance["spp"]
-    third, reached = making.make(job(2, seconds=0))
+    first, reached = making.make(job(2, seconds=0, by="bdpt"))
+    assert not reached and first.provenance["spp"] == 32
+    second, reached = making.make(job(2, by="bdpt"))
+    assert reached and second.provenance["spp"] > 100
+    third, reached = making.make(job(2, seconds=0, by="bdpt"))
     assert reached and third.provenance["spp"] == second.provenance["spp"]
+
+
+def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
+    """Expected: its finished rounds are stored, do not count as a reference, and are part of the next one."""
+    render, count = making.mi.render, iter(range(99))
+
+    def interrupted(*args, **more):
+        if next(count) == 6:  # two that are timed and two rounds
+            raise KeyboardInterrupt
+        return render(*args, **more)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(making.mi, "render", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            making.obtained(job(2, seconds=0, by="bdpt"))
+    assert reference_of(project, 2).provenance["spp"] == 16 and job(2).is_missing
+    assert making.obtained(job(2, seconds=0, by="bdpt")).provenance["spp"] == 48
+    assert not job(2).is_missing
 
 
 def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch):
     """Rationale: a reference "for at most about 7.5 s" took 2 minutes: eight renders of 256 samples. Renders
     take 1 s per sample here, after 10 s of compilation. Expected: of 266 s 236 remain after measuring, 80 %
     of which hold eight renders of 16 samples, and the rest three more rounds; `bdpt`, which is judged, is
-    not rendered. Without time eight renders of 4, and a warning before. A longer run continues with whole
-    renders and other seeds, and keeps the means until it has as many of them."""
+    not rendered. Without time eight renders of 4, and a warning before. Another run continues with other
+    seeds, and keeps the means until it has better ones."""
     clock, seen = [0.0], []
     render, name = making.mi.render, "cornell_box"
 
@@ -277,14 +289,11 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
     made = making.obtained(job(2, seconds=266.0, spp=64))
     assert [spp for _, spp in seen] == [4, 16, *[16] * 14] and clock[0] <= 266
     assert made.provenance["spp"] == 224 and made.means.columns.freedom == 13
-    assert "as many as fit into 266 s; to add more: mitsuba-bdpt reference" in capsys.readouterr().out
-    for sums in (True, False):
-        if not sums:
-            (project.renders / "reference_cornell_box_8_2.npz").unlink()
-        made, _ = making.make(job(2, seconds=1))
-        assert made.means.columns.freedom == 13
-    seeds = [{seed for seed, n in seen[2:] if n == spp and seed >= making.FIRST_SEED} for spp in (16, 256)]
-    assert [len(one) for one in seeds] == [14, 2] and not seeds[0] & seeds[1]
+    assert "as many as fit into 266 s; to go on: mitsuba-bdpt reference" in capsys.readouterr().out
+    made, _ = making.make(job(2, seconds=1))
+    assert made.means.columns.freedom == 13
+    seeds = [seed for seed, n in seen[2:] if seed >= making.FIRST_SEED]
+    assert len(seeds) == len({*seeds}) == 16
     seen.clear()
     path = reference.reference_path(project, name, 8, 3)
     making.obtained(job(3, seconds=20.0))
@@ -313,15 +322,12 @@ def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
 
 
 def test_a_better_reference_stays(project, job):
-    """Rationale: the sums behind the stored references are not in the repository. Expected: with the sums
-    gone, and made by something else than now, so that a run begins anew, what a short run gives does not
-    replace the stored one; with enough time a new one does.
+    """Expected: what a short run gives does not replace a better one that something else has made; with
+    enough time a new one does.
     """
     made, _ = making.make(job(2))
     stored = replace(made, provenance=made.provenance | {"sampler": "another"})
     reference.write(reference.reference_path(project, "cornell_box", 8, 2), stored)
-    for sums in project.renders.glob("*.npz"):
-        sums.unlink()
     kept, reached = making.make(job(2, seconds=0))
     assert not reached and kept.provenance["spp"] == stored.provenance["spp"]
     assert reference_of(project, 2).provenance["spp"] == stored.provenance["spp"]
@@ -340,22 +346,8 @@ def test_a_reference_with_merging_replaces_one_without(project, job):
     made, _ = making.make(job(5, name))
     stored = replace(made, provenance=made.provenance | {"sampler": "another"})
     reference.write(reference.reference_path(project, name, 8, 5), stored)
-    for sums in project.renders.glob("*.npz"):
-        sums.unlink()
     kept, reached = making.make(job(5, name, seconds=0))
     assert not reached and kept.provenance["sampler"] == "another"
-
-
-def test_sums_stay_finite_and_say_what_they_are_of(folder, capsys):
-    """Expected: a value that is not finite is refused before it is added; sums of something else are not
-    used, and it is said."""
-    halves = making.Halves(folder / "sums.npz", "key")
-    halves.add([np.ones((4, 4, 3))] * 2)
-    with pytest.raises(ValueError, match=r"sums.npz: round 1 has values that are not finite"):
-        halves.add([np.ones((4, 4, 3)), np.full((4, 4, 3), np.inf)])
-    assert making.Halves(folder / "sums.npz", "key").rounds == 1 and not capsys.readouterr().out
-    assert making.Halves(folder / "sums.npz", "another").rounds == 0
-    assert "sums.npz: of another scene, integrator or number of" in capsys.readouterr().out
 
 
 def test_references_that_half_precision_cannot_hold_are_refused(folder):
@@ -602,7 +594,7 @@ def test_the_command_line_of_references_tells_what_failed(folder, capsys, projec
     out = capsys.readouterr().out
     assert "nowhere: failed: scene='nowhere' is neither" in out and "furnace_point: known answer" in out
     assert run("cornell_box", *small, "--seconds", "0") == 1
-    assert "not good enough for 4 spp" in capsys.readouterr().out
+    assert "to go on: mitsuba-bdpt reference" in capsys.readouterr().out
     assert run("cornell_box", *small) == 0
     for wrong in (("--spp", "0"), ("--resolution", "50"), ("--max-depth", "0")):
         with pytest.raises(SystemExit):

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7268,
+    "measure": 7184,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2333,
@@ -17,14 +17,14 @@ MOST = {
     "media": 1349,
     "geometry": 1518,
     "image": 1508,
-    "files": 941,
+    "files": 927,
     "run": 1234,
     "scene sampling": 777,
     "host": 856,
     "sensors": 912,
     "": 1550,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 42684}
+OUTSIDE = {"scripts": 2931, "tests": 42659}
 MOST_WORDS = 29103
 
 

@@ -9,20 +9,18 @@ where nothing else samples some light, or `path` (with media `volpath`) where th
 independent integrator. Windows in which few samples find the light have more samples; furnaces are known
 exactly.
 
-`reference` describes the files. Sums in double precision are kept in renders/, from which a further run
-continues; without them it continues from the stored image, whose rounding is far below its error.
+`reference` describes the files. Each round is stored; a further run continues from the stored image, whose
+rounding to half precision is far below its error.
 """
 
 from __future__ import annotations
 
 import datetime
-import json
 import math
 import platform
 import time
-import zipfile
-import zlib
 from argparse import Namespace
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,7 +30,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, message
-from ..files.whole import check_writable, replacing
+from ..files.whole import check_writable
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means, tile_columns
@@ -43,10 +41,8 @@ from .project import Project
 from .reference import (
     Reference,
     header_of,
-    kept_of,
     load_reference,
     make_command,
-    means_of,
     reference_path,
     source_digest,
     write,
@@ -96,9 +92,8 @@ class Job:
     """A reference to be made.
 
     ``spp``: of the renders to judge; ``share``: the largest of its own error in theirs; ``seconds``: time
-    limit; ``rounds``: least number of rounds of two renders, which have fewer samples if several would not
-    fit into the limit; ``max_depth``: None for the project's; ``by``: a key of `WAYS` that replaces the
-    recipe's.
+    limit, after the first `FEWEST_RUNS` renders; ``max_depth``: None for the project's; ``by``: a key of
+    `WAYS` that replaces the recipe's.
     """
 
     project: Project
@@ -108,7 +103,6 @@ class Job:
     spp: int = 64
     seconds: float = REFERENCE_SECONDS
     by: str | None = None
-    rounds: int = 1
     share: float = REFERENCE_SHARE
 
     @cached_property
@@ -124,11 +118,9 @@ class Job:
     def spp_per_render(self) -> int:
         """Samples per pixel of a render of the whole image where there is time.
 
-        `PASS_SPP`; for several ``rounds`` the smallest power of two for which they reach the ``share``.
+        At most `PASS_SPP`; the smallest power of two for which `FEWEST_RUNS` reach the ``share``.
         """
-        if self.rounds == 1:
-            return PASS_SPP
-        enough = self.spp / self.share / (2 * self.rounds)
+        enough = self.spp / self.share / FEWEST_RUNS
         return min(max(2 ** math.ceil(math.log2(enough)), LEAST_SPP), PASS_SPP)
 
     @property
@@ -136,10 +128,16 @@ class Job:
         return reference_path(self.project, self.scene.name, self.resolution, self.depth)
 
     @property
-    def is_missing(self) -> bool:
-        """Whether there is no reference of this version of the scene."""
+    def is_outdated(self) -> bool:
+        """Whether the stored reference is of another version of the scene."""
         sha256 = self.scene_sha256
-        return not self.path.is_file() or header_of(self.path).get("scene_sha256", sha256) != sha256
+        return self.path.is_file() and header_of(self.path).get("scene_sha256", sha256) != sha256
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether there is no reference of this version of the scene, or one that was interrupted."""
+        is_begun = self.path.is_file() and header_of(self.path).get("means", True) is None
+        return not self.path.is_file() or self.is_outdated or is_begun
 
     @property
     def stored(self) -> Reference | None:
@@ -153,12 +151,12 @@ class Job:
 def obtained(job: Job) -> Reference:
     """Return the stored reference, or make it if it is missing or of another version of the scene.
 
-    A new one has enough renders for a bias check and is reported on standard output. It ends when its own
-    error is a tenth of the renders', or at the time limit.
+    A new one is reported on standard output. It ends when its own error is a tenth of the renders', or at the
+    time limit.
     """
     check(job)
     if job.is_missing:
-        made = replace(job, max_depth=job.depth, rounds=FEWEST_RUNS // 2, share=SUBTRACTED_SHARE)
+        made = replace(job, max_depth=job.depth, share=SUBTRACTED_SHARE)
         print(said(made, *make(made)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
@@ -166,7 +164,12 @@ def obtained(job: Job) -> Reference:
 def check(job: Job) -> None:
     """Raise ``CommandError``, before rendering, if a reference cannot be made."""
     recipe_of(job.project, job.scene.name)
-    check_size(job)
+    width = fitting_width(job.scene, job.resolution)
+    if width != job.resolution:
+        raise CommandError(
+            f"scene={job.scene.name!r} with resolution={job.resolution} does not divide into {TILES} x "
+            f"{TILES} tiles; take resolution={width}"
+        )
     try:
         if job.is_missing:
             job.path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,38 +190,23 @@ def make(job: Job) -> tuple[Reference, bool]:
     check(job)
     recipe = recipe_of(job.project, job.scene.name)
     check_writable(job.path)
-    if recipe.radiance is None and job.is_missing:
+    if recipe.radiance is not None:
+        reference = _known(job, recipe.radiance)
+        write(job.path, reference)
+        return reference, True
+    if job.is_missing:
         print(_announced(job), flush=True)
-    reference, reached = _known(job, recipe.radiance) if recipe.radiance else _rendered(job, recipe)
-    stored = None if reached else job.stored
-    if stored is not None and stored.merged == reference.merged and stored.error < reference.error:
-        print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
-        return stored, False
-    write(job.path, reference)
-    return reference, reached
+    return _rendered(job, recipe)
 
 
 def _announced(job: Job) -> str:
     """Return the message before a new reference is rendered."""
     where = f"{job.resolution} and depth {job.depth}"
-    if job.path.is_file():
+    if job.is_outdated:
         why = f"the scene has changed since its reference at {where} was made; making one anew"
     else:
         why = f"no reference at {where} yet; making one"
     return f"{job.scene.name}: {why}, for at most about {job.seconds:g} s"
-
-
-def check_size(job: Job) -> None:
-    """Raise ``CommandError`` for images without colours or not divisible into tiles."""
-    width, height = job.scene.size(job.resolution)
-    if height % TILES == 0 == width % TILES:
-        return
-    nearest = nearest_width(job.scene, job.resolution)
-    advice = f"; take resolution={nearest}" if nearest else "; give the film another shape"
-    raise CommandError(
-        f"scene={job.scene.name!r} has {width} x {height} pixels at resolution={job.resolution}; both must "
-        f"be divisible by {TILES}{advice}."
-    )
 
 
 def fitting_width(scene: MeasuredScene, wanted: int) -> int:
@@ -226,7 +214,9 @@ def fitting_width(scene: MeasuredScene, wanted: int) -> int:
 
     Raises ``CommandError`` if there is none near.
     """
-    found = nearest_width(scene, wanted)
+    widths = range(TILES, max(4 * wanted, TILES + 1), TILES)
+    fitting = [n for n in widths if scene.size(n)[1] % TILES == 0]
+    found = min(fitting, key=lambda n: abs(n - wanted), default=None)
     if found is None:
         width, height = scene.size()
         raise CommandError(
@@ -253,48 +243,22 @@ def fitted(scene: MeasuredScene, wanted: int) -> int:
     return width
 
 
-def nearest_width(scene: MeasuredScene, wanted: float) -> int | None:
-    """Return the nearest width that a bias check can divide into tiles; None if far."""
-    widths = range(TILES, max(math.ceil(4 * wanted), TILES + 1), TILES)
-    fitting = [n for n in widths if scene.size(n)[1] % TILES == 0]
-    return min(fitting, key=lambda n: abs(n - wanted), default=None)
-
-
 def _pixels(image):
     return np.array(image, dtype=np.float64)[..., :3]
 
 
 class Halves:
-    """Sums of two independent halves of the renders, stored in a file.
+    """Sums of two independent halves of the renders.
 
     With ``counts`` of renders per pixel, the tile means of each whole render (of those with the most samples,
     ``times`` `PASS_SPP`), and digests of the plugin's sources.
     """
 
-    def __init__(self, path: Path, key: str):
-        self.path, self.key, self.rounds, self.columns, self.times = path, key, 0, [], 0.0
+    def __init__(self, name: str):
+        self.name, self.rounds, self.columns, self.times = name, 0, [], 0.0
         self.sums = self.counts = np.zeros(0)  # allocated in the first round
-        self.sources: set[str] = set()
+        self.sources = {source_digest()}
         self.earlier: Means | None = None
-        if path.is_file():
-            try:
-                with path.open("rb") as file:
-                    self._take(np.load(file))
-            except (EOFError, LookupError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-                raise CommandError(
-                    f"{str(path)!r} is damaged ({error}); delete it: what references/ holds is gone on from"
-                ) from error
-        self.sources.add(source_digest())
-
-    def _take(self, kept):
-        """Continue from the content of a file, if it is of the same reference."""
-        if str(kept["key"]) != self.key:
-            print(f"{self.path}: of another scene, integrator or number of samples; begun anew")
-            return
-        self.rounds, self.sums = int(kept["rounds"]), kept["sums"]
-        self.columns, self.times, self.counts = list(kept["columns"]), float(kept["times"]), kept["counts"]
-        self.sources = set(kept["sources"].tolist())
-        self.earlier = means_of(json.loads(str(kept["earlier"]))) if "earlier" in kept else None
 
     def go_on_from(self, stored: Reference, windows: list):
         """Use a stored reference in place of earlier renders.
@@ -308,8 +272,8 @@ class Halves:
             self.counts[window] = most
         self.sums = np.stack([stored.image + stored.difference, stored.image - stored.difference])
         self.sums *= self.counts
-        upper = math.ceil((1 + len(windows)) * most)  # of the rounds rendered, in older files
-        self.rounds = max(upper, stored.provenance.get("rounds", 0))
+        # Older files have no rounds: an upper bound.
+        self.rounds = stored.provenance.get("rounds", math.ceil((1 + len(windows)) * most))
         self.sources |= set(stored.provenance.get("sources", ()))  # missing in older files
         self.earlier = stored.means
 
@@ -318,18 +282,18 @@ class Halves:
         if len(self.columns) < FEWEST_RUNS:
             return self.earlier
         made = Means.of(self.columns)
-        both = self.earlier.joined(made) if self.earlier else made
-        # Earlier renders may have had far fewer samples.
-        return both if both.whole.error <= made.whole.error else made
+        # Earlier renders may have had far more or far fewer samples.
+        found = [made, self.earlier, self.earlier.joined(made)] if self.earlier else [made]
+        return min(found, key=lambda means: float(np.max(means.whole.error)))
 
     def add(self, images, window=None, times: float = 1.0):
-        """Add an image to each half, and store the sums.
+        """Add an image to each half.
 
         ``window`` (slices of rows and columns): part of the image that was rendered; ``times``: its samples
         relative to a whole image. Raises ``CommandError`` for non-finite values, without changing the sums.
         """
         if not all(np.isfinite(image).all() for image in images):
-            raise CommandError(f"{self.path.name}: round {self.rounds} has values that are not finite")
+            raise CommandError(f"{self.name}: round {self.rounds} has values that are not finite")
         if not self.rounds:
             self.sums, self.counts = np.zeros((2, *images[0].shape)), np.zeros((*images[0].shape[:2], 1))
         self.sums[:, *(window or ())] += times * np.stack(images)
@@ -339,12 +303,6 @@ class Halves:
         if window is None and times == self.times:
             self.columns += [tile_columns(image) for image in images]
         self.rounds += 1
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        kept = {"sums": self.sums, "counts": self.counts, "columns": np.array(self.columns)}
-        kept |= {"times": np.array(self.times)}
-        kept |= {"earlier": json.dumps(kept_of(self.earlier))} if self.earlier else {}
-        with replacing(self.path) as temporary, temporary.open("wb") as file:
-            np.savez(file, key=self.key, rounds=self.rounds, sources=sorted(self.sources), **kept)
 
     def mean(self):
         """Return the image, and half the difference of the halves (a sample of its error)."""
@@ -433,51 +391,59 @@ def provenance_of(job: Job, **more: Any) -> dict[str, Any]:
     }
 
 
-def _known(job: Job, radiance: Radiance) -> tuple[Reference, bool]:
-    """Return a constant reference without error, and True."""
+def _known(job: Job, radiance: Radiance) -> Reference:
+    """Return a constant reference without error."""
     width, height = job.scene.size(job.resolution)
     value = radiance.limit - (radiance.lacks * 2.0**-job.depth if job.depth > 0 else 0.0)
     image = np.full((height, width, 3), value)
     provenance = provenance_of(job, integrator="known answer")
-    return Reference(image, 0 * image, Means.known(image), provenance), True
+    return Reference(image, 0 * image, Means.known(image), provenance)
 
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
-    """Return a rendered reference, and False if the time was over first."""
+    """Render and store a reference, or return the better one that is stored; False if time was over first."""
     started = time.perf_counter()
     by = job.by or recipe.by
     parameters = _way(job.scene, by, recipe.merging_radius) | {"max_depth": job.depth}
     integrator = _loaded(parameters)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
-    key = json.dumps([job.scene_sha256, job.resolution, parameters, PASS_SPP, sampler])
+    made_by = {"integrator": parameters, "sampler": sampler}
     scene = job.scene.load(job.resolution, sampler)
-    halves = Halves(job.project.renders / f"reference_{job.scene.name}_{job.resolution}_{job.depth}.npz", key)
     windows = [Window(job, share, sampler) for share in recipe.windows]
-    stored = job.stored if halves.rounds == 0 else None
-    by_the_same = {"integrator": parameters, "sampler": sampler}.items()
-    if stored is not None and by_the_same <= stored.provenance.items():
+    halves, aim, stored = Halves(job.scene.name), AccuracyTarget(job, scene, by), job.stored
+    if stored is not None and made_by.items() <= stored.provenance.items():
         halves.go_on_from(stored, [window.slices for window in windows])
-    spp = _fitting(job, scene, integrator, started) if job.rounds > 1 else PASS_SPP
-    aim = AccuracyTarget(job, scene, by)
-    reached = _refined(job, halves, aim, (scene, integrator, windows), spp, started)
-    provenance = provenance_of(
-        job,
-        integrator=parameters,
-        sampler=sampler,
-        spp=round(2 * float(halves.counts.min()) * PASS_SPP),
-        spp_in_windows=round(2 * float(halves.counts.max()) * PASS_SPP),
-        spp_per_render=spp,
-        rounds=halves.rounds,
-        first_seed=FIRST_SEED,
-        sources=sorted(halves.sources),
-        judges_spp=job.spp,
-        share=job.share,
-    )
-    return halves.reference(provenance), reached
+        if aim.reached(halves.reference({})):
+            return stored, True
+        stored = None
+    spp = _fitting(job, scene, integrator, started)
+    for reached in _refined(job, halves, aim, (scene, integrator, windows), spp, started):
+        counts = halves.counts * 2 * PASS_SPP
+        provenance = provenance_of(
+            job,
+            **made_by,
+            spp=round(float(counts.min())),
+            spp_in_windows=round(float(counts.max())),
+            spp_per_render=spp,
+            rounds=halves.rounds,
+            first_seed=FIRST_SEED,
+            sources=sorted(halves.sources),
+            judges_spp=job.spp,
+            share=job.share,
+        )
+        made = halves.reference(provenance)
+        if stored is None or reached:
+            write(job.path, made)
+    if stored is not None and not reached:
+        if stored.merged == made.merged and stored.error < made.error:
+            print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
+            return stored, False
+        write(job.path, made)
+    return made, reached
 
 
 def _fitting(job: Job, scene, integrator, started: float) -> int:
-    """Return the samples per pixel of renders of which all of a job's rounds fit into its seconds.
+    """Return the samples per pixel of renders of which `FEWEST_RUNS` fit into a job's seconds.
 
     A power of two, `LEAST_SPP` to ``job.spp_per_render``, or what the sampler makes of it. Prints a warning
     where not even the least fit.
@@ -491,9 +457,9 @@ def _fitting(job: Job, scene, integrator, started: float) -> int:
     seconds(LEAST_SPP)  # compiles
     of_a_sample = seconds(TRIAL_SPP) / TRIAL_SPP
     spent = time.perf_counter() - started
-    wanted = FITTED * (job.seconds - spent) / (2 * job.rounds * of_a_sample)
+    wanted = FITTED * (job.seconds - spent) / (FEWEST_RUNS * of_a_sample)
     if wanted < LEAST_SPP:
-        least = spent + 2 * job.rounds * LEAST_SPP * of_a_sample
+        least = spent + FEWEST_RUNS * LEAST_SPP * of_a_sample
         print(
             f"warning: {job.scene.name}: {job.seconds:g} s are too few for its reference, which takes about "
             f"{least:.2g} s with the fewest samples ({spent:.2g} s to load and compile)",
@@ -505,19 +471,17 @@ def _fitting(job: Job, scene, integrator, started: float) -> int:
 
 def _refined(
     job: Job, halves: Halves, aim: AccuracyTarget, rendered: tuple, spp: int, started: float
-) -> bool:
-    """Add rounds to the ``halves`` until they are good enough or the time is over; return whether they are.
+) -> Iterator[bool]:
+    """Add rounds to the ``halves`` until they are good enough or the time is over.
 
-    ``rendered``: scene, integrator and windows; ``spp``: of each render. Renders with less than the job's are
-    those that the time allows, so that it is not measured whether they are good enough.
+    Yields whether they are, after each round. ``rendered``: scene, integrator and windows; ``spp``: of each
+    render. On the way to other renders, those with less than the job's are not judged: there is no time.
     """
     scene, integrator, windows = rendered
-    is_short, times = spp < job.spp_per_render, spp / PASS_SPP
-    # A round that would end too late does not begin, where several had to fit.
-    spent, last = 0.0, 0.0
-    reached = halves.rounds > 0 and not is_short and aim.reached(halves.reference({}))
+    reached, spent, last = False, 0.0, 0.0
     with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
-        while halves.rounds < job.rounds or not (reached or spent + last > job.seconds):
+        # A round that would end too late does not begin.
+        while halves.means() is None or not (reached or spent + last > job.seconds):
             began = time.perf_counter()
             behind = [w for w in windows if w.is_behind(halves)]
             for window in behind:
@@ -525,15 +489,13 @@ def _refined(
                 images = _pair(window.scene, integrator, halves, count)
                 halves.add(images, window.slices, count / PASS_SPP)
             if not behind:
-                halves.add(_pair(scene, integrator, halves, spp), times=times)
+                halves.add(_pair(scene, integrator, halves, spp), times=spp / PASS_SPP)
             now = halves.reference({})
             aim.check(now)
-            spent = time.perf_counter() - started
-            last = time.perf_counter() - began if job.rounds > 1 else 0.0
-            is_judged = job.rounds == 1 or not (is_short or spent > job.seconds)
-            reached = is_judged and aim.reached(now)
+            reached = (spp >= job.spp_per_render or job.share == REFERENCE_SHARE) and aim.reached(now)
+            spent, last = time.perf_counter() - started, time.perf_counter() - began
             show(spent)
-    return reached
+            yield reached
 
 
 def _pair(scene, integrator, halves: Halves, spp: int):
@@ -576,8 +538,7 @@ def said(job: Job, made: Reference, reached: bool) -> str:
     own = job.project, job.project.called(job.scene), job.resolution, job.depth
     is_short = made.provenance.get("spp_per_render", PASS_SPP) < job.spp_per_render
     why = f"as many as fit into {job.seconds:.3g} s" if is_short else f"not good enough for {job.spp} spp"
-    how = "to add more" if is_short else "to go on"
-    return f"{text}, {why}; {how}: {make_command(*own, '--spp', str(job.spp))}"
+    return f"{text}, {why}; to go on: {make_command(*own, '--spp', str(job.spp))}"
 
 
 def run(options: Namespace) -> int:

@@ -46,7 +46,7 @@ from .options import Sweep as SweepOptions
 from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
 from .record import Row
-from .reference import load_reference, make_command
+from .reference import make_command
 from .results import (
     beside,
     cell_file,
@@ -502,20 +502,15 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     project, scene, resolution, depth = cells.where()
     words = "--spp", str(max(cells.subject.spp))
     make = make_command(project, project.called(scene), resolution, depth, *words)
-    found = []
-    if load_reference(*cells.where()).means is None:
-        found.append(f"the reference of {scene.name} has too few renders for a bias check; go on by {make}")
     keys = dict.fromkeys((row["method"], row["budget"]) for row in rows)
     cells_of = {key: analysis.select(rows, method=key[0], budget=key[1]) for key in keys}
     poor = [key for key, at in cells_of.items() if seed_errors(at, "rel_mse_trimmed", False)[1]]
-    if poor:
-        others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
-        method, budget = poor[-1]
-        found.append(
-            f"{scene.name}: the reference is noisier than the renders of {method} at {budget} spp{others}, "
-            f"whose trimmed errors are upper bounds. To go on: {make}"
-        )
-    return found
+    if not poor:
+        return []
+    others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
+    method, budget = poor[-1]
+    text = f"{scene.name}: the reference is noisier than the renders of {method} at {budget} spp{others}, "
+    return [f"{text}whose trimmed errors are upper bounds. To go on: {make}"]
 
 
 def short_of_target(table: list[Row]) -> list[str]:
