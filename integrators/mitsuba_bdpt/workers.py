@@ -4,60 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import sys
 import threading
-import time
 from collections import Counter
-from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from typing import Any
 
 from .errors import CommandError, FailureError
 
 ANSWERS_WITHIN = 3.0
 """Seconds that a scheduler may take to answer."""
 
-RETURNS_WITHIN = 300.0
-"""Seconds for which a scheduler that was there may be gone."""
-
 one_at_a_time = threading.Lock()
 """Held by a call that takes all cores of a worker, whose threads would otherwise make several at once."""
-
-
-class Cluster:
-    """A ``distributed.Client`` of the scheduler at ``address``."""
-
-    def __init__(self, address: str):
-        self.address, self.client = address, _client(address)
-
-    def reconnect(self) -> None:
-        """Connect to a restarted scheduler, which has no state of the previous one.
-
-        Raises ``OSError`` if none answers within `RETURNS_WITHIN`.
-        """
-        print(f"warning: the scheduler {self.address} is gone; waiting for another one", file=sys.stderr)
-        self.close()
-        deadline = time.monotonic() + RETURNS_WITHIN
-        while True:
-            try:
-                self.client = _client(self.address)
-                return
-            except OSError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(1)
-
-    def close(self) -> None:
-        """Close the connection, even if the scheduler is gone."""
-        with contextlib.suppress(Exception):
-            self.client.close(timeout=3)
-
-
-def _client(address: str) -> Any:
-    from distributed import Client
-
-    _check_answers(address)
-    return Client(address, timeout=ANSWERS_WITHIN)
 
 
 def _check_answers(address: str) -> None:
@@ -80,26 +37,16 @@ def _check_answers(address: str) -> None:
     raise OSError(f"no dask scheduler answers at {address} within {ANSWERS_WITHIN:g} s: {why}")
 
 
-def results(cluster: Cluster, function, arguments):
-    """Yield index and result of ``function(*arguments[index])`` as workers finish.
+def results(client, function, arguments):
+    """Yield index and result of ``function(*arguments[index])`` as workers of ``client`` finish.
 
     Each index is yielded once. A worker runs one call at a time. Idle workers repeat unfinished calls, so
     that a slow machine does not delay the end; results must not depend on the worker. Calls of a lost worker
-    move to another one; calls of a lost scheduler are repeated by the next.
+    move to another one.
     """
-    left = dict(enumerate(arguments))
-    while left:
-        try:
-            yield from _computed(cluster.client, function, left)
-        except _gone():
-            cluster.reconnect()
-
-
-def _computed(client, function, left):
-    """Like `results`, of the calls in ``left``, from which it removes what was yielded."""
     from distributed import as_completed
 
-    running, pending = {}, as_completed()
+    left, running, pending = dict(enumerate(arguments)), {}, as_completed()
 
     def fill():
         workers, times = max(1, worker_count(client)), Counter(running.values())  # may be 0 for a moment
@@ -124,18 +71,9 @@ def _computed(client, function, left):
             client.cancel(list(running), force=True)
 
 
-def _gone() -> tuple[type[BaseException], ...]:
-    """Return the exceptions raised when a scheduler is gone."""
-    from distributed.client import ClosedClientError
-
-    return CancelledError, ClosedClientError
-
-
 def _result(future, index: int):
     try:
         return future.result()
-    except _gone():
-        raise
     except Exception as error:
         text = str(error) or type(error).__name__
         raise FailureError(f"part {index} failed on the cluster: {text}") from error
@@ -148,21 +86,23 @@ def worker_count(client) -> int:
 
 @contextmanager
 def connected(address: str):
-    """Yield the `Cluster` of the scheduler at ``address``.
+    """Yield a ``distributed.Client`` of the scheduler at ``address``.
 
     Raises ``CommandError`` if distributed is not installed or the scheduler has no worker, ``OSError`` if
     there is no scheduler within `ANSWERS_WITHIN`.
     """
     try:
-        import distributed  # noqa: F401
+        from distributed import Client
     except ImportError as error:
         raise CommandError(
             "scheduler needs dask.distributed; install it with: pip install 'mitsuba-bdpt[cluster]'"
         ) from error
-    cluster = Cluster(address)
+    _check_answers(address)
+    client = Client(address, timeout=ANSWERS_WITHIN)
     try:
-        if not worker_count(cluster.client):
+        if not worker_count(client):
             raise CommandError(f"scheduler={address!r} has no worker; start some with `dask worker`.")
-        yield cluster
+        yield client
     finally:
-        cluster.close()
+        with contextlib.suppress(Exception):  # the scheduler may be gone
+            client.close(timeout=3)

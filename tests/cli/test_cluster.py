@@ -4,17 +4,12 @@ import json
 import math
 import os
 import signal
-import socket
-import subprocess
-import sys
 import threading
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import distributed
-import internals
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -214,7 +209,7 @@ def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
             return self.futures.pop(1)
 
     monkeypatch.setattr(distributed, "as_completed", Completed)
-    found = list(results(SimpleNamespace(client=Client()), None, [(seed,) for seed in range(4)]))
+    found = list(results(Client(), None, [(seed,) for seed in range(4)]))
     assert sorted(found) == [(i, i) for i in range(4)] and released.is_set()
     assert Client.submitted == [0, 1, 2, 3, 0]
 
@@ -264,74 +259,3 @@ def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
         assert main([*command, "--scheduler", workers.scheduler_address]) == 0
         means.append(rendered.image(tmp_path / "a.exr", "RGB")[0].mean())
     assert means[1] == pytest.approx(2 * means[0], rel=0.1)
-
-
-def started(*words):
-    """A process of dask's command, its output for whom the test fails."""
-    command = [sys.executable, "-m", "distributed.cli.dask_scheduler", *words]
-    if words[0] == "worker":
-        command = [sys.executable, "-m", "distributed.cli.dask_worker", *words[1:]]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
-
-@pytest.mark.slow
-def test_a_farm_in_a_bad_night(tmp_path):
-    """Rationale: farms lose machines, get new ones, and restart what schedules them.
-
-    Expected: of eight workers one is killed in the middle, two come late, and the scheduler is killed and
-    started again: the image and the counts are those of the same parts on one machine in peace.
-    """
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    address, seen = f"tcp://127.0.0.1:{port}", []
-    schedule = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show"]
-    work = ["worker", address, "--nworkers", "1", "--nthreads", "1", "--no-dashboard"]
-    processes = [started(*schedule)] + [started(*work) for _ in range(6)]
-    original = cluster.Merged.add
-
-    def add(self, index, snapshot):
-        original(self, index, snapshot)
-        seen.append(index)
-        if len(seen) == 4:
-            processes.extend(started(*work) for _ in range(2))
-            processes[3].kill()
-        if len(seen) == 8:
-            processes[0].kill()
-            processes[0].wait()
-            processes.append(started(*schedule))
-
-    command = ["render", str(SCENE), "-D", "resolution=32", "--spp", "512", "--parts", "24"]
-    try:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(cluster.Merged, "add", add)
-            wait_for_workers(address, 6)
-            assert main([*command, "--scheduler", address, "-o", str(tmp_path / "night.exr")]) == 0
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-    assert len(seen) >= 24
-    found, night = rendered.image(tmp_path / "night.exr", "RGB")
-    options = build_parser().parse_args([*command])
-    scene, integrator, _ = load(options)
-    merged, reports = cluster.Merged(), []
-    integrator = internals.bdpt(max_depth=integrator.max_depth, decisions=night["decisions"])
-    integrator.on_pass = reports.append
-    for index, (seed, spp) in enumerate(cluster.parts_of(512, 24, 0)):
-        integrator.render(scene, 0, seed, spp, develop=False)
-        merged.add(index, reports[-1].snapshot().image_only())
-    integrator.on_pass = None
-    expected = np.array(integrator.assemble(merged.snapshot, scene))[..., :3]
-    np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
-    assert night["rays"] == integrator.statistics["rays"]
-
-
-def wait_for_workers(address, count):
-    """Until the scheduler has so many."""
-    while True:
-        try:
-            with distributed.Client(address, timeout="2s") as client:
-                client.wait_for_workers(count)
-                return
-        except OSError:  # the scheduler has not come yet
-            continue

@@ -99,7 +99,7 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
         of_pilot = integrator.statistics  # before the parts replace them
-        count = options.parts or PARTS_PER_WORKER * worker_count(workers.client)
+        count = options.parts or PARTS_PER_WORKER * worker_count(workers)
         parts = [(job, i, *part) for i, part in enumerate(parts_of(spp, count, options.seed))]
         try:
             for index, data in results(workers, render_part, parts):

@@ -24,7 +24,7 @@ from ..settings import Settings
 from . import denoising
 from .colour import POLARIZED
 from .layers import film_layers, image_count, partitions, strategies, strategy_count, strategy_index
-from .replicates import Replicates, Spread
+from .replicates import Replicates
 from .taps import Taps, is_wide
 
 
@@ -343,19 +343,15 @@ class Accumulator:
     def store(self) -> tuple[tuple[int, ...], dict]:
         """Return passes and raw sums (arrays of Dr.Jit or NumPy, not changed later)."""
         sums, passes = self._done
-        return passes, self.replicates.store() | dict(zip(_NAMES, sums, strict=False))
-
-    @property
-    def halves(self) -> tuple[Spread, Spread] | None:
-        """The `Spread` of each half of the replicates; ``None`` without the variance."""
-        return self.replicates.halves if self.variance else None
+        of_variance = self.replicates.store() if self.variance else {}
+        return passes, of_variance | dict(zip(_NAMES, sums, strict=False))
 
     def ends_replicates(self) -> bool:
         """Return whether all passes belong to complete replicates."""
         return self.variance and self.replicates.spp == sum(self.passes) > 0
 
-    def restore(self, passes: tuple[int, ...], arrays: dict, halves: tuple[Spread, Spread] | None):
-        """Restore the state that `store` and `halves` returned after ``passes``."""
+    def restore(self, passes: tuple[int, ...], arrays: dict):
+        """Restore the state that `store` returned."""
         sums = [mi.Float64(arrays[name]) for name in _NAMES if name in arrays]
         rows = {"camera": self.size[1], "light": self.size[1] * self._channels.splats}
         for block, s, name in zip(self._blocks(), sums, _NAMES, strict=False):
@@ -363,8 +359,8 @@ class Accumulator:
             if len(s) != expected:
                 raise UsageError(f"the snapshot has {len(s)} numbers of {name}, not {expected}")
         self._done = (sums, tuple(passes))
-        if halves is not None:
-            self.replicates.restore(halves, arrays)
+        if self.variance:
+            self.replicates.restore(arrays)
 
     def close_replicate(self):
         """Add what was accumulated since the last call as one independent replicate."""

@@ -51,7 +51,20 @@ class Spread:
 
 
 # Prefix of the names of the sums after the last image, in a snapshot.
-_LAST = "replicates.last."
+LAST = "replicates.last."
+
+
+def stored(halves: tuple[Spread, ...]) -> dict[str, np.ndarray]:
+    """Return the arrays of ``halves``, by name in a snapshot."""
+    parts = [(f"replicates.{i}", half) for i, half in enumerate(halves)]
+    return {f"{part}.{n}": np.asarray(v, np.float64) for part, half in parts for n, v in vars(half).items()}
+
+
+def halves_of(arrays: dict) -> tuple[Spread, ...]:
+    """Inverse of `stored`; none in the ``arrays`` of a snapshot without the variance."""
+    parts = [part for part in ("replicates.0", "replicates.1") if f"{part}.spp" in arrays]
+    found = ([arrays[f"{part}.{name}"] for name in Spread.__annotations__] for part in parts)
+    return tuple(Spread(int(count), int(spp), *rest) for count, spp, *rest in found)
 
 
 class Replicates:
@@ -89,14 +102,15 @@ class Replicates:
         self._sums = sums
 
     def store(self) -> dict:
-        """Return the sums after the last image, which `restore` needs beside the halves."""
-        return {f"{_LAST}{i}": sums for i, sums in enumerate(self._sums or ())}
+        """Return the arrays of the halves, and the sums after the last image."""
+        return stored(self.halves) | {f"{LAST}{i}": sums for i, sums in enumerate(self._sums or ())}
 
-    def restore(self, halves: tuple[Spread, Spread], arrays: dict):
-        """Restore ``halves`` and what `store` returned."""
-        self.halves = halves
+    def restore(self, arrays: dict):
+        """Restore the state that `store` returned."""
+        first, second = halves_of(arrays)
+        self.halves = first, second
         if self.count:
-            self._sums = [mi.Float64(arrays[name]) for name in sorted(arrays) if name.startswith(_LAST)]
+            self._sums = [mi.Float64(arrays[name]) for name in sorted(arrays) if name.startswith(LAST)]
 
     def variance(self, spp: int, shape=()):
         """Return the variance of the mean of ``spp`` samples per pixel.

@@ -314,7 +314,7 @@ class Sweep:
     def run(self, progress: Renders, elsewhere=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
 
-        ``elsewhere``: a `workers.Cluster` and the preset's text, to render on a cluster. ``seconds``: limit,
+        ``elsewhere``: a cluster's client and the preset's text, to render there. ``seconds``: limit,
         shared equally by the scenes; what does not fit is recorded in ``cut``.
         """
         scenes, todo = self.scenes, self._todo

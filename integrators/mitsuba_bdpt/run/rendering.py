@@ -337,8 +337,7 @@ class Render:
         The state is consistent even if an interruption comes while the next pass is recorded.
         """
         passes, arrays = self.accumulator.store()
-        state = self.accumulator.halves, self._small_first, self.why_merged
-        progress = Progress(self.planner.decided, self.meter.work, *state)
+        progress = Progress(self.planner.decided, self.meter.work, self._small_first, self.why_merged)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
@@ -380,7 +379,7 @@ class Render:
         self.planner.restore(progress.decided)
         self._use_plan()
         self.kernel.inverse_threshold = dr.opaque(mi.Float, np.float32(arrays["inverse_threshold"][0]))
-        self.accumulator.restore(snapshot.passes, arrays, progress.halves)
+        self.accumulator.restore(snapshot.passes, arrays)
         self.meter.resume(progress.work, snapshot.spp)
         self._small_first, self.why_merged = progress.small_first, progress.why_merged
 

@@ -14,7 +14,7 @@ import numpy as np
 from .._version import __version__
 from ..errors import CommandError, UsageError
 from ..image.accumulator import Accumulator
-from ..image.replicates import Spread
+from ..image.replicates import LAST, halves_of, stored
 from ..planning.configuration import Decision
 from ..planning.planner import PlannerState
 from ..settings import Settings
@@ -25,15 +25,13 @@ from .statistics import Work
 class Progress:
     """Progress of a render after a pass.
 
-    ``decided``: decisions so far; ``work``: counts; ``halves``: those of the replicates, ``None`` without
-    `variance` (see `image.replicates`); ``small_first``: whether the first pass has one sample per pixel,
-    ``None`` if not yet known; ``why_merged``: see `Render`; ``whole``: whether a render can
+    ``decided``: decisions so far; ``work``: counts; ``small_first``: whether the first pass has one sample
+    per pixel, ``None`` if not yet known; ``why_merged``: see `Render`; ``whole``: whether a render can
     continue from it; ``scene``: optional digest of the scene's files.
     """
 
     decided: PlannerState = PlannerState()
     work: Work = Work()
-    halves: tuple[Spread, ...] | None = None
     small_first: bool | None = None
     why_merged: str = ""
     whole: bool = True
@@ -41,68 +39,33 @@ class Progress:
 
     def joined(self, other: Progress) -> Progress:
         """Return the progress of two merged renders, with the decisions of the first."""
-        halves = None
-        if self.halves is not None:
-            pairs = zip(self.halves, other.halves, strict=True)
-            halves = tuple(mine.joined(others) for mine, others in pairs)
-        joined = replace(self, work=self.work.joined(other.work), halves=halves)
-        return joined.image_only()
+        return replace(self, work=self.work.joined(other.work)).image_only()
 
     def image_only(self) -> Progress:
         """Return a copy without the state that only a continued render needs."""
         return replace(self, whole=False)
 
-    def stored(self) -> tuple[dict, dict]:
-        """Return the fields of all parts: JSON values, and arrays by name."""
-        values, arrays = {}, {}
+    def stored(self) -> dict:
+        """Return the fields of all parts as JSON values."""
+        values = {}
         for part in (self, self.decided, self.work):
             values |= {f.name: getattr(part, f.name) for f in fields(part)}
         del values["decided"], values["work"]
-        values["decisions"] = [decision.record() for decision in self.decided.decisions]
-        values["replicates"] = halves = values.pop("halves")
-        if halves is not None:
-            values["replicates"] = {"halves": [[half.count, half.spp] for half in halves]}
-            for i, half in enumerate(halves):
-                arrays |= _split(half, f"replicates.{i}")[1]
-        return values, arrays
+        return values | {"decisions": [decision.record() for decision in self.decided.decisions]}
 
     @classmethod
-    def restored(cls, values: dict, arrays: dict) -> Progress:
-        """Inverse of `stored`; removes its arrays from ``arrays``."""
+    def restored(cls, values: dict) -> Progress:
+        """Inverse of `stored`."""
         values = dict(values)
         values["decisions"] = tuple(map(Decision.read, values["decisions"]))
         values["left_out"] = tuple(values["left_out"])
-        replicates, values["halves"] = values.pop("replicates"), None
-        if replicates is not None:
-            values["halves"] = tuple(
-                Spread(count, spp, **_arrays(arrays, f"replicates.{i}"))
-                for i, (count, spp) in enumerate(replicates["halves"])
-            )
         for name, part in (("decided", PlannerState), ("work", Work)):
             values[name] = part(**{f.name: values.pop(f.name) for f in fields(part)})
         return cls(**values)
 
 
-def _split(record, name: str) -> tuple[dict, dict]:
-    """Split a dataclass into plain values and arrays, named after the record."""
-    values, arrays = {}, {}
-    for f in fields(record):
-        value = getattr(record, f.name)
-        if isinstance(value, np.ndarray):
-            arrays[f"{name}.{f.name}"] = value
-        else:
-            values[f.name] = value
-    return values, arrays
-
-
-def _arrays(arrays: dict, name: str) -> dict:
-    """Remove the arrays of the record ``name`` from ``arrays`` and return them."""
-    names = [other for other in arrays if other.startswith(f"{name}.")]
-    return {other.removeprefix(f"{name}."): arrays.pop(other) for other in names}
-
-
 # Version of the stored format; increase with every change.
-FORMAT = 12
+FORMAT = 13
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:
@@ -143,8 +106,7 @@ class Snapshot:
     """State of the render beside its sums."""
     arrays: dict
     """Arrays in double precision: ``camera``, ``light`` and, with strategy images, ``strategies`` (raw sums,
-    flat); ``inverse_threshold`` of roulette; ``replicates.last.*``, the sums after the last replicate of the
-    variance."""
+    flat); ``inverse_threshold`` of roulette; with the variance ``replicates.*``, see `image.replicates`."""
 
     @property
     def spp(self) -> int:
@@ -180,6 +142,8 @@ class Snapshot:
             for name in ("camera", "light", "strategies")
             if name in self.arrays
         } | {"inverse_threshold": self.arrays["inverse_threshold"]}
+        pairs = zip(halves_of(self.arrays), halves_of(other.arrays), strict=True)
+        arrays |= stored(tuple(mine.joined(others) for mine, others in pairs))
         return Snapshot(
             identity=self.identity | {"seed": seeds + others, "spp": spp},
             passes=self.passes + other.passes,
@@ -189,15 +153,15 @@ class Snapshot:
 
     def image_only(self) -> Snapshot:
         """Return a smaller snapshot from which a render cannot continue."""
-        kept = {n: a for n, a in self.arrays.items() if not n.startswith("replicates.last.")}
+        kept = {n: a for n, a in self.arrays.items() if not n.startswith(LAST)}
         return replace(self, progress=self.progress.image_only(), arrays=kept)
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an ``npz`` file (NumPy), without pickled objects."""
-        progress, arrays = self.progress.stored()
+        progress = self.progress.stored()
         text = json.dumps({"identity": self.identity, "passes": self.passes, "progress": progress})
         file = io.BytesIO()
-        np.savez(file, snapshot=np.array(text), **self.arrays, **arrays)
+        np.savez(file, snapshot=np.array(text), **self.arrays)
         return file.getvalue()
 
     @staticmethod
@@ -209,7 +173,7 @@ class Snapshot:
             values = json.loads(str(arrays.pop("snapshot")))
             identity, passes = values["identity"], tuple(values["passes"])
             if identity["format"] == FORMAT:
-                progress = Progress.restored(values["progress"], arrays)
+                progress = Progress.restored(values["progress"])
                 return Snapshot(identity, passes, progress, arrays)
         except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise CommandError(f"not a snapshot, or a damaged one ({error})") from error
