@@ -12,7 +12,6 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 
-from .emitters.kinds import third_party_elsewhere
 from .emitters.light_groups import parsed
 from .errors import UnsupportedError, UsageTypeError, did_you_mean
 from .image.layers import film_layers
@@ -57,25 +56,9 @@ def _without_gradients(method):
     @wraps(method)
     def undisturbed(*args, **kwargs):
         with dr.suspend_grad():
-            try:
-                return method(*args, **kwargs)
-            except RuntimeError as error:
-                if not isinstance(error, NotImplementedError):  # errors of ours need no hint
-                    _hint_at_others(error, (*args, *kwargs.values()))
-                raise
+            return method(*args, **kwargs)
 
     return undisturbed
-
-
-def _hint_at_others(error: RuntimeError, arguments):
-    """Add a note to ``error`` if emitters of other scenes may have caused it."""
-    scene = next((value for value in arguments if isinstance(value, mi.Scene)), None)
-    count = third_party_elsewhere(scene) if scene is not None else 0
-    if count:
-        error.add_note(
-            f"bdpt: other scenes in this process have {count} foreign emitters, of plugins not "
-            "Mitsuba's, which its calls visit too: if the error is theirs, delete those scenes first"
-        )
 
 
 class BDPTIntegrator(metaclass=ABCMeta):

@@ -14,6 +14,7 @@ import contextlib
 import sys
 import time
 from dataclasses import dataclass
+from io import StringIO
 from typing import TYPE_CHECKING, Any, TextIO
 
 # Not at run time: the command declares its options, and `doctor` runs, without rich.
@@ -42,15 +43,7 @@ class Report:
 
 def share_done(report: Report, limit: float | None = None) -> float:
     """Return the finished share of the samples, or of the time limit, from 0 to 1."""
-    done = report.spp_done / report.spp_total
-    if limit:
-        done = max(done, report.seconds / limit)
-    return min(done, 1.0)
-
-
-def seconds_left(report: Report, limit: float | None = None) -> float:
-    left = report.seconds * (report.spp_total / max(report.spp_done, 1e-9) - 1)
-    return max(0.0, min(left, limit - report.seconds)) if limit else left
+    return min(max(report.spp_done / report.spp_total, report.seconds / limit if limit else 0), 1.0)
 
 
 def in_words(report: Report, limit: float | None = None, open_ended: bool = False) -> str:
@@ -64,7 +57,8 @@ def in_words(report: Report, limit: float | None = None, open_ended: bool = Fals
     if limit and report.seconds >= limit and report.spp_done < report.spp_total:
         text += f", stopped after {limit:g} s"
     elif limit or not open_ended:
-        text += f", {seconds_left(report, limit):.0f} s left"
+        left = report.seconds * (report.spp_total / max(report.spp_done, 1e-9) - 1)
+        text += f", {max(0.0, min(left, limit - report.seconds)) if limit else left:.0f} s left"
     return text if report.error is None else f"{text}, relMSE {report.error:.2g}"
 
 
@@ -74,13 +68,6 @@ def readable(number: float) -> str:
         if number >= limit:
             return f"{number / limit:.3g}{unit}"
     return f"{number:.3g}"
-
-
-def _say(line: str, stream: TextIO | None) -> None:
-    """Print a ``line``; a closed stream must not end the render."""
-    if stream is not None:
-        with contextlib.suppress(OSError, ValueError):
-            print(line, file=stream, flush=True)
 
 
 class Display:
@@ -121,16 +108,6 @@ class Bar(Display):
         self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False, disable=not shown)
         self._task = self._bar.add_task("rendering", total=1.0)
         self._begun = False
-
-    @property
-    def description(self) -> str:
-        """The text beside the bar."""
-        return self._bar.tasks[0].description
-
-    @property
-    def completed(self) -> float:
-        """Filled share of the bar."""
-        return self._bar.tasks[0].completed
 
     def __call__(self, report: Report) -> None:
         if not self._begun:
@@ -176,7 +153,7 @@ class Lines(Display):
         every: float = EVERY,
     ):
         super().__init__(limit, open_ended)
-        self._stream, self._every = stream or sys.stderr, every
+        self._stream, self._every = stream or sys.stderr or StringIO(), every  # None without a console
         self._last = time.monotonic()
 
     def __call__(self, report: Report) -> None:
@@ -187,10 +164,13 @@ class Lines(Display):
         minutes, seconds = divmod(int(report.seconds), 60)
         clock = f"{minutes // 60:02d}:{minutes % 60:02d}:{seconds:02d}"
         done = share_done(report, self._limit)
-        _say(f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}", self._stream)
+        text = f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}"
+        with contextlib.suppress(OSError, ValueError):  # a closed stream must not end the render
+            print(text, file=self._stream, flush=True)
 
 
-KINDS = ("auto", "bar", "lines", "none")
+_DISPLAYS: dict[str, type[Display]] = {"bar": Bar, "lines": Lines, "none": Display}
+KINDS = ("auto", *_DISPLAYS)
 """Names of displays on the command line."""
 
 
@@ -198,4 +178,4 @@ def display(kind: str, limit: float | None = None, open_ended: bool = False) -> 
     """Return the `Display` of this name; ``auto``: a bar on a terminal, else lines."""
     if kind == "auto":
         kind = "bar" if sys.stderr is not None and sys.stderr.isatty() else "lines"
-    return {"bar": Bar, "lines": Lines, "none": Display}[kind](limit, open_ended)
+    return _DISPLAYS[kind](limit, open_ended)

@@ -39,11 +39,9 @@ _SAMPLE_DIRECT = (
     "all other strategies; leave it out"
 )
 REMEDIES = {
-    "samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass",
-    "lightImage": _LIGHT_IMAGE,
-    "light_image": _LIGHT_IMAGE,
-    "sampleDirect": _SAMPLE_DIRECT,
-    "sample_direct": _SAMPLE_DIRECT,
+    "samplesperpass": "it is deprecated in Mitsuba; use spp_per_pass",
+    "lightimage": _LIGHT_IMAGE,
+    "sampledirect": _SAMPLE_DIRECT,
 }
 
 
@@ -180,7 +178,7 @@ def _not_a_parameter(name: str, value) -> str:
         )
     if remedy := removed.remedy(name):
         return f"{name}={_shown(value)}: the parameter {remedy}"
-    remedy = REMEDIES.get(name)
+    remedy = REMEDIES.get(name.replace("_", "").lower())
     if remedy is None:
         remedy = f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
     return f"{name}={_shown(value)} is not a parameter; {remedy}"

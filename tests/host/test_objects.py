@@ -94,48 +94,6 @@ def test_scenes_that_the_cycle_collector_frees():
     assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]
 
 
-BROKEN = """
-import mitsuba_bdpt
-import mitsuba as mi
-
-mi.set_variant("llvm_ad_rgb")
-
-
-class Broken(mi.Emitter):
-    def __init__(self, properties):
-        super().__init__(properties)
-        self.m_flags = mi.EmitterFlags.DeltaPosition
-
-    def sample_direction(self, *args):
-        raise RuntimeError("broken")
-
-    def bbox(self):
-        return mi.ScalarBoundingBox3f()
-
-
-mi.register_emitter("broken", Broken)
-parts = {"sensor": {"type": "perspective"}, "plate": {"type": "rectangle"}, "lamp": {"type": "point"}}
-sound, bdpt = mi.load_dict({"type": "scene", **parts}), mi.load_dict({"type": "bdpt"})
-broken = mi.load_dict({"type": "scene", **parts, "odd": {"type": "broken"}})
-for scene, sensor in ((sound, 0), (sound, 5), (broken, 0)):
-    try:
-        bdpt.render(scene, sensor=sensor, spp=1)
-    except Exception as error:
-        print(type(error).__name__, *getattr(error, "__notes__", [""]))
-"""
-
-
-def test_an_error_of_another_scenes_emitter_hints_at_it():
-    """Rationale: virtual calls visit the emitters of all scenes that live. Expected: the error of a sound
-    scene says that there is another, a refusal of `bdpt` itself and the other's own error do not. (In a
-    process of its own: the traceback of an error keeps the broken scene alive.)"""
-    done = subprocess.run([sys.executable, "-c", BROKEN], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-500:]
-    sound, refused, broken = done.stdout.splitlines()
-    assert sound.startswith("RuntimeError bdpt: other scenes in this process have 1 foreign emitters")
-    assert (refused, broken) == ("UsageError ", "RuntimeError ")
-
-
 def test_what_has_no_id_is_named_by_its_class_or_shape():
     """Expected: an id where there is one, for a lamp on a shape the shape's, else the class; a refusal says
     so in place of a name that is empty."""

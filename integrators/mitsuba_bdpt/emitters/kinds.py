@@ -6,7 +6,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..geometry import rays
-from ..host.jit import registered_emitters
 from .area import AreaEmitters
 from .directional_area import DirectionalAreaEmitters
 from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
@@ -93,9 +92,3 @@ def group_of(emitter) -> type[Group]:
 
 def is_third_party(class_name: str) -> bool:
     return class_name not in MITSUBAS
-
-
-def third_party_elsewhere(scene) -> int:
-    """Number of user-defined emitters outside ``scene``; virtual calls visit them."""
-    own = sum(is_third_party(emitter.class_name()) for emitter in scene.emitters())
-    return sum(map(is_third_party, registered_emitters())) - own

@@ -31,11 +31,8 @@ from .taps import Taps, is_wide
 class Block:
     """Sums of samples weighted by the film's filter, like ``mi.ImageBlock``.
 
-    The size is opaque: as a literal, it would compile a new kernel for every resolution.
-
     ``size``: (width, height). ``channels``: even, so that Dr.Jit adds them as a packet. ``mode``: ``Local``
-    where neighbouring lanes mostly share a pixel, else ``Direct``. ``packet``: array type of a pixel's sums,
-    in double precision where the number of samples of a pixel is unbounded.
+    where neighbouring lanes mostly share a pixel, else ``Direct``. ``packet``: array type of a pixel's sums.
     """
 
     def __init__(self, size, offset, channels: int, rfilter, mode, packet):
@@ -97,10 +94,7 @@ class Block:
         return position - mi.Point2f(self._offset) - 0.5
 
     def _add_each(self, count: int, tap, values, active, row):
-        """Add ``values`` to ``count`` pixels; ``tap(number)`` returns a pixel and its weight.
-
-        A loop, also for few pixels: unrolled, the branches of its additions are predicted less well.
-        """
+        """Add ``values`` to ``count`` pixels; ``tap(number)`` returns a pixel and its weight."""
 
         def body(number):
             pixel, weight = tap(number)
@@ -130,10 +124,10 @@ COPIES_MEMORY = 1 << 30
 
 
 def reduce_mode(numbers: int, samples: int, additions: int = 16, otherwise=dr.ReduceMode.Local):
-    """Return how samples of many ``additions`` are added to sums of ``numbers`` in single precision.
+    """Return how samples of ``additions`` are added to sums of ``numbers`` in single precision.
 
-    A copy of the sums for each of T threads needs no atomic additions: less work from about T^2 / additions
-    ``samples`` per pixel and launch on. ``otherwise``: the mode without copies.
+    A copy of the sums for each of T threads pays from about T^2 / additions ``samples`` per pixel and launch
+    on. ``otherwise``: the mode without copies.
     """
     threads = dr.thread_count()
     copied = threads * numbers * 4 <= COPIES_MEMORY and threads**2 <= additions * samples
@@ -221,10 +215,9 @@ _NAMES = ("camera", "light", "strategies")
 class Accumulator:
     """Accumulates the samples of one render.
 
-    ``film``: Mitsuba's film; ``colour``: converts spectra to the film's colours, see `colour`; ``border``:
-    pixels that camera samples reach beyond the crop window; ``settings``: the layers, of which the variance
-    needs replicates, see `close_replicate`; ``features``: the `FeatureLayers`, or ``None``; ``parts`` of the
-    sums.
+    ``colour``: converts spectra to the film's colours, see `colour`; ``border``: pixels that camera samples
+    reach beyond the crop window; ``features``: the `FeatureLayers`, or ``None``; ``parts`` of the sums;
+    ``layers``: number of layers of all partitions.
     """
 
     def __init__(self, film, colour, border: int, settings: Settings, features, parts: Parts):
@@ -244,6 +237,7 @@ class Accumulator:
             POLARIZED if self.stokes else 0,
             [len(layers) for layers in partitions(settings, parts.light_groups)],
         )
+        self.alpha, self.layers = bool(self._channels.alpha), self._channels.layers
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
         self._samples = parts.samples
@@ -268,15 +262,6 @@ class Accumulator:
             numbers = channels * size[0] * size[1] * (2 if packet == mi.ArrayXd else 1)
             mode = reduce_mode(numbers, self._samples, ceil(2 * self.rfilter.radius()) ** 2, mode)
         return Block(size, self.offset, channels, self.rfilter, mode, packet)
-
-    @property
-    def alpha(self) -> bool:
-        return bool(self._channels.alpha)
-
-    @property
-    def layers(self) -> int:
-        """Number of layers of all partitions that are kept."""
-        return self._channels.layers
 
     def indices(self, layers: Sequence[mi.UInt32]) -> list[mi.UInt32]:
         """Return the indices, among all layers, of a layer of each partition."""
@@ -368,15 +353,14 @@ class Accumulator:
         self.replicates.add([mi.Float64(s) for s in sums[:2]], sum(passes), self._image)
 
     def error(self) -> float:
-        """Return the estimated relMSE of the image, see `Replicates.error`."""
+        """Estimated relMSE of the image, see `Replicates.error`."""
         return self.replicates.error(sum(self.passes), np.array(self.colour.unit))
 
     def _image(self, camera: mi.Float64, light: mi.Float64, spp: int) -> np.ndarray:
         """Return the image (height, width, colours) of sums over ``spp`` samples."""
         pixels, w = self._pixels(camera, light), self._splat_weight(spp)
-        return self._on_host(
-            [c / pixels.weight + y / w for c, y in zip(pixels.colours, pixels.light, strict=True)]
-        )
+        colours = zip(pixels.colours, pixels.light, strict=True)
+        return self._on_host([c / pixels.weight + y / w for c, y in colours])
 
     def _on_host(self, channels: list[mi.Float64]) -> np.ndarray:
         """Return an image of ``channels`` in NumPy, (height, width, channels)."""
