@@ -12,20 +12,20 @@ MOST = {
     "measure": 7184,
     "transport merging guided_emission": 5706,
     "planning": 1731,
-    "emitters": 2333,
+    "emitters": 2326,
     "cli": 1810,
     "media": 1349,
     "geometry": 1518,
-    "image": 1508,
+    "image": 1502,
     "files": 927,
-    "run": 1234,
+    "run": 1197,
     "scene sampling": 777,
     "host": 856,
     "sensors": 912,
-    "": 1550,  # top files
+    "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 42659}
-MOST_WORDS = 29103
+OUTSIDE = {"scripts": 2931, "tests": 42548}
+MOST_WORDS = 29098
 
 
 def _lines(files):
