@@ -19,7 +19,7 @@ from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
 from mitsuba_bdpt.transport.photons.photon_guide import Guide
-from mitsuba_bdpt.transport.plan import GUIDED
+from mitsuba_bdpt.transport.plan import GUIDED_SAMPLES
 from sds_scenes import (
     ASIDE,
     CASES,
@@ -227,7 +227,7 @@ def test_the_pilot_guides_where_it_pays(monkeypatch):
     method = bdpt()
     image = np.array(mi.render(scene, integrator=method, spp=16))
     found = method.statistics
-    assert found["decisions"][0]["guided"] == GUIDED and found["unbiased"]
+    assert found["decisions"][0]["guided"] == GUIDED_SAMPLES and found["unbiased"]
     assert found["rays"]["photon"] and found["rays"]["guided"]
     text = method.explain(scene, spp=16)
     assert "used: guided s=0" in text
@@ -238,7 +238,7 @@ def test_the_pilot_guides_where_it_pays(monkeypatch):
     assert "guided s=0" not in method.explain(mi.load_dict(mi.cornell_box()), spp=16)
     monkeypatch.setitem(choice.COSTS, "guided", 1e9)
     always = bdpt(guiding="always")
-    assert always.decide(scene, spp=16)[0]["guided"] == GUIDED
+    assert always.decide(scene, spp=16)[0]["guided"] == GUIDED_SAMPLES
     assert "guided s=0" not in {skipped["class"] for skipped in always.statistics["skipped"]}
 
 
@@ -301,7 +301,7 @@ def test_guiding_has_to_pay(mean, typical, chosen):
     moments = Moments(np.ones((2, GROUPS, len(CANDIDATES))), (mean, typical), mean=1.0, rays=rays)
     possible = [c for c in CANDIDATES if c.light_paths == 1 and c.connections == "none"]
     table = choice.choose(moments, possible)
-    assert table[0].candidate.guided == (GUIDED if chosen else 0)
+    assert table[0].candidate.guided == (GUIDED_SAMPLES if chosen else 0)
     assert bool(choice.left_out(table)) == (not chosen)
     unmeasured = choice.choose(replace(moments, guidable=(0.0, 0.0)), possible)
     assert not any(row.candidate.guided for row in unmeasured)

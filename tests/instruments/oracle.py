@@ -123,7 +123,8 @@ def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     k, n = paths.k, len(paths.kind)
     names = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
     names += ("first", "second", "direct", "lens_pdf", "sensor_pdf")
-    log = {name: np.log(np.asarray(getattr(paths, name), dtype=np.float64)) for name in names}
+    with np.errstate(divide="ignore"):
+        log = {name: np.log(np.asarray(getattr(paths, name), dtype=np.float64)) for name in names}
     is_area = paths.kind == AREA
 
     # Densities of x_i when sampled from x_{i-1}. A delta event has the same (discrete) probability both ways,
@@ -270,7 +271,8 @@ class Guided(Explicit):
     vertices whose connection is in use. They have s = 0 and s = 1, and the same two, in further columns, for
     each vertex x_2 ... x_{k-1} with a guided direction: that of the first vertex that is not specular, seen
     from the emitter; without one (``pure``) those of all that are not delta, behind a specular event or an
-    edge that no strategy connects. ``guide`` (n, k + 1): density of that direction at each vertex.
+    edge that no strategy connects. ``guide`` (n, k + 1): density of that direction at each vertex. With
+    ``least`` infinite delta events alone are specular, and t = 0 takes part.
     """
 
     def __init__(self, paths: Paths, coefficients: Coefficients, guide, least: float):
@@ -286,7 +288,7 @@ class Guided(Explicit):
         guides = ~paths.delta[:, 1:k] & (specular[:, 2:] | ~used[1:]) & self.pure[:, None]
         rows = np.flatnonzero(self.sds & ~self.pure)
         guides[rows, diffuse[rows].argmax(1)] = True
-        size[self.sds, 2 : k + 2] = -np.inf
+        size[self.sds, 2 : k + 2 if np.isfinite(least) else k + 1] = -np.inf
         with np.errstate(divide="ignore"):
             ratio = np.log(guide[:, 1:k] / paths.to_light[:, 1:k])
         ratio = np.where(guides, ratio, -np.inf)[:, 1:]

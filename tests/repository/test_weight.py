@@ -25,7 +25,7 @@ MOST = {
     "": 1451,  # top files
 }
 OUTSIDE = {"scripts": 2931, "tests": 42548}
-MOST_WORDS = 29098
+MOST_WORDS = 29086
 
 
 def _lines(files):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..transport.plan import GUIDED
+from ..transport.plan import GUIDED_SAMPLES
 from .configuration import CANDIDATES, PATH_TRACING, Configuration, not_worth
 from .moments import GROUPS, Moments
 
@@ -111,7 +111,7 @@ def choose(
         errors = np.maximum(of_groups.mean(axis=1), LEAST_VARIANCE)
         if not math.isfinite(errors[0]):
             continue
-        for guided in (0, GUIDED) if guidable and light else (0,):
+        for guided in (0, GUIDED_SAMPLES) if guidable and light else (0,):
             emission = learnt.tables if learnt and light else None
             candidate = replace(way, guided=guided, emission=emission)
             each = cost(candidate, moments.rays, samples)

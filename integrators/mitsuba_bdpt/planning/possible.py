@@ -10,7 +10,7 @@ from ..geometry.boxes import scene_box
 from ..host.introspection import world_matrix
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
-from ..transport.plan import GUIDED, Plan
+from ..transport.plan import GUIDED_SAMPLES, Plan
 from ..transport.sds import FEWEST_EDGES
 from .budget import EVEN
 
@@ -80,7 +80,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         hide_emitters=settings.hide_emitters,
         skipped=tuple(skipped),
         merging=merging,
-        guided=GUIDED if guidable and not merging and settings.guiding == "always" else 0,
+        guided=GUIDED_SAMPLES if guidable and not merging and settings.guiding == "always" else 0,
         guidable=guidable,
         teachable=teachable,
     )

@@ -119,7 +119,7 @@ class Heuristic:
         return dr.minimum(inverse_pdf, SATURATION)
 
     def equal_weight(self, ratio: mi.Float) -> mi.Float:
-        """Factor of an estimate f / p, of density ``ratio`` times p, that is to have the weight of p."""
+        """r^(beta - 1): factor of an estimate f / p of density r p (r: ``ratio``) with the weight of p."""
         return ratio if self.name == "power" else mi.Float(1)
 
     def weigh(
@@ -210,10 +210,10 @@ def _folded(h: Heuristic, step: Step, before: PartialSum, older: PartialSum):
 
 
 def scattered_guided(h: Heuristic, partial: Partial, step: Step, guided: PartialSum, isolated: mi.Bool):
-    """``d_vm`` after an event on SDS paths: guided s = 0 at earlier vertices, and at this one unless delta.
+    """``d_vm`` of a light subpath after an event: guided s = 0 at earlier vertices, and at this one.
 
-    ``guided``: its partial sum at this vertex; ``isolated``: no edge up to the event is connected by a
-    strategy in use.
+    ``guided``: n p_g d_vc, 0 where this vertex does not guide; ``isolated``: no edge up to the event is
+    connected by a strategy in use.
     """
     total = h.combine(h.scale(partial.d_vm, step.pdf_rev_w), guided)
     return dr.select(isolated, _folded(h, step, partial.d_vm, total), 0)

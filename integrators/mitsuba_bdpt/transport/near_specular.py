@@ -23,9 +23,9 @@ from ..host.introspection import number, own_parameters
 # .063 in reflection, of .38 in refraction by glass. See experiments, "Near-specular lobes".
 NARROW = 20.0
 
-# Least density (1 / sr) from both sides of an event through which photons guide; see experiments,
-# "Photon-guided BSDF sampling".
-GUIDED = 4.0
+# Least density (1 / sr) from both sides of an event that counts as specular in guiding, see `sds` and
+# experiments, "Photon-guided BSDF sampling".
+SPECULAR = 4.0
 
 # Least cosine of incidence of sampled BSDFs: at grazing incidence all glossy lobes are narrow.
 _LEAST_COS = 0.5

@@ -9,7 +9,7 @@ from typing import Any
 JOINED = (1, 4)
 
 # Guided samples per vertex where s = 0 is guided.
-GUIDED = 4
+GUIDED_SAMPLES = 4
 
 
 @dataclass(frozen=True)

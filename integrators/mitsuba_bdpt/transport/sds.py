@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import mis
-from .near_specular import GUIDED, is_narrow
+from .near_specular import SPECULAR, is_narrow
 
 # Edges of the shortest guided path: no photon directly from the emitter guides.
 FEWEST_EDGES = 3
@@ -96,7 +96,7 @@ def connects_sds_path(edges: mi.UInt32, *ends: tuple) -> mi.Bool:
 
 def is_specular(f) -> mi.Bool:
     """Mask: a near-specular event, which photons guide through; ``f`` as in `near_specular.is_narrow`."""
-    return is_narrow(f, GUIDED)
+    return is_narrow(f, SPECULAR)
 
 
 @dataclass

@@ -59,7 +59,7 @@ def hit_emitter(kernel: TraceContext, z: Vertex, sds: PhotonStrategy) -> Contrib
         sides = _beside_guided(kernel, z.sds.guided, on_sds_path, sides, alone, kernel.kappa.hit)
         active = sds.counts(active, on_sds_path)
     elif z.sds is not None and z.sds.guided is not None:
-        on_sds_path = ~mis.is_connectible(z.partial, newest) & (z.sds.guided > 0)
+        on_sds_path = (z.partial.d_vcm == 0) & (z.sds.guided > 0)  # guided subpaths arrive from delta events
         guided = h.scale(dr.select(on_sds_path, z.sds.guided, 0), kernel.kappa.hit)
         sides, active = (0, h.combine(sides[1], guided)), sds.counts(active, on_sds_path)
     merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)

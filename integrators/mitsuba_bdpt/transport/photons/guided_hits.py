@@ -1,6 +1,6 @@
 """Photon-guided BSDF sampling: samples SDS paths by hitting an emitter (s = 0).
 
-From a diffuse vertex n further directions (`plan.GUIDED`) are sampled from the density p_g of a
+From a diffuse vertex n further directions (`plan.GUIDED_SAMPLES`) are sampled from the density p_g of a
 `photon_guide.Guide` and followed through specular events only. All densities but those of the direction
 cancel: guided s = 0 over s = 0 by the BSDF is n p_g / p_bsdf. Under the balance heuristic a guided subpath
 has the throughput and the weight of one by the BSDF, since each technique of a path contributes f over the
@@ -22,7 +22,7 @@ from .. import bsdf, mis, path_layers, spectra, techniques
 from ..alternatives import is_sds_vertex, newest_coefficient
 from ..contribution import one
 from ..inputs import TraceContext
-from ..near_specular import GUIDED
+from ..near_specular import SPECULAR
 from ..sds import Advice, PhotonStrategy, State, begun_near_specular, is_specular
 from ..walk import Side, Vertex, Walk, not_finite, random_walk
 from . import photon_guide
@@ -172,7 +172,7 @@ def _follow_one(kernel: TraceContext, guiding: Guiding, z: Vertex, numbers: Stre
         kernel.max_depth,
         guided if near_specular else PhotonStrategy(),
         connect=(lambda z: techniques.choose_emitter(kernel, z, numbers)) if connects else None,
-        only_specular=GUIDED if near_specular else math.inf,
+        only_specular=SPECULAR if near_specular else math.inf,
     )
     begun = walk.active
     (total, lost, traced), walk = random_walk(kernel, side, walk, visit, (total, lost, traced))

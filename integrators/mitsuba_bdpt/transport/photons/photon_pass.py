@@ -14,7 +14,7 @@ from .. import spectra, subpaths
 from ..alternatives import is_sds_vertex, newest_connection
 from ..contribution import Counters, one
 from ..inputs import TraceContext
-from ..near_specular import GUIDED
+from ..near_specular import SPECULAR
 from ..sds import PhotonStrategy, begun_near_specular
 from ..walk import Vertex, Walk, random_walk
 from .aim import Aim
@@ -59,7 +59,7 @@ class GuidePhotons(PhotonPolicy):
     """Stores vertices with a lobe up to the first non-specular event, if s = 0 can sample the path."""
 
     def __init__(self, near_specular: bool):
-        self.only_specular = GUIDED if near_specular else math.inf
+        self.only_specular = SPECULAR if near_specular else math.inf
 
     def begin(self, kernel, e, walk):
         return begun_near_specular(walk, light=True) if kernel.near_specular else walk
