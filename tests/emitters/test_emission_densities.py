@@ -101,11 +101,8 @@ def sphere_bins(d, axis, cos_least, rings=10, sectors=16):
 
 @pytest.mark.parametrize("name", AT_A_POINT)
 def test_directions_from_a_point(name):
-    """Rationale: Mitsuba offers no density for what a spot or a projector sends out.
-
-    Expected: the stated density of directions is that of the sampled ones, and each emission states
-    its own. Statistic: see the module.
-    """
+    """Mitsuba offers no density for what a spot or a projector sends out. Expected: the stated density of
+    directions is that of the sampled ones, and each emission states its own. Statistic: see the module."""
     _, emitters, e = emission(name)
     d = column(e.d)
     axis, cos_least = np.array([-1, -3, -1.5]) / np.sqrt(12.25), -1.0
@@ -128,11 +125,9 @@ def test_directions_from_a_point(name):
 
 @pytest.mark.parametrize("name", AT_INFINITY)
 def test_directions_from_infinity(name):
-    """Rationale: emission, next-event estimation and hits of an environment share one density of directions.
-
-    Expected: the density that a camera ray that leaves the scene states is that of the sampled emissions,
-    which state the same. Statistic: see the module.
-    """
+    """Emission, next-event estimation and hits of an environment share one density of directions. Expected:
+    the density that a camera ray that leaves the scene states is that of the sampled emissions, which state
+    the same. Statistic: see the module."""
     scene, emitters, e = emission(name)
     d = column(e.d)
     u = numbers(2, 12)
@@ -154,12 +149,10 @@ def test_directions_from_infinity(name):
 
 @pytest.mark.parametrize("name", [*AT_INFINITY, "directional"])
 def test_light_from_infinity_covers_the_scene_evenly(name):
-    """Rationale: Mitsuba's `envmap` starts from a wrong disk if it is rotated.
-
-    Expected: seen along its direction, an emission starts on the plane before the scene's bounding sphere and
-    evenly on the disk that covers it: its squared distance from the middle is uniform, and so is its
-    angle. Statistic: Kolmogorov-Smirnov at 1e-4, within 1e-4 of the radius for the plane.
-    """
+    """Mitsuba's `envmap` starts from a wrong disk if it is rotated. Expected: seen along its direction, an
+    emission starts on the plane before the scene's bounding sphere and evenly on the disk that covers it: its
+    squared distance from the middle is uniform, and so is its angle. Statistic: Kolmogorov-Smirnov at 1e-4,
+    within 1e-4 of the radius for the plane."""
     _, emitters, e = emission(name)
     d, around = column(e.d), emitters.disks.scene
     radius = float(around.radius[0])
@@ -182,13 +175,9 @@ def place_bins(p, low, high, cells=6):
 
 @pytest.mark.parametrize("name", ON_SURFACES)
 def test_places_on_a_surface(name):
-    """Rationale: emission chooses places by area or by texture; what a camera ray that hits the
-    surface states must be that.
-
-    Expected: the stated density of places is that of the sampled ones, and directions have the density
-    cos / pi about the normal (a directionalarea: only that one). Statistic: see the module, for directions
-    Kolmogorov-Smirnov at 1e-4.
-    """
+    """Emission chooses places by area or by texture. Expected: the stated density of places is that of the
+    sampled ones, and directions have the density cos / pi about the normal (a directionalarea: only that
+    one). Statistic: see the module, for directions Kolmogorov-Smirnov at 1e-4."""
     scene, emitters, e = emission(name)
     shape = scene.emitters()[0].get_shape()
     u = numbers(2, 12)
@@ -215,12 +204,9 @@ def test_places_on_a_surface(name):
 @pytest.mark.parametrize("radiance", ["uniform", "textured"])
 @pytest.mark.parametrize("inwards", [False, True])
 def test_spheres_that_to_world_turns(inwards, radiance):
-    """Rationale: a sphere's sampled points turn with its ``to_world``, their normals do not in Mitsuba; light
-    subpaths then left into the sphere, and half of a lamp seen directly was black.
-
-    Expected: normals point away from the centre, or towards it, within 1e-5 (single precision), rays leave
-    on that side; emission, next-event estimation and an irradiance meter on the sphere agree on it.
-    """
+    """A sphere's sampled points turn with its ``to_world``, their normals do not in Mitsuba. Expected:
+    normals point away from the centre, or towards it, within 1e-5 (single precision), rays leave on that
+    side; emission, next-event estimation and an irradiance meter on the sphere agree on it."""
     transform = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0, 0.8], 115).scale(0.7)
     ball = {"type": "sphere", "to_world": transform, "flip_normals": inwards, "bsdf": parts.grey(0)}
     lamp = {"type": "area", "radiance": parts.texture() if radiance == "textured" else 1.0}
@@ -250,11 +236,9 @@ def test_spheres_that_to_world_turns(inwards, radiance):
 
 @pytest.mark.parametrize("name", ["projector", "textured projector"])
 def test_power_of_a_projector(name):
-    """Rationale: a projector's weight is irradiance at distance 1 over the density of its directions.
-
-    Expected: the mean weight is its power, the integral of Mitsuba's own intensity over directions (points
-    at distance 1 and `sample_direction`). Statistic: five standard errors of both sides.
-    """
+    """A projector's weight is irradiance at distance 1 over the density of its directions. Expected: the mean
+    weight is its power, the integral of Mitsuba's own intensity over directions (points at distance 1 and
+    `sample_direction`). Statistic: five standard errors of both sides."""
     scene, _, e = emission(name)
     lamp = scene.emitters()[0]
     d = column(e.d)
@@ -274,12 +258,8 @@ def test_power_of_a_projector(name):
 
 
 def test_selection_beside_what_cannot_be_traced():
-    """Rationale: an emitter that starts no light subpath keeps its share of the choice, and the
-    emissions of the others carry theirs.
-
-    Expected: of a point light and a plugin of unknown class only the emissions of the first carry light, half
-    of all, and their mean is the point light's power. Statistic: five standard errors.
-    """
+    """Expected: of a point light and a plugin of unknown class only the emissions of the first carry light,
+    half of all, and their mean is the point light's power. Statistic: five standard errors."""
     parts.register_plugins()
     _, _, e = emission("point", other=parts.EMITTERS["own lamp"]())
     weight = column(e.weight)[0]
@@ -322,12 +302,10 @@ FROM_INFINITY = {
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_emission(name):
-    """Rationale: half of the light subpaths from infinity are aimed at the block on the ground.
-
-    Expected: where they pass, per area across their direction, is what `Emitters` states at any point of
-    that line, and integrates to the disk of the scene, and to that of the block; half and more pass the
-    block's sphere. Statistic: five standard errors.
-    """
+    """Half of the light subpaths from infinity are aimed at the block on the ground. Expected: where they
+    pass, per area across their direction, is what `Emitters` states at any point of that line, and integrates
+    to the disk of the scene, and to that of the block; half and more pass the block's sphere. Statistic: five
+    standard errors."""
     emitters = Emitters(meadow(FROM_INFINITY[name]))
     u = [mi.Float(v) for v in numbers(4)]
     like = dr.zeros(mi.Interaction3f)
@@ -375,11 +353,8 @@ def test_details():
 
 @pytest.mark.parametrize("scale", [8, 1000])
 def test_aimed_points_know_that_they_are(scale):
-    """Rationale: a point on the rim of the details' disk may be outside of it by rounding; without the aimed
-    part in its density it would weigh (R / r)^2 times too much.
-
-    Expected: no start that was aimed has less than that part, and none has none.
-    """
+    """A point on the rim of the details' disk may be outside of it by rounding. Expected: no start that was
+    aimed has less than that part, and none has none."""
     transform = mi.ScalarTransform4f()
     disks = emitter_disks.Disks(
         mi.load_dict(
@@ -399,10 +374,8 @@ def test_aimed_points_know_that_they_are(scale):
 
 
 def test_a_vertex_that_is_not_finite():
-    """Rationale: the box of a mesh with such a vertex is not valid, yet rays meet its other triangles.
-
-    Expected: the scene's disk covers what is finite.
-    """
+    """The box of a mesh with such a vertex is not valid, yet rays meet its other triangles. Expected: the
+    scene's disk covers what is finite."""
     mesh = mi.Mesh("broken", 4, 2)
     params = mi.traverse(mesh)
     params["vertex_positions"] = [0, 0, 0, 2, 0, 0, 0, 2, 0, np.nan, 0, 0]
@@ -428,9 +401,8 @@ CORNER = """<scene version="3.0.0">
 
 
 def test_rectangles_that_mitsuba_merges():
-    """Rationale: Mitsuba makes one mesh of rectangles of one BSDF, and the box of it is not valid: the
-    scene's is that of the ball. Expected: the disk covers what it covers where nothing is merged.
-    """
+    """Mitsuba makes one mesh of rectangles of one BSDF, and the box of it is not valid. Expected: the disk
+    covers what it covers where nothing is merged."""
     merged, apart = (mi.load_string(CORNER, optimize=on) for on in (True, False))
     assert len(merged.shapes()) == 2 and len(apart.shapes()) == 3
     assert merged.bbox().bounding_sphere().radius < 0.2
@@ -464,10 +436,9 @@ def room_of_rectangles():
 
 @pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
 def test_a_room_of_merged_rectangles(parameters):
-    """Rationale: shadow rays of `path` towards the sky end at the box of the cube, and meet no wall: the room
-    is 6 % too bright. Where other shapes stretch the box nearly to the walls it is a few per mille, which was
-    taken for a loss of ours in other people's scenes. Expected: the image is the same whether
-    Mitsuba has merged the walls or not, to 1e-5 of the mean for sums in another order; `path` differs."""
+    """Shadow rays of `path` towards the sky end at the box of the cube, and meet no wall. Expected: the image
+    is the same whether Mitsuba has merged the walls or not, to 1e-5 of the mean for sums in another order;
+    `path` differs."""
     merged, apart = (mi.load_dict(room_of_rectangles(), optimize=on) for on in (True, False))
     assert len(merged.shapes()) == 2 and len(apart.shapes()) == 6
     ours = mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters)
@@ -479,10 +450,8 @@ def test_a_room_of_merged_rectangles(parameters):
 
 
 def test_sizes_of_scenes_with_merged_rectangles():
-    """Rationale: as above, of all that asks how large a scene or a shape is. Expected: the scene's box is
-    that of the rectangles, beside which a ball of radius .1, a thousandth of them, is small; spheres around
-    merged mirrors, at which photons are aimed, are finite.
-    """
+    """Expected: the scene's box is that of the rectangles, beside which a ball of radius .1, a thousandth of
+    them, is small; spheres around merged mirrors, at which photons are aimed, are finite."""
     text = CORNER.replace("diffuse", "conductor").replace(
         '<rotate x="1" angle="-90"/>', '<scale value="100"/>'
     )
@@ -495,9 +464,8 @@ def test_sizes_of_scenes_with_merged_rectangles():
 
 
 def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
-    """Rationale: the box of such a mesh is that of the cube alone, and valid. Expected: the scene's box is
-    that of all.
-    """
+    """The box of such a mesh is that of the cube alone, and valid. Expected: the scene's box is that of
+    all."""
     scene = room_of_rectangles()
     scene["cube"]["bsdf"] = scene["floor"]["bsdf"]
     merged, apart = (mi.load_dict(scene, optimize=on) for on in (True, False))
@@ -507,13 +475,9 @@ def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
-    """Rationale: the density of aimed emission enters the weights of all strategies, at the points where
-    these have vertices.
-
-    Expected: next-event estimation (1, 2) and light tracing (2, 1) alone each give the image of light that
+    """Expected: next-event estimation (1, 2) and light tracing (2, 1) alone each give the image of light that
     is reflected once, and so do all together. Statistic: t test (23 degrees of freedom, at least) of each
-    pixel and of the whole over 24 renders, Sidak, at 1e-4; the whole is known to 2 % or better.
-    """
+    pixel and of the whole over 24 renders, Sidak, at 1e-4; the whole is known to 2 % or better."""
     scene, images = meadow(FROM_INFINITY[name]), {}
     integrator = mi.load_dict(
         {"type": "bdpt", "max_depth": 2, "light_paths": 1, "layers": "strategies", "hide_emitters": True}
@@ -535,12 +499,9 @@ def test_aimed_light_subpaths(name):
 
 
 def test_aimed_light_subpaths_that_reach_a_lens():
-    """Rationale: for (1, 1) and t = 0 the density is asked for at the sensor, which may lie outside the
-    scene.
-
-    Expected: with all strategies, the sky that a wide lens far outside sees directly past the scene, and
-    beside it, is that of `path`. Statistic: as above, against the mean of a long render (1e-3 for its error).
-    """
+    """For and t = 0 the density is asked for at the sensor, which may lie outside the scene. Expected: with
+    all strategies, the sky that a wide lens far outside sees directly past the scene, and beside it, is that
+    of `path`. Statistic: as above, against the mean of a long render (1e-3 for its error)."""
     transform = mi.ScalarTransform4f()
     scene = meadow(FROM_INFINITY["sky"])
     sensor = mi.load_dict(

@@ -14,7 +14,7 @@ import pytest
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import mitsubas_choices, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
-from scene_parts import T, grey
+from scene_parts import T, grey, perspective
 from scipy import stats
 from test_endpoints import egg_with_coordinates, own_area_class
 
@@ -31,19 +31,14 @@ def peaked(peak, height=8, width=16):
 
 def gap(**lamp):
     """A floor and a ceiling that look at each other past the ``lamp`` at height 1.5."""
-    film = {"type": "hdrfilm", "width": 12, "height": 12, "pixel_format": "rgb", "rfilter": {"type": "box"}}
     plates = {
         name: {"type": "rectangle", "bsdf": grey(0.6), "to_world": T().translate([0, y, 0]).rotate(*turn)}
         for name, y, turn in (("floor", 0, ([1, 0, 0], -90)), ("ceiling", 3, ([1, 0, 0], 90)))
     }
     for plate in plates.values():
         plate["to_world"] = plate["to_world"].scale(1.5)
-    eye = T().look_at([0, 1.5, 5], [0, 1.5, 0], [0, 1, 0])
-    return mi.load_dict(
-        {"type": "scene", "sensor": {"type": "perspective", "fov": 45, "to_world": eye, "film": film}}
-        | plates
-        | lamp
-    )
+    sensor = perspective((0, 1.5, 5), (0, 1.5, 0), 45, size=12)
+    return mi.load_dict({"type": "scene", "sensor": sensor} | plates | lamp)
 
 
 def check_sums(scene, depth=2, spp=512, width=0.03, seeds=SEEDS):
@@ -88,12 +83,8 @@ def textured_lamps():
 
 @pytest.mark.parametrize("shape, flipped, placed", list(textured_lamps()))
 def test_peaked_textures(shape, flipped, placed, tmp_path):
-    """Rationale: Mitsuba samples the texture of some lamps, and the shape of others; which, and with which
-    normal, depends on the shape, its `flip_normals` and its `to_world`. A flipped sphere of radius 10 that is
-    not rotated was +53 % wrong, a flipped rectangle black for all but s = 0 (and in `path`, 34 % too dark).
-
-    Expected, tolerance, statistic: those of `check_sums`. A flipped closed shape surrounds all.
-    """
+    """Mitsuba samples the texture of some lamps, and the shape of others. See `check_sums`. A flipped closed
+    shape surrounds all."""
     # A sphere that is mirrored turns its normals as well.
     around = shape in CLOSED and flipped != (shape == "sphere" and placed == "mirrored")
     to_world = T().translate([0, 1.5, 0]).scale((16 if shape == "mesh" else 8) if around else 1)
@@ -115,6 +106,7 @@ def test_peaked_textures(shape, flipped, placed, tmp_path):
 
 
 SHEARED = T([[1, 0.7, 0.4, 0], [0, 1, 0.3, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+LAMP = {"bsdf": grey(0), "emitter": {"type": "area", "radiance": 5.0}}
 SHEARED_LAMPS = {
     "disk": ("disk", SHEARED),
     "stretched disk": ("disk", T().scale([1, 0.4, 2])),
@@ -125,19 +117,6 @@ SHEARED_LAMPS = {
     "turned rectangle": ("rectangle", T().rotate([1, 1, 0], 40)),
     "turned cube": ("cube", T().rotate([1, 1, 1], 40).scale(0.6)),
 }
-
-
-@pytest.mark.parametrize("name", SHEARED_LAMPS)
-def test_shapes_that_may_be_sheared(name):
-    """Rationale: lamps on shapes whose `to_world` shears are refused where Mitsuba samples them otherwise
-    than rays find them (tests of parameters), and right elsewhere. Expected, tolerance, statistic: those of
-    `check_sums`."""
-    shape, matrix = SHEARED_LAMPS[name]
-    to_world = T().translate([0, 1.5, 0]).rotate([1, 0, 0], 75) @ matrix
-    emitter = {"type": "area", "radiance": 5.0}
-    check_sums(gap(lamp={"type": shape, "to_world": to_world, "bsdf": grey(0), "emitter": emitter}))
-
-
 # Rectangles, disks and spheres are one surface for all strategies, whatever turned them.
 REFLECTORS = {
     "sheared instance": ("instance", SHEARED.scale(0.5)),
@@ -149,19 +128,21 @@ REFLECTORS = {
 }
 
 
+@pytest.mark.parametrize("name", SHEARED_LAMPS)
+def test_shapes_that_may_be_sheared(name):
+    """Lamps whose `to_world` shears where Mitsuba samples and finds the same points. See `check_sums`."""
+    shape, matrix = SHEARED_LAMPS[name]
+    to_world = T().translate([0, 1.5, 0]).rotate([1, 0, 0], 75) @ matrix
+    check_sums(gap(lamp=LAMP | {"type": shape, "to_world": to_world}))
+
+
 @pytest.mark.parametrize("name", REFLECTORS)
 def test_what_reflects_may_be_sheared(name):
-    """Rationale: joins ask for the surface's area and normal, path tracing alone for no more than what
-    Mitsuba's samplers draw. Shapes that are two surfaces are refused (tests of parameters). Expected,
-    tolerance, statistic: those of `check_sums`."""
+    """Connections need the surface's area and normal. See `check_sums`."""
     shape, matrix = REFLECTORS[name]
-    lamp = {"type": "rectangle", "to_world": T().translate([0, 2.9, 0]).rotate([1, 0, 0], 90)}
-    parts = {"lamp": lamp | {"emitter": {"type": "area", "radiance": 5.0}}}
-    keys = {
-        "type": shape,
-        "to_world": T().translate([0, 1, 0]) @ matrix,
-        "bsdf": {"type": "twosided", "b": grey(0.6)},
-    }
+    parts = {"lamp": {"type": "rectangle", "to_world": T().translate([0, 2.9, 0]).rotate([1, 0, 0], 90)}}
+    parts["lamp"]["emitter"] = LAMP["emitter"]
+    keys = {"type": shape, "to_world": T().translate([0, 1, 0]) @ matrix, "bsdf": grey(0.6)}
     if shape == "instance":
         parts["group"] = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": keys.pop("bsdf")}}
         keys["ref"] = {"type": "ref", "id": "group"}
@@ -169,8 +150,7 @@ def test_what_reflects_may_be_sheared(name):
 
 
 def test_flat_instances_are_not_refused():
-    """Rationale: the inverse of a matrix that flattens is known to single precision alone, and NumPy's
-    differs from Mitsuba's, which is right. Expected: no complaint about axes."""
+    """Expected: no complaint about axes."""
     flat = T().rotate([0.6, 0.8, 0], 30).scale([1, 1, 1e-7])
     group = {"type": "shapegroup", "plate": {"type": "rectangle"}}
     one = {"type": "instance", "to_world": flat, "group": {"type": "ref", "id": "group"}}
@@ -178,9 +158,8 @@ def test_flat_instances_are_not_refused():
 
 
 def test_a_sheared_disk_is_found_where_it_is_sampled():
-    """Rationale: of a disk turned by `rotate` about [1, 1, 0], 40 degrees, rays find 46 % of the sampled
-    points; the same matrix without its wrong inverse is a disk like any. Expected: rays find all points,
-    with the density of places that is stated, one over the area."""
+    """Of a disk turned by `rotate` about [1, 1, 0], 40 degrees, rays find 46 % of the sampled points.
+    Expected: rays find all points, with the density of places that is stated, one over the area."""
     matrix = np.array(T().rotate([1, 1, 0], 40).matrix)
     lamp = {"type": "disk", "emitter": {"type": "area", "radiance": 5.0}}
     scene = gap(lamp=lamp | {"to_world": T().translate([0, 1.5, 0]) @ T(matrix)})
@@ -224,14 +203,9 @@ def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitt
 
 @pytest.mark.parametrize("rows", [3, 32, 128, 256])
 def test_normals_of_fine_meshes(rows):
-    """Rationale: the geometric normal of a point of a mesh with vertex normals is that of the face that
-    Mitsuba has chosen, by a table of single precision: of 32,512 faces a table in double precision found 23 %
-    wrong, of 130,560 faces 57 %.
-
-    Expected: on a ball of triangles all normals of emitted points and of those sampled directly are within
+    """Expected: on a ball of triangles all normals of emitted points and of those sampled directly are within
     the largest angle between a face and the points of the sphere above it: half a diagonal of a cell, and a
-    tenth more, and 1e-3 for rounding (2e-6 of the height of a face near a pole).
-    """
+    tenth more, and 1e-3 for rounding (2e-6 of the height of a face near a pole)."""
     count = 20_000
     scene = gap(lamp=ball_of_triangles((0, 1.5, 0), 0.5, rows, rows))
     assert rows < 128 or scene.emitters()[0].get_shape().face_count() > 30_000
@@ -258,13 +232,9 @@ def placed_lamps():
 
 @pytest.mark.parametrize("shape, placed, flipped", list(placed_lamps()))
 def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
-    """Rationale: the side of an emitting surface decides in which medium light starts. Samples of meshes
-    with vertex normals, and of mirrored rectangles and cubes, had the opposite of the geometric normal.
-
-    Expected: for emission and next-event estimation the normal is that of a hit at the same point, to 0.03
-    (interpolated normals of a coarse mesh are off by 0.1 and more); of at least 99 % of 2,000 points, others
-    are on edges.
-    """
+    """The side of an emitting surface decides in which medium light starts. Expected: for emission and
+    next-event estimation the normal is that of a hit at the same point, to 0.03 (interpolated normals of a
+    coarse mesh are off by 0.1 and more); of at least 99 % of 2,000 points, others are on edges."""
     count = 2000
     lamp = {"type": shape, "flip_normals": flipped}
     if shape == "mesh":
@@ -287,8 +257,7 @@ def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
 
 
 def test_a_fine_mesh_shines_like_any():
-    """Rationale: as above; such a lamp over a floor was 10 % too dark. Expected, tolerance, statistic: those
-    of `check_sums`."""
+    """See `check_sums`."""
     check_sums(gap(lamp=ball_of_triangles((0, 1.5, 0), 0.6)), width=0.01)
 
 
@@ -358,10 +327,7 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
 
 @pytest.mark.parametrize("emitter", [None, "timed_sunsky", "own_area"])
 def test_textured_lamps_beside_shapes_without_points(emitter, tmp_path):
-    """Rationale: points of these lamps are asked of shapes, and Mitsuba's call on shapes visits instances,
-    curves and grids, which sample none ("Shape::sample_position(): not implemented!"). Kernels beside a
-    `timed_sunsky` run step by step; beside a user's class that samples no points those of all lamps are asked
-    of their shapes. Expected, tolerance, statistic: those of `check_sums`."""
+    """See `check_sums`."""
     curve = tmp_path / "curve.txt"
     curve.write_text("\n".join(f"{x} 1 0 0.1" for x in (-1.5, -0.5, 0.5, 1.5)))
     area = {"type": "area", "radiance": peaked(20)}
@@ -394,8 +360,7 @@ def test_textured_lamps_beside_shapes_without_points(emitter, tmp_path):
 
 
 def test_a_textured_cube_that_was_met_as_an_emitters_shape():
-    """Rationale: Python keeps the type under which it first met an object, and an emitter tells its shape as
-    a plain one, without the methods of meshes. Expected: the image is made all the same."""
+    """Expected: the image is made all the same."""
     lamp = {"type": "cube", "emitter": {"type": "area", "radiance": peaked(2)}}
     film = {"type": "hdrfilm", "width": 8, "height": 8}
     eye = T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
@@ -423,27 +388,15 @@ def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
 
 
 def test_a_textured_lamp_beside_a_group_of_two_kinds_of_shapes():
-    """Rationale: ``Shape.ray_intersect`` of Mitsuba reads out of bounds there. Expected: it is rendered."""
-    texels = np.ones((4, 4, 3), dtype=np.float32)
-    texels[0] = 0
-    radiance = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True}
+    """``Shape.ray_intersect`` of Mitsuba reads out of bounds there. Expected: it is rendered."""
     group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.2}, "box": {"type": "cube"}}
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "to_world": mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 16, "height": 16},
-            },
-            "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": radiance}},
-            "group": group,
-            "instance": {
-                "type": "instance",
-                "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).scale(0.1),
-                "group": {"type": "ref", "id": "group"},
-            },
-        }
-    )
-    image = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=4))
+    one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    scene = {
+        "type": "scene",
+        "sensor": perspective((0, 0, 4), (0, 0, 0)),
+        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": peaked(2)}},
+        "group": group,
+        "instance": one | {"to_world": T().translate([0, 0, 2]).scale(0.1)},
+    }
+    image = np.array(mi.load_dict({"type": "bdpt"}).render(mi.load_dict(scene), spp=4))
     assert 0.1 < image.mean() < 1 and np.isfinite(image).all()

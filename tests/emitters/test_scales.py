@@ -83,14 +83,10 @@ LAMPS = {
 
 @pytest.mark.parametrize("name", LAMPS)
 def test_lamps_of_any_size(name):
-    """Rationale: Mitsuba finds points of textured disks and spheres by a ray from one unit of length above
-    the surface, whatever the scale; at 1e-3 they lay so far off it that rays met their own start: up to 89 %
-    of the light of a disk was lost, 37 % of a sphere's. Projectors were asked at one unit of length.
-
-    Expected: pixel by pixel the image at scale 1, with the same random numbers: scales that are powers of two
-    change no rounding. Tolerance: 1e-6 of the mean for the order of sums, and for lamps at a point, which are
-    asked at a distance of 1 + |p|; losses of one lamp do not hide behind others. All scales are one kernel.
-    """
+    """Expected: pixel by pixel the image at scale 1, with the same random numbers: scales that are powers of
+    two change no rounding. Tolerance: 1e-6 of the mean for the order of sums, and for lamps at a point, which
+    are asked at a distance of 1 + |p|; losses of one lamp do not hide behind others. All scales are one
+    kernel."""
     lamps, images = LAMPS[name](), []
     for scale in (1.0, *SCALES):
         parts = {key: of_scale(part, scale) for key, part in (room() | lamps).items()}

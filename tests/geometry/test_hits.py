@@ -112,10 +112,9 @@ def test_spheres_are_mitsubas(others):
     ids=["copies", "balls", "others"],
 )
 def test_kernels_do_not_grow(made, called):
-    """Rationale: Mitsuba records n^2 functions for n instances, most of a forest's first image, and one for
-    each sphere. Expected: with 10 and with 30 the same number of shapes is called one by one, and kernels are
-    as long (a few lines are about how tables lie in memory), also with more of other shapes, which share
-    their function."""
+    """Expected: with 10 and with 30 the same number of shapes is called one by one, and kernels are as long
+    (a few lines are about how tables lie in memory), also with more of other shapes, which share their
+    function."""
     other, counts = balls(3), []  # else shapes might have the numbers by which Dr.Jit merges functions
     for count in (10, 30):
         scene, ray = made(count), rays(16)

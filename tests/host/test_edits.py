@@ -148,9 +148,8 @@ def test_each_entry_counts(kind, entries):
 
 
 def test_edits_of_inner_texels_are_seen(traced):
-    """Rationale: a lamp's bitmap of which four entries were looked at became a hundred thousand times as
-    bright between them, and the pilot of before chose no light subpaths. Expected: another pilot after an
-    edit of inner texels; none after one back and forth, since what was found of that bitmap is remembered."""
+    """Expected: another pilot after an edit of inner texels; none after one back and forth, since what was
+    found of that bitmap is remembered."""
     data = np.full((8, 8, 3), 0.05, dtype=np.float32)
     texture = {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest"}
     lamp = {

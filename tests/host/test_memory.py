@@ -147,11 +147,9 @@ def test_what_was_asked_for_counts():
 
 @pytest.mark.parametrize("name", FILMS)
 def test_a_film_takes_what_is_said_of_it(child, name):
-    """Rationale: what exceeds a limit ends the process by a signal.
-
-    Expected: a render's peak of resident memory grows by what its film is said to take. Tolerances: measured
-    are 0.97 to 1.01 of it; 32 MiB above for what else a render takes.
-    """
+    """What exceeds a limit ends the process by a signal. Expected: a render's peak of resident memory grows
+    by what its film is said to take. Tolerances: measured are 0.97 to 1.01 of it; 32 MiB above for what else
+    a render takes."""
     film = child["films"][list(FILMS).index(name)]
     assert 0.9 * film["said"] <= film["taken"] <= film["said"] + 32 * 2**20
 

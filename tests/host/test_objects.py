@@ -44,10 +44,8 @@ NAMELESS_GROUP = """<scene version="3.0.0">
 
 
 def test_shapes_of_a_group_need_no_ids():
-    """Rationale: all shapes without id are called "shape" in what a group holds; one that is not found is not
-    asked for its BSDF, and rays that meet it asked another one, or crashed. Expected: all are found, under
-    the names that ``mi.traverse`` gives them.
-    """
+    """All shapes without id are called "shape" in what a group holds. Expected: all are found, under the
+    names that ``mi.traverse`` gives them."""
     scene = mi.load_string(NAMELESS_GROUP)
     found = [s.bsdf().class_name() for s in all_shapes(scene) if s.class_name() != "Instance"]
     assert sorted(found) == [
@@ -86,9 +84,8 @@ print("alive")
 
 
 def test_scenes_that_the_cycle_collector_frees():
-    """Rationale: a scene in a reference cycle (a notebook's, or one in a traceback) goes whenever Python's
-    cycle collector runs. While a kernel was being recorded, Dr.Jit aborted the process. Expected: renders
-    beside such scenes end, however often the collector runs."""
+    """A scene in a reference cycle goes whenever Python's cycle collector runs. Expected: renders beside such
+    scenes end, however often the collector runs."""
     command = [sys.executable, "-c", FREED_MEANWHILE]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]

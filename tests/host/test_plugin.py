@@ -33,9 +33,8 @@ def answers(variant, **environment):
 
 
 def test_mitsuba_is_not_hurt_where_there_is_no_llvm():
-    """Rationale: Mitsuba imports the module in every process, whatever variant it runs. Expected: without a
-    library of LLVM scalar renders are what they were; who loads the plugin is told why it cannot be.
-    """
+    """Mitsuba imports the module in every process, whatever variant it runs. Expected: without a library of
+    LLVM scalar renders are what they were; who loads the plugin is told why it cannot be."""
     rendered, *words = answers("scalar_rgb", DRJIT_LIBLLVM_PATH="/no/such.so")
     assert rendered == "rendered"
     words = " ".join(words)
@@ -60,11 +59,9 @@ def written(scene, transformed):
 
 @pytest.mark.parametrize("transformed", [False, True], ids=["parsed", "transformed"])
 def test_a_dictionary_is_written_as_a_scene_file(transformed):
-    """Rationale: the parser writes an element's name by the type that its plugin has in scalar_rgb; bdpt was
-    not registered there ("Cannot determine XML tag name"). Expected: the image of the written file is that of
-    the dictionary. The tolerance is for `to_world`, which the writer splits into scale, rotations and
-    translation in single precision.
-    """
+    """The parser writes an element's name by the type that its plugin has in scalar_rgb. Expected: the image
+    of the written file is that of the dictionary. The tolerance is for `to_world`, which the writer splits
+    into scale, rotations and translation in single precision."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": 8, "height": 8}
     scene["integrator"] = {"type": "bdpt", "max_depth": 3, "light_paths": "1/4"}
@@ -103,8 +100,7 @@ PARAMETER_SETS = (
 @pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategies"])
 def test_parameters_are_written(changed):
     """Expected: an integrator read from the written file has the settings of the dictionary, none of which is
-    the default.
-    """
+    the default."""
     integrator = {"type": "bdpt", **changed}
     made, read = mi.load_dict(integrator), mi.load_string(written(integrator, False))
     assert read.settings == made.settings

@@ -37,9 +37,8 @@ def test_names_of_today():
 
 
 def test_names_of_3_10():
-    """Rationale: its tensors have a position for several vertices, by an index. Expected: the same numbers as
-    of 3.9, where each vertex has its own.
-    """
+    """Its tensors have a position for several vertices, by an index. Expected: the same numbers as of 3.9,
+    where each vertex has its own."""
     positions = np.arange(9, dtype=np.float32).reshape(3, 3)
     index, faces = [0, 1, 2, 1], [[0, 1, 2], [2, 3, 0]]
     parameters = {
@@ -101,8 +100,7 @@ def owner(*frames):
 
 def test_to_world_of_both_versions(of_3_10):
     """Expected: matrices of a parameter and of an endpoint are the same from 3.10's object as from 3.9's
-    value.
-    """
+    value."""
     expected = np.array(MOVED.matrix, dtype=np.float64)
     for one in (owner(), owner(MOVED)):
         assert introspection.matrix_of(one).tolist() == expected.tolist()
@@ -142,8 +140,7 @@ class MovingCamera(mi.Sensor):
 @pytest.mark.parametrize("moving", ["lamp", "eye", "view"])
 def test_animated_scenes_are_refused(of_3_10, moving):
     """Expected: a render of a scene with a lamp, a camera or a view of a batch that moves is refused, with
-    its name.
-    """
+    its name."""
     mi.register_emitter("moving_lamp", MovingLamp)
     mi.register_sensor("moving_camera", MovingCamera)
     scene = {"type": "scene", "eye": {"type": "perspective"}, "lamp": {"type": "point"}}
@@ -158,8 +155,7 @@ def test_animated_scenes_are_refused(of_3_10, moving):
 
 def test_all_that_may_move_is_looked_at(monkeypatch):
     """Expected: shapes, instances, shapes of groups, emitters and the sensor are asked for a transformation
-    with key frames.
-    """
+    with key frames."""
     group = {"type": "shapegroup", "id": "group", "box": {"type": "cube"}}
     parts = {
         "eye": {"type": "perspective"},

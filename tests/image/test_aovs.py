@@ -168,12 +168,10 @@ def bdpt(**parameters):
     ids=["plain", "hidden emitters", "thin lens, border", "crop, passes", "all layers", "depth 0"],
 )
 def test_features_are_those_of_aov(film_keys, sensor_keys, parameters, monkeypatch):
-    """Rationale: features are Mitsuba's own, at our camera samples. With a sampler that always gives the
-    same number both integrators see the same points, so that there is no noise. Expected: all kinds of
-    layers equal `aov`'s in every pixel for any film, sensor and parameter, except where its uv derivatives
-    are NaN, as its misses are; they follow the image and come before other layers. Tolerance: 1e-4 of a
-    layer's largest value (rays are set up in another order; sums in single precision).
-    """
+    """Features are Mitsuba's own, at our camera samples. Expected: all kinds of layers equal `aov`'s in every
+    pixel for any film, sensor and parameter, except where its uv derivatives are NaN, as its misses are; they
+    follow the image and come before other layers. Tolerance: 1e-4 of a layer's largest value (rays are set up
+    in another order; sums in single precision)."""
     mi.register_sampler("fixed", Fixed)
     monkeypatch.setattr(Points, "_draw", fixed(Points._draw))
     target = scene(sensor(film(**film_keys), sampler={"type": "fixed"}, **sensor_keys))
@@ -205,11 +203,10 @@ def region(target):
 
 
 def test_features_of_the_usual_points():
-    """Rationale: with points and splats as usual, features are the mean over the pixel. Expected: equal to
-    `aov` in every layer and tile of 2x2 pixels where `aov` has a value (see above). Statistic: Welch over
-    tiles with Sidak for all, 12 seeds a side, gaussian filter. (Layers share their samples, so that
-    p-values of all need not be uniform.)
-    """
+    """With points and splats as usual, features are the mean over the pixel. Expected: equal to `aov` in
+    every layer and tile of 2x2 pixels where `aov` has a value (see above). Statistic: Welch over tiles with
+    Sidak for all, 12 seeds a side, gaussian filter. (Layers share their samples, so that p-values of all need
+    not be uniform.)"""
     target = scene(sensor(film(rfilter="gaussian", pixel_format="rgba")))
 
     def tiles(method, seeds, spp):
@@ -243,10 +240,9 @@ def test_uv_derivatives_of_misses_are_zero():
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
 def test_denoisers_are_told_normals_of_the_world(kind):
-    """Rationale: Mitsuba's `aov` has normals of bump maps in the shading frame: (0, 0, 1) on every flat bump.
-    Expected: a map without any effect on a wall that is turned by 40 degrees has the wall's normal;
-    `sh_normal` of the bump map is still that of `aov`.
-    """
+    """Mitsuba's `aov` has normals of bump maps in the shading frame. Expected: a map without any effect on a
+    wall that is turned by 40 degrees has the wall's normal; `sh_normal` of the bump map is still that of
+    `aov`."""
     maps = {
         "bumpmap": {
             "type": "bumpmap",
@@ -301,10 +297,9 @@ def test_an_interrupted_render_keeps_features():
 
 
 def test_spectral_albedo():
-    """Rationale: a spectral film's wavelengths follow its bands, which says nothing about RGB. Expected:
-    the albedo on a `specfilm`, between its bands and its weight, and on an `hdrfilm` is `aov`'s on an
-    `hdrfilm`. Statistic: Welch over tiles of 5x6 pixels, 12 seeds a side.
-    """
+    """A spectral film's wavelengths follow its bands, which says nothing about RGB. Expected: the albedo on a
+    `specfilm`, between its bands and its weight, and on an `hdrfilm` is `aov`'s on an `hdrfilm`. Statistic:
+    Welch over tiles of 5x6 pixels, 12 seeds a side."""
     mi.set_variant("llvm_ad_spectral")
     bands = {"near": {"type": "spectrum", "value": [(600, 0.0), (700, 1.0), (800, 0.0)]}}
     aovs = "albedo:albedo,dd:depth"

@@ -31,13 +31,11 @@ def guides(scene) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_what_it_does_to_the_error(name):
-    """Rationale: previews are to look finished, whoever has rendered them.
-
-    Expected: in six scenes of 16 samples per pixel the relMSE of the denoised image is at most three quarters
-    of the raw one's, of `path` as of bdpt; the colours are those of a render without the parameter. (In
-    `veach_mis` the denoiser makes halos about a lamp whose radiance is a thousand times the image's mean:
-    docs/development/experiments.md, "Denoising".)
-    """
+    """Previews are to look finished, whoever has rendered them. Expected: in six scenes of 16 samples per
+    pixel the relMSE of the denoised image is at most three quarters of the raw one's, of `path` as of bdpt;
+    the colours are those of a render without the parameter. (In `veach_mis` the denoiser makes halos about a
+    lamp whose radiance is a thousand times the image's mean: docs/development/experiments.md,
+    "Denoising".)"""
     scene, depth = repository.load_scene(name, resolution=SIZE), repository.benchmark_depth(name)
     expected = repository.load_reference(name, SIZE, depth).image
     common = {"type": "bdpt", "max_depth": depth}
@@ -56,8 +54,7 @@ def test_what_it_does_to_the_error(name):
 
 def test_other_layers_are_untouched():
     """Expected: features, variance and strategies are where they were, with the same numbers; the layers come
-    after the features.
-    """
+    after the features."""
     scene = repository.load_scene("cornell_box", resolution=16)
     more = {"aovs": "albedo:albedo,dd:depth", "max_depth": 3}
     images = {}
@@ -107,8 +104,7 @@ def test_what_is_refused(monkeypatch):
 
 def test_the_command(tmp_path, capsys):
     """Expected: the EXR has the raw image and the denoised one, the PNG shows the latter; contradictions and
-    other integrators are refused.
-    """
+    other integrators are refused."""
     scene = str(Path(repository.SCENES) / "cornell_box.xml")
     arguments = ["render", scene, "--size", "32x32", "--spp", "4", "-o", str(tmp_path / "a.exr")]
     assert main([*arguments, "--denoise"]) == 0

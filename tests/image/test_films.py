@@ -101,11 +101,9 @@ def layer_names(scene):
     ids=["default", "gaussian crop", "mitchell border", "camera side, lanczos crop border"],
 )
 def test_bands_are_known(parameters, film):
-    """Rationale: a band is the integral of radiance times its response, for camera samples and splats, of
-    any filter and at any border, also outside the visible range. Expected: 50 and 100, the responses'
-    integrals, times r + r^2 + r^3 in every tile and along the border. Statistic: Student's t over 12
-    seeds with Sidak's correction; standard errors below 0.3 % of a tile and 0.06 % of the image.
-    """
+    """Expected: 50 and 100, the responses' integrals, times r + r^2 + r^3 in every tile and along the border.
+    Statistic: Student's t over 12 seeds with Sidak's correction; standard errors below 0.3 % of a tile and
+    0.06 % of the image."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(**film))
     images = renders(scene, integrator(max_depth=4, **parameters), range(12), 64)
@@ -130,10 +128,8 @@ COLOURFUL = {
     "film", [{}, {"rfilter": "gaussian", "sample_border": True, **CROP}], ids=["box", "gaussian crop border"]
 )
 def test_overlapping_bands_equal_path(film):
-    """Rationale: bands may overlap and differ in scale; lamp, walls and sky have colours of their own.
-    Expected: equal to `path` in every tile and band. Statistic: Welch over tiles, 12 seeds a side; the
-    image's mean is compared to some 1 %.
-    """
+    """Bands may overlap and differ in scale. Expected: equal to `path` in every tile and band. Statistic:
+    Welch over tiles, 12 seeds a side; the image's mean is compared to some 1 %."""
     mi.set_variant(SPECTRAL)
     scene = mi.load_dict(
         {
@@ -170,12 +166,9 @@ def test_overlapping_bands_equal_path(film):
 
 
 def test_unit_of_a_response_does_not_matter():
-    """Rationale: a response of 1 over 100 nm makes an image a hundred times as bright as the radiance,
-    and roulette on connections compares with the image. Expected: responses x 1000 give 1000 times the
-    image (1e-3: the threshold is rounded to powers of two) with the same rays, and roulette ends as many
-    of the connections as on an RGB film (a factor of two: the RGB of a spectrum of 1 is 0.9 to 1.2, and
-    powers of two).
-    """
+    """Expected: responses x 1000 give 1000 times the image (1e-3: the threshold is rounded to powers of two)
+    with the same rays, and roulette ends as many of the connections as on an RGB film (a factor of two: the
+    RGB of a spectrum of 1 is 0.9 to 1.2, and powers of two)."""
     mi.set_variant(SPECTRAL)
     loud = {name: [(x, 1000 * y) for x, y in values] for name, values in BANDS.items()}
     flat = {"type": "uniform", "value": 0.5}
@@ -192,11 +185,9 @@ def test_unit_of_a_response_does_not_matter():
 
 def test_variance_of_bands():
     """Expected: layers named after the bands, whose mean over 12 seeds is the spread of the pixels over
-    these; and `statistics["error"]` is the relMSE of bands in units of their responses. Tolerance: 20 %:
-    12 seeds give each pixel's variance to 43 %, 256 pixels, correlated by the filter, the mean to 4 %; the
-    error pairs the variance of one half of the replicates with the mean of the other.
-    Statistic: ratio of means.
-    """
+    these; and `statistics["error"]` is the relMSE of bands in units of their responses. Tolerance: 20 %: 12
+    seeds give each pixel's variance to 43 %, 256 pixels, correlated by the filter, the mean to 4 %; the error
+    pairs the variance of one half of the replicates with the mean of the other. Statistic: ratio of means."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(rfilter="gaussian"))
     bdpt = integrator(max_depth=3, layers="variance")
@@ -298,11 +289,9 @@ FORMATS = [
 
 @pytest.mark.parametrize(("pixel_format", "rfilter", "border", "hide", "sky"), FORMATS)
 def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
-    """Rationale: a crop window with a border, a format and hidden emitters all change what the film's
-    channels hold, and where splats count. Expected: each channel, alpha included, equals `path` in tiles
-    of 2x2 pixels of an 8x12 crop, which splats reach from outside. Statistic: Welch with Sidak, 24
-    seeds a side; the mean of each channel is compared to 2 %.
-    """
+    """Expected: each channel, alpha included, equals `path` in tiles of 2x2 pixels of an 8x12 crop, which
+    splats reach from outside. Statistic: Welch with Sidak, 24 seeds a side; the mean of each channel is
+    compared to 2 %."""
     keys = {"pixel_format": pixel_format, "rfilter": rfilter, "sample_border": border, **CROP}
     scene = lamps_and_sky(rgb_film(**keys), sky)
     a = renders(scene, integrator(max_depth=3, hide_emitters=hide, skip="none"), range(24), 64)

@@ -66,11 +66,9 @@ def drawn(rfilter, numbers=NUMBERS, shift=0.5):
 
 @pytest.mark.parametrize("rfilter", FILTERS)
 def test_the_mean_over_all_numbers_is_the_filter(rfilter):
-    """Rationale: a drawn pixel with a wrong weight, probability, or sign, or at a border, biases all images
-    with splats. Expected: over a grid of all random numbers, the mean of a splat is the splat to every pixel
-    of the filter's support, in a crop window too. Tolerance: a pixel's share of a grid of n cells per axis is
-    exact to 1 / n per axis; times what the drawn pixels receive, at most 0.6 (lanczos).
-    """
+    """Expected: over a grid of all random numbers, the mean of a splat is the splat to every pixel of the
+    filter's support, in a crop window too. Tolerance: a pixel's share of a grid of n cells per axis is exact
+    to 1 / n per axis; times what the drawn pixels receive, at most 0.6 (lanczos)."""
     expected = exact(rfilter)
     assert np.abs(expected).max() > 0.1
     rounding = 1e-5
@@ -183,9 +181,8 @@ def test_strips_of_camera_samples_are_apart(monkeypatch):
 
 
 def test_numbers_of_the_filter_are_uniform_and_independent(monkeypatch):
-    """Rationale: numbers that depend on where a splat falls, or on its vertex, distort the filter, and a flat
-    image does not show it. Expected: wherever in a pixel splats fall, their numbers are uniform in the
-    square. Statistic: chi-squared of 4 x 4 cells of the numbers in each of 4 x 4 cells of the pixel."""
+    """Expected: wherever in a pixel splats fall, their numbers are uniform in the square. Statistic:
+    chi-squared of 4 x 4 cells of the numbers in each of 4 x 4 cells of the pixel."""
     found = dr.zeros(mi.UInt32, 4**4)
     dr.make_opaque(found)
     original = Accumulator.put_light

@@ -27,10 +27,9 @@ def renders(integrator, target, seeds, spp):
 
 
 def test_weighted_variance_of_a_mean():
-    """Rationale: replicates may differ in size. Expected: images 1, 2, 4 of 1, 1, 2 samples have the
-    weighted mean 11/4 and sum n (x - mean)^2 = 49/16 + 9/16 + 2 * 25/16 = 27/4, hence the variance
-    27/4 / (4 * 2) of four samples, and 27/4 / (5 * 2) if a fifth belongs to no replicate.
-    """
+    """Replicates may differ in size. Expected: images 1, 2, 4 of 1, 1, 2 samples have the weighted mean 11/4
+    and sum n (x - mean)^2 = 49/16 + 9/16 + 2 * 25/16 = 27/4, hence the variance 27/4 / (4 * 2) of four
+    samples, and 27/4 / (5 * 2) if a fifth belongs to no replicate."""
     replicates, total, spp = Replicates(), 0.0, 0
     for x, n in ((1.0, 1), (2.0, 1), (4.0, 2)):
         total, spp = total + x * n, spp + n
@@ -50,10 +49,8 @@ def replicates(images, n):
 
 
 def test_the_estimated_error_sees_fireflies():
-    """Rationale: divided by the square of a mean that has the same firefly, no value could count for more
-    than 1, and renders would stop however wild they are. A hundred pixels of 1, and a ninth replicate's worth
-    of 1,000 in one of eight images of one of them. Expected: relMSE about 125^2 / 100, of which the
-    estimate sees half, in the half that has it, times 8 / 4 for its mean; within 2 % (epsilon moves)."""
+    """Expected: relMSE about 125^2 / 100, of which the estimate sees half, in the half that has it, times 8 /
+    4 for its mean; within 2 % (epsilon moves)."""
     images = np.ones((8, 100))
     images[3, 7] = 1000
     error = replicates(images, 4).error(32, 1.0)
@@ -68,10 +65,9 @@ def test_the_estimated_error_of_a_black_image():
 
 @pytest.mark.parametrize(("shape", "most"), [(4.0, 1.03), (0.5, 2.0)])
 def test_the_estimated_error_is_that_of_skewed_images(shape, most):
-    """Expected: for images whose pixels have a gamma distribution (mean 1, variance 1 / (2 ``shape``) of
-    each of 8 replicates) the estimate is the relMSE in the mean where that is 1.6 % (what is left, of the
-    second order in the 3 % variance of a half, is below 3 %), and above it, up to twice, where it is 12
-    %."""
+    """Expected: for images whose pixels have a gamma distribution (mean 1, variance 1 / (2 ``shape``) of each
+    of 8 replicates) the estimate is the relMSE in the mean where that is 1.6 % (what is left, of the second
+    order in the 3 % variance of a half, is below 3 %), and above it, up to twice, where it is 12 %."""
     images = np.random.default_rng(1).gamma(2 * shape, 1 / (2 * shape), (8, 100_000))
     truth = ((images.mean(0) - 1) ** 2).mean() / 1.01
     assert 0.97 * truth < replicates(images, 4).error(32, 1.0) < most * truth
@@ -86,12 +82,11 @@ def test_the_estimated_error_is_that_of_skewed_images(shape, most):
     ],
 )
 def test_variance_is_the_spread_over_seeds(rfilter, parameters):
-    """Rationale: error bars are worth what they predict. Expected: the estimate, averaged over 32
-    seeds and the pixels, is the variance of the pixels over these seeds, splats included; both
-    relative to the pixels' squared mean, so that the few at the lamp's rim do not decide alone.
-    Tolerance: 10 %: 32 seeds give each pixel's variance to 25 %, 144 pixels of three partly correlated
-    channels give the mean to 3 %. Statistic: ratio of means.
-    """
+    """Error bars are worth what they predict. Expected: the estimate, averaged over 32 seeds and the pixels,
+    is the variance of the pixels over these seeds, splats included; both relative to the pixels' squared
+    mean, so that the few at the lamp's rim do not decide alone. Tolerance: 10 %: 32 seeds give each pixel's
+    variance to 25 %, 144 pixels of three partly correlated channels give the mean to 3 %. Statistic: ratio of
+    means."""
     target = scene(rfilter)
     integrator = bdpt(**parameters)
     assert integrator.aov_names() == ["variance.R", "variance.G", "variance.B"]
@@ -103,9 +98,8 @@ def test_variance_is_the_spread_over_seeds(rfilter, parameters):
 
 
 def test_error_is_the_relative_error_of_the_image():
-    """Expected: statistics["error"], averaged over 32 seeds, is the relMSE against a long render.
-    Tolerance: 15 %: the estimate divides by the noisy mean (some 5 % at this error), the rest as above.
-    """
+    """Expected: statistics["error"], averaged over 32 seeds, is the relMSE against a long render. Tolerance:
+    15 %: the estimate divides by the noisy mean (some 5 % at this error), the rest as above."""
     target, integrator = scene(), bdpt()
     errors, images = [], []
     for seed in range(32):
@@ -117,9 +111,8 @@ def test_error_is_the_relative_error_of_the_image():
 
 
 def test_the_image_is_as_good_with_it():
-    """Rationale: eight short point sequences instead of one. Expected: the mean is that of a render
-    without `variance` (2 %, four standard errors), and all samples count.
-    """
+    """Eight short point sequences instead of one. Expected: the mean is that of a render without `variance`
+    (2 %, four standard errors), and all samples count."""
     target = scene()
     integrator = bdpt()
     a = renders(integrator, target, range(8), 100)[..., :3]
@@ -130,9 +123,8 @@ def test_the_image_is_as_good_with_it():
 
 
 def test_schedule_of_replicates():
-    """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass
-    of all with one sample for the scale of roulette; without `variance` one part.
-    """
+    """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass of all
+    with one sample for the scale of roulette; without `variance` one part."""
     settings = bdpt().settings
     steps = schedule.schedule(19, 19, settings, True)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
@@ -142,9 +134,8 @@ def test_schedule_of_replicates():
 
 
 def test_launches_on_a_gpu(monkeypatch):
-    """Rationale: a GPU traces a pass of 2^21 camera subpaths in less time than Python records it. Expected:
-    the passes of a large image have eight times as many samples there.
-    """
+    """A GPU traces a pass of 2^21 camera subpaths in less time than Python records it. Expected: the passes
+    of a large image have eight times as many samples there."""
     settings = bdpt(layers="").settings
     camera = SimpleNamespace(region=SimpleNamespace(size=(1024, 1024)))
     assert schedule.pass_sizes(64, schedule.longest_pass(camera, settings), False) == [2] * 32

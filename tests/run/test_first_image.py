@@ -46,13 +46,9 @@ def functions(kernel: str) -> int:
 
 
 def test_functions_of_materials(kernels):
-    """Rationale: compiling the functions of BSDFs is most of a room's first image; `path` has one for each
-    BSDF of the process. A kernel that had one for each place that asks, and those of BSDFs that no ray meets
-    (inside of others, in other scenes), took 4 to 7 times as long as `path`'s to compile.
-
-    Expected: one for samples and one for evaluations of each BSDF that rays may meet, the lamp's included,
-    at most, also beside another scene; some differ in numbers only and share theirs.
-    """
+    """Compiling the functions of BSDFs is most of a room's first image. Expected: one for samples and one for
+    evaluations of each BSDF that rays may meet, the lamp's included, at most, also beside another scene; some
+    differ in numbers only and share theirs."""
     other = mi.load_dict(room(len(KINDS), 16))
     scene = mi.load_dict(room(len(KINDS), 16))
     render(scene)
@@ -63,10 +59,8 @@ def test_functions_of_materials(kernels):
 
 
 def test_calls_of_few_questions_and_of_all(monkeypatch):
-    """Rationale: few BSDFs are asked everything in one call, many in several, see `bsdf.MANY`. Expected: the
-    same image, up to rounding: where it decides otherwise about a path, a pixel differs; two in a hundred
-    may.
-    """
+    """Few BSDFs are asked everything in one call, many in several, see `bsdf.MANY`. Expected: the same image,
+    up to rounding: where it decides otherwise about a path, a pixel differs; two in a hundred may."""
     scene = mi.load_dict(room(len(KINDS), 24))
     images = []
     for many in (1, 1000):
@@ -114,9 +108,8 @@ def test_lit_rooms_are_decided(light):
     ("spp", "expected"), [(1, [1]), (16, [16]), (64, [1, 63])], ids=["one sample", "an edit", "longer"]
 )
 def test_a_short_render_has_one_pass(spp, expected):
-    """Rationale: a first pass of one sample, from which roulette has its scale, has everything recorded a
-    second time, which takes longer than what roulette saves in a short render. Expected: one pass in a render
-    of 64^2 pixels and 16 samples each, as after an edit, without a pilot; two where the render is longer."""
+    """Expected: one pass in a render of 64^2 pixels and 16 samples each, as after an edit, without a pilot;
+    two where the render is longer."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": 64, "height": 64}
     scene, integrator = mi.load_dict(scene), mi.load_dict({"type": "bdpt", "skip": "impossible"})
@@ -134,10 +127,9 @@ FROSTED = GLASS | {"bsdf": {"type": "roughdielectric", "alpha": 0.05}}
     ids=["diffuse", "glass", "frosted glass"],
 )
 def test_an_edit_of_a_small_render_asks_no_pilot(monkeypatch, more, least):
-    """Rationale: after each edit a render of 65,536 samples ran a pilot that took twice as long as itself;
-    where glass focuses light its choice has a third of the noise. Expected: 64^2 pixels of 16 samples run
-    none in a diffuse room, of 64 samples they do; of 16 with a glass ball, also a frosted one (near-specular
-    scenes have 0.15 to 0.6 times the time times trimmed error with it)."""
+    """After each edit a render of 65,536 samples ran a pilot that took twice as long as itself. Expected:
+    64^2 pixels of 16 samples run none in a diffuse room, of 64 samples they do; of 16 with a glass ball, also
+    a frosted one (near-specular scenes have 0.15 to 0.6 times the time times trimmed error with it)."""
     for name in ("FOCUSED_SAMPLES", "LEAST_SAMPLES"):
         monkeypatch.setattr(budget, name, getattr(short_pilots, name))
     scene = mi.cornell_box() | more
@@ -188,10 +180,9 @@ def test_rooms_of_many_bsdfs_ask_a_pilot():
 
 
 def test_lanes_take_turns_by_kinds_of_bsdfs():
-    """Rationale: lanes whose BSDFs have different functions take turns, those of one kind do not. By the
-    number of BSDFs a connection seemed to cost 1.3 times what it does in a room of 12, and path tracing alone
-    was chosen, at half the efficiency. Expected: with 16 further diffuse BSDFs `cornell_box` is rendered as
-    without them, and the pilot's costs are the same to 5 % (the spheres take room)."""
+    """Lanes whose BSDFs have different functions take turns, those of one kind do not. Expected: with 16
+    further diffuse BSDFs `cornell_box` is rendered as without them, and the pilot's costs are the same to 5 %
+    (the spheres take room)."""
     tables = []
     for count in (0, 16):
         scene = mi.cornell_box()
@@ -209,9 +200,8 @@ def test_lanes_take_turns_by_kinds_of_bsdfs():
 
 
 def test_kinds_of_bsdfs_share_functions(kernels):
-    """Rationale: how long a kernel compiles depends on the number of functions in it, and BSDFs that differ
-    in numbers alone share theirs. Expected: a room of twice as many BSDFs of the same kinds is as many kinds,
-    and has at most a tenth more functions."""
+    """Expected: a room of twice as many BSDFs of the same kinds is as many kinds, and has at most a tenth
+    more functions."""
     counts = []
     for materials in (len(KINDS), 2 * len(KINDS)):
         scene = mi.load_dict(room(materials, 16))
@@ -224,10 +214,7 @@ def test_kinds_of_bsdfs_share_functions(kernels):
 
 
 def test_bitmaps_do_not_cut_kernels(kernels):
-    """Rationale: what a bitmap is turned into when it is first asked was computed while the first pass was
-    being recorded; that ran what there was of it, and the rest and the next pass were two kernels to compile,
-    in rooms two seconds of a short render's four. Expected: of a scene that was just loaded all passes run
-    the same kernel."""
+    """Expected: of a scene that was just loaded all passes run the same kernel."""
     scene = mi.load_dict(room(2, 16))
     integrator = internals.bdpt(max_depth=3, decisions=[], spp_per_pass=2)
     integrator.render(scene, spp=4)
@@ -237,9 +224,8 @@ def test_bitmaps_do_not_cut_kernels(kernels):
 
 
 def test_an_edited_bitmap_is_evaluated_once():
-    """Rationale: an edit multiplies a bitmap by a number, which is part of each kernel that reads the result:
-    two were compiled anew in each render of a loop of edits, 18 ms. Expected: once a render is prepared, the
-    result is an evaluated array."""
+    """An edit multiplies a bitmap by a number, which is part of each kernel that reads the result. Expected:
+    once a render is prepared, the result is an evaluated array."""
     scene = mi.cornell_box()
     picture = mi.Bitmap(np.full((8, 8, 3), 0.5, dtype=np.float32))
     scene["floor"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": picture}}
@@ -254,9 +240,7 @@ def test_an_edited_bitmap_is_evaluated_once():
 
 
 def test_decisions_share_kernels(kernels):
-    """Rationale: pilots of other scenes, and longer ones, choose other numbers of light subpaths and
-    coefficients, and compiling a kernel anew takes as long as a preview. Expected: one kernel for all of
-    them, and one for each kind of connections."""
+    """Expected: one kernel for all of them, and one for each kind of connections."""
     scene = mi.load_dict(room(2, 16))
     ways = [
         (1, 1 / 64, "none"),

@@ -36,11 +36,10 @@ def bdpt(**parameters):
     "parameters", [{"skip": "none"}, {"layers": "variance", "aovs": "dd:depth"}], ids=str
 )
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
-    """Rationale: what a lane carries in media (channels, tracking, thinned vertices) belongs to no
-    snapshot, and must start anew the same. Expected: image, layers and counts, those of media included,
-    of a render that was stopped and went on in a new integrator are those of the render that never
-    stopped, up to the order of sums; and so are those of a render that replays its decisions.
-    """
+    """What a lane carries in media belongs to no snapshot, and must start anew the same. Expected: image,
+    layers and counts, those of media included, of a render that was stopped and went on in a new integrator
+    are those of the render that never stopped, up to the order of sums; and so are those of a render that
+    replays its decisions."""
     target, whole = misty(), bdpt(**parameters)
     expected = np.array(whole.render(target, seed=3, spp=SPP))
     start = stopped(bdpt(**parameters), misty(), 2, seed=3, spp=SPP)
@@ -58,9 +57,8 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
 
 
 def test_variance_and_target_error():
-    """Expected: the stated variances of pixels are those over 10 seeds, in the mean over the image within
-    a fifth (2,000 degrees of freedom, but of pixels that differ), and a render until an error ends at it.
-    """
+    """Expected: the stated variances of pixels are those over 10 seeds, in the mean over the image within a
+    fifth (2,000 degrees of freedom, but of pixels that differ), and a render until an error ends at it."""
     target = misty()
     images = [np.array(bdpt(layers="variance").render(target, seed=seed, spp=64)) for seed in range(10)]
     found = np.var([image[..., :3] for image in images], axis=0, ddof=1).mean()
@@ -72,10 +70,9 @@ def test_variance_and_target_error():
 
 
 def test_features_are_those_of_aov():
-    """Expected: depth, position and albedo behind fog and null boundaries are what Mitsuba's ``aov``
-    gives with as many samples, to 2 % of their range in six pixels of seven (its samples are others,
-    which tells at edges), and the image beside them is that without.
-    """
+    """Expected: depth, position and albedo behind fog and null boundaries are what Mitsuba's ``aov`` gives
+    with as many samples, to 2 % of their range in six pixels of seven (its samples are others, which tells at
+    edges), and the image beside them is that without."""
     aovs = "dd:depth,pp:position,aa:albedo,nn:sh_normal"
     target = misty()
     ours = np.array(bdpt(aovs=aovs).render(target, seed=1, spp=64))
@@ -92,10 +89,9 @@ def test_features_are_those_of_aov():
 
 
 def test_an_edited_medium_is_asked_anew():
-    """Rationale: pilots and what a scene is like are remembered until something is edited. Expected:
-    after sigma_t of the ball has changed the pilot runs again, the image is that of a scene loaded with
-    the new number, and not the one before.
-    """
+    """Pilots and what a scene is like are remembered until something is edited. Expected: after sigma_t of
+    the ball has changed the pilot runs again, the image is that of a scene loaded with the new number, and
+    not the one before."""
 
     def ball(sigma):
         return mi.load_dict(parts.room(light=parts.point(), ball=parts.ball(interior=parts.fog(sigma, 0.9))))

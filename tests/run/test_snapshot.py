@@ -40,8 +40,7 @@ def bdpt(**parameters):
 )
 def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
     """Expected: the image, its layers and the counts of a render that was stopped and went on in a new
-    integrator are those of the render that never stopped. Tolerance: the rounding of atomic sums.
-    """
+    integrator are those of the render that never stopped. Tolerance: the rounding of atomic sums."""
     target = scene(rfilter)
     whole = bdpt(**parameters)
     expected = np.array(whole.render(target, seed=3, spp=64))
@@ -60,9 +59,7 @@ def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
     "size, samples, layers", [(16, 256, ""), (5000, 20000, ""), (5000, 80000, "variance")]
 )
 def test_few_pixels_go_on(size, samples, layers):
-    """Rationale: a film of few pixels has a light subpath for each camera subpath, which no decision says,
-    and in long passes (of ``size`` samples) several sums for each pixel. Expected: it has them too when it
-    goes on, and when its decisions (none) are replayed."""
+    """Expected: it has them too when it goes on, and when its decisions (none) are replayed."""
     way = {"spp_per_pass": size, "layers": layers}
     target, whole = scene(size=4), bdpt(**way)
     expected = np.array(whole.render(target, seed=1, spp=samples))
@@ -78,8 +75,7 @@ def test_few_pixels_go_on(size, samples, layers):
 @pytest.mark.parametrize("blind", [False, True])
 def test_pilots_and_decisions_go_on(monkeypatch, blind):
     """Expected: a render stopped after 41 spp or so goes on as the uninterrupted one, its decision included;
-    also where the pilot is ``blind`` and decides nothing, so that a small pass comes first.
-    """
+    also where the pilot is ``blind`` and decides nothing, so that a small pass comes first."""
     monkeypatch.setattr(budget, "LEAST_SAMPLES", 0)
     if blind:
         monkeypatch.setattr(choice, "choose", lambda *of: [])
@@ -110,11 +106,10 @@ def test_a_snapshot_of_the_last_pass_traces_nothing():
 
 @pytest.mark.parametrize(("rfilter", "tolerance"), [("box", 1e-5), ("gaussian", 0.02)])
 def test_joined_renders_are_their_mean(rfilter, tolerance):
-    """Rationale: renders of seeds of their own, made anywhere, add up by their raw sums. Expected: the
-    mean of the three images, weighted by their samples. Tolerance: the mean relative difference is
-    rounding with the box filter; with others the sums of filter weights differ by some per cent from
-    render to render, which the mean of images does not know.
-    """
+    """Renders of seeds of their own, made anywhere, add up by their raw sums. Expected: the mean of the three
+    images, weighted by their samples. Tolerance: the mean relative difference is rounding with the box
+    filter; with others the sums of filter weights differ by some per cent from render to render, which the
+    mean of images does not know."""
     target, parts = scene(rfilter), ((5, 8), (6, 16), (7, 8))
     snapshots = [part(target, seed, spp) for seed, spp in parts]
     images = [np.array(bdpt(skip="impossible").render(target, seed=seed, spp=spp)) for seed, spp in parts]
@@ -133,9 +128,8 @@ def part(target, seed: int, spp: int, **parameters) -> Snapshot:
 
 
 def test_joined_variance_is_that_of_all_replicates():
-    """Expected: the variance that follows from 8 replicates of one render and 8 of another is that of the
-    16 images, whose weighted mean and squares are taken here in one go; the joined order does not matter.
-    """
+    """Expected: the variance that follows from 8 replicates of one render and 8 of another is that of the 16
+    images, whose weighted mean and squares are taken here in one go; the joined order does not matter."""
     target = scene()
     a, b = (part(target, seed, spp, layers="variance") for seed, spp in ((1, 16), (2, 32)))
     image = np.array(bdpt(skip="impossible", layers="variance").assemble(a.joined(b), target))
@@ -187,9 +181,8 @@ def test_another_format_is_refused():
 
 
 def test_the_format_has_a_new_number_where_names_change():
-    """Rationale: fields of pilots were renamed under one number, and a checkpoint of the version before was
-    said to be damaged. Expected: a checkpoint with a pilot has the names, and rows of the sizes, of the
-    format's number; if not, increase `snapshot.FORMAT`, and write down both here."""
+    """Expected: a checkpoint with a pilot has the names, and rows of the sizes, of the format's number; if
+    not, increase `snapshot.FORMAT`, and write down both here."""
     start = stopped(bdpt(), scene(size=32), 1, spp=64)
     with np.load(io.BytesIO(start.to_bytes())) as file:
         sizes = {name: file[name].shape[1:] for name in sorted(file.files)}

@@ -105,10 +105,9 @@ def test_nothing_is_said_of_sound_scenes(name):
 def test_panes_thinner_than_the_ray_offset(x, share):
     """Paths to the sky through both faces of a pane have three edges, through a single face two: with
     max_depth=2 the image has the light that the pane reflects, 4 % of it from the front (a mean of 0.08 and
-    less with that of the back), or all of it, where a face is lost.
-
-    Expected: the latter, and a warning, for panes of less than a ray offset at their place, seen from nearby;
-    neither for the thicker ones (at the origin the ray's length of 3 makes the offset: 4 times that)."""
+    less with that of the back), or all of it, where a face is lost. Expected: the latter, and a warning, for
+    panes of less than a ray offset at their place, seen from nearby; neither for the thicker ones (at the
+    origin the ray's length of 3 makes the offset: 4 times that)."""
     thickness = share * 32 * 2**-24 * (x + 1) * (1 if x else 4)
     image, texts, _ = rendered(pane(x, thickness), x=x)
     assert (image.mean() > 0.4) == (share < 1)

@@ -91,9 +91,8 @@ LACKING = {
 
 @pytest.mark.parametrize("name", LACKING)
 def test_what_a_sensor_lacks_is_said(name):
-    """Rationale: with such sensors Mitsuba ends the process, or renders black, NaN or what is not asked for.
-    Expected: an error that names the sensor, what it lacks and what to do.
-    """
+    """With such sensors Mitsuba ends the process, or renders black, NaN or what is not asked for. Expected:
+    an error that names the sensor, what it lacks and what to do."""
     make, message = LACKING[name]
     scene = mi.load_dict(
         {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}, "eye": make()}
@@ -103,10 +102,9 @@ def test_what_a_sensor_lacks_is_said(name):
 
 
 def test_a_distant_sensor_beside_the_scene_is_refused():
-    """Rationale: Mitsuba tells the sensors of a scene where it is; others start their rays at the origin.
-    Expected: said in words; as a sensor of the scene, also in a batch, it sees the scene from outside: the
-    ball, of reflectance 1/2 under a sky of radiance 1, in both pixels.
-    """
+    """Mitsuba tells the sensors of a scene where it is. Expected: said in words; as a sensor of the scene,
+    also in a batch, it sees the scene from outside: the ball, of reflectance 1/2 under a sky of radiance 1,
+    in both pixels."""
     parts = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
     loose = mi.load_dict(distant(target=[0, 0, 0]))
     with pytest.raises(UnsupportedError, match="not one of the scene's own sensors"):

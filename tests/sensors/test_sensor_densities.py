@@ -69,10 +69,9 @@ def column(x):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_rays_are_those_of_mitsuba(name):
-    """Rationale: camera rays are made here. Expected: origin, direction and weight of Mitsuba's for the same
-    film position and aperture sample, within 1e-5 of the scene's scale (float32, some ten operations; 2e-4
-    for meters, from whose shapes its offsets and ours differ), and a camera's length.
-    """
+    """Camera rays are made here. Expected: origin, direction and weight of Mitsuba's for the same film
+    position and aperture sample, within 1e-5 of the scene's scale (float32, some ten operations; 2e-4 for
+    meters, from whose shapes its offsets and ours differ), and a camera's length."""
     _, sensor, camera, u = prepared(name)
     start = start_of(camera, u)
     uv = camera.region.to_uv(start.position)
@@ -87,12 +86,10 @@ def test_rays_are_those_of_mitsuba(name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_join_is_the_ray_back(name):
-    """Rationale: t = 1 makes the paths that camera subpaths make, with what these state.
-
-    Expected: a point on a camera ray, joined with the sensor point of that ray, has its film position
-    (where the film has positions) within 1e-3 pixels (cameras: 1e-4, float32 at some 30 pixels, times ten),
-    its direction and density within 1e-3.
-    """
+    """T = 1 makes the paths that camera subpaths make, with what these state. Expected: a point on a camera
+    ray, joined with the sensor point of that ray, has its film position (where the film has positions) within
+    1e-3 pixels (cameras: 1e-4, float32 at some 30 pixels, times ten), its direction and density within
+    1e-3."""
     _, _, camera, u = prepared(name)
     start = start_of(camera, u)
     p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
@@ -114,12 +111,9 @@ def test_a_join_is_the_ray_back(name):
 
 @pytest.mark.parametrize("name", [name for name in CAMERAS if "orthographic" not in name])
 def test_splats_do_not_depend_on_where_the_camera_stands(name):
-    """Rationale: where a light vertex is seen follows from its direction from the lens point; taken back from
-    world to camera coordinates, a lens point 1e4 units away is off by up to 1e-3, and so were splats, of
-    pinholes too: by 2e-2 pixels here, more in larger images. Expected: the direction of a camera ray, joined
-    with the same point of the lens, gives back the ray's film position within 1e-4 pixels, as at the origin.
-    Eight places, since in some of them rounding errors cancel.
-    """
+    """Where a light vertex is seen follows from its direction from the lens point. Expected: the direction of
+    a camera ray, joined with the same point of the lens, gives back the ray's film position within 1e-4
+    pixels, as at the origin. Eight places, since in some of them rounding errors cancel."""
     rng = np.random.default_rng(6)
     for shift in rng.uniform(-1e4, 1e4, (8, 3)):
         part = CAMERAS[name]()
@@ -152,12 +146,10 @@ def test_nothing_is_joined_beyond_the_far_plane(name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_importance_integrates_to_the_weight(name):
-    """Rationale: what a sensor makes of uniform radiance 1 does not depend on the strategy.
-
-    Expected: the integral of the importance is 1, for a meter pi: over directions, the points being far
-    away and uniform about the sensor; of parallel sensors over a square across their direction.
-    Tolerance: five standard errors, which are below 3 %, plus 2e-3 for points that are not at infinity.
-    """
+    """What a sensor makes of uniform radiance 1 does not depend on the strategy. Expected: the integral of
+    the importance is 1, for a meter pi: over directions, the points being far away and uniform about the
+    sensor; of parallel sensors over a square across their direction. Tolerance: five standard errors, which
+    are below 3 %, plus 2e-3 for points that are not at infinity."""
     _, sensor, camera, u = prepared(name)
     lens, choice = mi.Point2f(u[2], u[3]), mi.Point2f(u[6], u[7])
     if name in PARALLEL:
@@ -189,14 +181,11 @@ def test_importance_integrates_to_the_weight(name):
 
 @pytest.mark.parametrize("name", AREA)
 def test_an_arrival_is_a_start_in_reverse(name):
-    """Rationale: t = 0 makes the paths that camera subpaths make, from the other end.
-
-    Expected: light that comes along a camera ray arrives at its film position (a meter: anywhere on its
-    pixel), and importance times cosine over both densities is the camera subpath's weight; the
-    densities are those of the start, which also states cos / (both densities), and of the join, which states
-    cos / (squared distance, density of z_0). Tolerance: 1e-2, twice what offsets from a meter's shape (2e-4)
-    are of a cosine of 0.05.
-    """
+    """T = 0 makes the paths that camera subpaths make, from the other end. Expected: light that comes along a
+    camera ray arrives at its film position (a meter: anywhere on its pixel), and importance times cosine over
+    both densities is the camera subpath's weight; the densities are those of the start, which also states cos
+    / (both densities), and of the join, which states cos / (squared distance, density of z_0). Tolerance:
+    1e-2, twice what offsets from a meter's shape (2e-4) are of a cosine of 0.05."""
     scene, _, camera, u = prepared(name)
     start = start_of(camera, u)
     p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
@@ -228,9 +217,8 @@ def test_an_arrival_is_a_start_in_reverse(name):
 
 @pytest.mark.parametrize("name", ["distant, point", "distant, shape", "radiancemeter", "own fisheye"])
 def test_sensors_by_their_rays_alone(name):
-    """Rationale: of these nothing but Mitsuba's camera rays is used. Expected: the start is that ray with its
-    weight, the sensor says that it cannot be joined and that it has no area, and why.
-    """
+    """Of these nothing but Mitsuba's camera rays is used. Expected: the start is that ray with its weight,
+    the sensor says that it cannot be joined and that it has no area, and why."""
     parts.register_plugins()
     scene = mi.load_dict(parts.open_scene(parts.SENSORS[name]()))
     sensor = scene.sensors()[0]
