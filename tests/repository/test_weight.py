@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 42548}
+OUTSIDE = {"scripts": 2931, "tests": 42050}
 MOST_WORDS = 29086
 
 
