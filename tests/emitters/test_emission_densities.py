@@ -400,17 +400,6 @@ CORNER = """<scene version="3.0.0">
 </scene>"""
 
 
-def test_rectangles_that_mitsuba_merges():
-    """Mitsuba makes one mesh of rectangles of one BSDF, and the box of it is not valid. Expected: the disk
-    covers what it covers where nothing is merged."""
-    merged, apart = (mi.load_string(CORNER, optimize=on) for on in (True, False))
-    assert len(merged.shapes()) == 2 and len(apart.shapes()) == 3
-    assert merged.bbox().bounding_sphere().radius < 0.2
-    found, expected = (emitter_disks.Disks(scene).scene for scene in (merged, apart))
-    np.testing.assert_allclose(np.array(found.center), np.array(expected.center), atol=1e-6)
-    assert float(found.radius[0]) == pytest.approx(float(expected.radius[0]), rel=1e-6)
-
-
 def room_of_rectangles():
     """A room of five rectangles of one BSDF, open to a white sky, with a small cube on its floor."""
     grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}

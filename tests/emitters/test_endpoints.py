@@ -481,12 +481,6 @@ def before_the_sky(lamp):
     return room(sensor, lamp=EMITTERS[lamp](), glass=glass)
 
 
-def on_film(**keys):
-    return lambda: room(perspective(**keys), lamp=EMITTERS["sphere"]())
-
-
-FILTERS = ("box", "tent", "gaussian", "mitchell", "catmullrom", "lanczos")
-FORMATS = ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
 # Scene, and arguments of `same_image`: widest confidence interval, parameters.
 IMAGES = {
     "several emitters": (with_unequal_lamps, {"relative": 0.05, "spp": (256, 512), "max_depth": 3}),
@@ -499,18 +493,6 @@ IMAGES |= {
         {"relative": 0.03, "hide_emitters": hide, "max_depth": 3, "spp": (128, 1024)},
     )
     for lamp, hide in itertools.product(("sphere", "constant"), (False, True))
-}
-IMAGES |= {
-    f"filter {name}{', border' * border}": (
-        on_film(rfilter=name, sample_border=border),
-        {"relative": 0.04, "max_depth": 3, "size": 2},
-    )
-    for name, border in itertools.product(FILTERS, (False, True))
-    if not border or name not in ("tent", "catmullrom")
-}
-IMAGES |= {
-    f"format {name}": (on_film(pixel_format=name), {"relative": 0.03, "spp": (256, 512), "max_depth": 2})
-    for name in FORMATS
 }
 
 

@@ -147,27 +147,6 @@ def test_each_entry_counts(kind, entries):
     assert len(found) == 5 and _checksum(made(values)) in found
 
 
-def test_edits_of_inner_texels_are_seen(traced):
-    """Expected: another pilot after an edit of inner texels; none after one back and forth, since what was
-    found of that bitmap is remembered."""
-    data = np.full((8, 8, 3), 0.05, dtype=np.float32)
-    texture = {"type": "bitmap", "data": mi.TensorXf(data), "raw": True, "filter_type": "nearest"}
-    lamp = {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([0, 0.9, 0]).rotate([1, 0, 0], 90).scale(0.1),
-        "emitter": {"type": "area", "radiance": texture},
-    }
-    scene, integrator = cornell(lamp=lamp), bdpt()
-    integrator.render(scene, spp=SPP)
-    parameters = mi.traverse(scene)
-    for value, pilots in ((20000, 2), (0.05, 2), (20000, 2), (30000, 3)):
-        data[2:6, 2:6] = value
-        parameters["lamp.emitter.radiance.data"] = mi.TensorXf(data)
-        parameters.update()
-        integrator.render(scene, spp=SPP)
-        assert len(traced) == pilots
-
-
 def test_edits_in_place_are_seen():
     mesh = bumpy()
     parameters, before = mi.traverse(mesh), State.of([mesh])

@@ -63,74 +63,44 @@ def film(kind="hdrfilm", **keys):
 
 
 def sensor(film, **keys):
-    to_world = mi.ScalarTransform4f().look_at([1, 1.5, 4], [0, 0.4, 0], [0, 1, 0])
+    to_world = T().look_at([1, 1.5, 4], [0, 0.4, 0], [0, 1, 0])
     return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film} | keys
+
+
+def textured(raw=True):
+    return {"type": "bitmap", "bitmap": bitmap(), "raw": raw}
 
 
 def bumps():
     """A small wall with bumps, whose normals are not flipped to the side from which it is seen."""
-    bump = {"type": "bumpmap", "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True}, "scale": 20.0}
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f().translate([0.2, 0.4, 1.5]).rotate([0, 1, 0], -70).scale(0.3),
-        "bsdf": bump | {"flip_invalid_normals": False, "bsdf": {"type": "diffuse"}},
-    }
+    bump = {"type": "bumpmap", "texture": textured(), "scale": 20.0, "flip_invalid_normals": False}
+    to_world = T().translate([0.2, 0.4, 1.5]).rotate([0, 1, 0], -70).scale(0.3)
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bump | {"bsdf": {"type": "diffuse"}}}
 
 
 def scene(sensor):
     """Textured, bumpy, hidden and glowing things before nothing."""
-    t = mi.ScalarTransform4f()
-    texture = {"type": "bitmap", "bitmap": bitmap(), "raw": mi.is_rgb}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor,
-            "floor": {
-                "type": "rectangle",
-                "to_world": t.rotate([1, 0, 0], -90).scale(2),
-                "bsdf": {"type": "diffuse", "reflectance": texture},
-            },
-            "ball": {
-                "type": "sphere",
-                "center": [-0.5, 0.6, 0],
-                "radius": 0.6,
-                "bsdf": {
-                    "type": "bumpmap",
-                    "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
-                    "scale": 2.0,
-                    "bsdf": {"type": "plastic", "diffuse_reflectance": 0.3},
-                },
-            },
-            "box": {
-                "type": "cube",
-                "to_world": t.translate([0.8, 0.3, 0.3]).rotate([0, 1, 0], 30).scale(0.3),
-                "bsdf": {
-                    "type": "normalmap",
-                    "normalmap": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
-                    "flip_invalid_normals": False,
-                    "bsdf": {"type": "conductor"},
-                },
-            },
-            "bumps": bumps(),
-            "more bumps": {"type": "shapegroup", "id": "more bumps", "chip": bumps()},
-            "copy": {
-                "type": "instance",
-                "to_world": t.translate([1, 0.5, -1.5]).rotate([0, 1, 0], 40),
-                "more bumps": {"type": "ref", "id": "more bumps"},
-            },
-            "back": {
-                "type": "disk",
-                "to_world": t.translate([-1, 1, -1]).scale(0.8),
-                "bsdf": {"type": "twosided", "bsdf": bumps()["bsdf"]},
-            },
-            "lamp": {
-                "type": "sphere",
-                "center": [0.2, 1.2, 1],
-                "radius": 0.2,
-                "emitter": {"type": "area", "radiance": 5.0},
-            },
-        }
-    )
+    plastic = {"type": "plastic", "diffuse_reflectance": 0.3}
+    bumpy = {"type": "bumpmap", "texture": textured(), "scale": 2.0, "bsdf": plastic}
+    mapped = {"type": "normalmap", "normalmap": textured(), "flip_invalid_normals": False}
+    mapped["bsdf"] = {"type": "conductor"}
+    painted = {"type": "diffuse", "reflectance": textured(mi.is_rgb)}
+    box = T().translate([0.8, 0.3, 0.3]).rotate([0, 1, 0], 30).scale(0.3)
+    copy = {"type": "instance", "to_world": T().translate([1, 0.5, -1.5]).rotate([0, 1, 0], 40)}
+    both = {"type": "twosided", "bsdf": bumps()["bsdf"]}
+    lamp = {"type": "area", "radiance": 5.0}
+    parts = {
+        "sensor": sensor,
+        "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2), "bsdf": painted},
+        "ball": {"type": "sphere", "center": [-0.5, 0.6, 0], "radius": 0.6, "bsdf": bumpy},
+        "box": {"type": "cube", "to_world": box, "bsdf": mapped},
+        "bumps": bumps(),
+        "more bumps": {"type": "shapegroup", "id": "more bumps", "chip": bumps()},
+        "copy": copy | {"more bumps": {"type": "ref", "id": "more bumps"}},
+        "back": {"type": "disk", "to_world": T().translate([-1, 1, -1]).scale(0.8), "bsdf": both},
+        "lamp": {"type": "sphere", "center": [0.2, 1.2, 1], "radius": 0.2, "emitter": lamp},
+    }
+    return mi.load_dict({"type": "scene"} | parts)
 
 
 def layers(method, target, spp, seed=0):
@@ -243,14 +213,8 @@ def test_denoisers_are_told_normals_of_the_world(kind):
     """Mitsuba's `aov` has normals of bump maps in the shading frame. Expected: a map without any effect on a
     wall that is turned by 40 degrees has the wall's normal; `sh_normal` of the bump map is still that of
     `aov`."""
-    maps = {
-        "bumpmap": {
-            "type": "bumpmap",
-            "texture": {"type": "bitmap", "bitmap": bitmap(), "raw": True},
-            "scale": 0.0,
-        },
-        "normalmap": {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.5, 0.5, 1]}},
-    }
+    flat = {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.5, 0.5, 1]}}
+    maps = {"bumpmap": {"type": "bumpmap", "texture": textured(), "scale": 0.0}, "normalmap": flat}
     wall = {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 40).scale(9)}
     wall["bsdf"] = maps[kind] | {"bsdf": {"type": "diffuse"}}
     target = mi.load_dict({"type": "scene", "sensor": sensor(film()), "wall": wall})
@@ -279,14 +243,10 @@ def test_an_interrupted_render_keeps_features():
             raise KeyboardInterrupt
 
     to_world = T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-    target = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": sensor(film(rfilter="gaussian"), to_world=to_world),
-            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(9)},
-            "lamp": {"type": "point", "position": [0, 0, 5]},
-        }
-    )
+    wall = {"type": "rectangle", "to_world": T().translate([0, 0, 1]).scale(9)}
+    eye = sensor(film(rfilter="gaussian"), to_world=to_world)
+    lamp = {"type": "point", "position": [0, 0, 5]}
+    target = mi.load_dict({"type": "scene", "sensor": eye, "wall": wall, "lamp": lamp})
     integrator = bdpt(aovs="pos:position", spp_per_pass=1, skip="none")
     integrator.on_pass = interrupt
     with pytest.raises(KeyboardInterrupt):

@@ -40,26 +40,16 @@ def rgb_film(**keys):
 
 
 def camera(film, **keys):
-    to_world = mi.ScalarTransform4f().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0])
+    to_world = T().look_at([0, 0, 0.5], [0.2, 0.1, -1], [0, 1, 0])
     return {"type": "perspective", "fov": 60, "near_clip": 1e-3, "to_world": to_world, "film": film} | keys
 
 
 def lamp_in_a_sphere(film, reflectance=None):
     """See above; the sphere has the spectrum `STEP` unless another is given."""
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera(film),
-            "wall": {
-                "type": "sphere",
-                "bsdf": {
-                    "type": "twosided",
-                    "bsdf": {"type": "diffuse", "reflectance": reflectance or spectrum(STEP)},
-                },
-            },
-            "lamp": {"type": "point", "intensity": {"type": "uniform", "value": float(np.pi)}},
-        }
-    )
+    inner = {"type": "diffuse", "reflectance": reflectance or spectrum(STEP)}
+    lamp = {"type": "point", "intensity": {"type": "uniform", "value": float(np.pi)}}
+    wall = {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": inner}}
+    return mi.load_dict({"type": "scene", "sensor": camera(film), "wall": wall, "lamp": lamp})
 
 
 def known(depth):
@@ -85,9 +75,6 @@ def tiles(images, size=4):
 
 def layer_names(scene):
     return [channel.name for channel in scene.sensors()[0].film().bitmap().struct_()]
-
-
-# -- bands of a spectral film -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -131,30 +118,18 @@ def test_overlapping_bands_equal_path(film):
     """Bands may overlap and differ in scale. Expected: equal to `path` in every tile and band. Statistic:
     Welch over tiles, 12 seeds a side; the image's mean is compared to some 1 %."""
     mi.set_variant(SPECTRAL)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera(spectral_film(COLOURFUL, **film)),
-            "sky": {"type": "constant", "radiance": spectrum([(400, 0.1), (700, 0.4)])},
-            "lamp": {
-                "type": "sphere",
-                "radius": 0.2,
-                "center": [0.7, 0.5, -0.6],
-                "emitter": {"type": "area", "radiance": spectrum([(400, 3), (550, 8), (700, 2)])},
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": mi.ScalarTransform4f().translate([0, -0.7, -2]).rotate([1, 0, 0], -90).scale(2),
-                "bsdf": {"type": "diffuse", "reflectance": spectrum([(400, 0.8), (700, 0.1)])},
-            },
-            "ball": {
-                "type": "sphere",
-                "radius": 0.4,
-                "center": [0.1, -0.2, -1.5],
-                "bsdf": {"type": "roughconductor", "alpha": 0.4},
-            },
-        }
-    )
+    lamp = {"type": "area", "radiance": spectrum([(400, 3), (550, 8), (700, 2)])}
+    floor = T().translate([0, -0.7, -2]).rotate([1, 0, 0], -90).scale(2)
+    matte = {"type": "diffuse", "reflectance": spectrum([(400, 0.8), (700, 0.1)])}
+    metal = {"type": "roughconductor", "alpha": 0.4}
+    parts = {
+        "sensor": camera(spectral_film(COLOURFUL, **film)),
+        "sky": {"type": "constant", "radiance": spectrum([(400, 0.1), (700, 0.4)])},
+        "lamp": {"type": "sphere", "radius": 0.2, "center": [0.7, 0.5, -0.6], "emitter": lamp},
+        "floor": {"type": "rectangle", "to_world": floor, "bsdf": matte},
+        "ball": {"type": "sphere", "radius": 0.4, "center": [0.1, -0.2, -1.5], "bsdf": metal},
+    }
+    scene = mi.load_dict({"type": "scene"} | parts)
     a = renders(scene, integrator(max_depth=4), range(12), 64)
     b = renders(scene, integrator("path", max_depth=4), range(50, 62), 256)
     assert layer_names(scene) == list(COLOURFUL)
@@ -235,41 +210,23 @@ class OtherFilm(mi.Film):
 def test_other_special_films_are_refused():
     """Expected: the class is named, and what can be used."""
     mi.register_film("other", OtherFilm)
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": camera({"type": "other", "width": 4, "height": 4}),
-            "l": {"type": "point"},
-        }
-    )
+    eye = camera({"type": "other", "width": 4, "height": 4})
+    scene = mi.load_dict({"type": "scene", "sensor": eye, "l": {"type": "point"}})
     with pytest.raises(NotImplementedError, match="film .* is not supported; use hdrfilm or specfilm"):
         integrator().render(scene, spp=1)
 
 
-# -- crop windows, borders, formats -----------------------------------------------------------
-
-
 def lamps_and_sky(film, sky):
     """A lamp before the camera, a wall, glass without colour; past all of them, the sky if there is one."""
+    matte = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}}
+    lamp = {"type": "area", "radiance": {"type": "rgb", "value": [2.0, 3.0, 5.0]}}
+    wall, pane = T().translate([0.3, -0.2, 0]).scale([1.2, 1, 1]), T().translate([-1, -0.6, 0.5]).scale(0.5)
     scene = {
         "type": "scene",
         "sensor": camera(film, to_world=T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]), fov=45),
-        "wall": {
-            "type": "rectangle",
-            "to_world": T().translate([0.3, -0.2, 0]).scale([1.2, 1, 1]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.5, 0.2]}},
-        },
-        "lamp": {
-            "type": "sphere",
-            "radius": 0.25,
-            "center": [-0.4, 0.3, 0.8],
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [2.0, 3.0, 5.0]}},
-        },
-        "pane": {
-            "type": "rectangle",
-            "to_world": T().translate([-1, -0.6, 0.5]).scale(0.5),
-            "bsdf": {"type": "thindielectric"},
-        },
+        "wall": {"type": "rectangle", "to_world": wall, "bsdf": matte},
+        "lamp": {"type": "sphere", "radius": 0.25, "center": [-0.4, 0.3, 0.8], "emitter": lamp},
+        "pane": {"type": "rectangle", "to_world": pane, "bsdf": {"type": "thindielectric"}},
     }
     if sky:
         scene["sky"] = {"type": "constant", "radiance": {"type": "rgb", "value": [0.2, 0.3, 0.1]}}
