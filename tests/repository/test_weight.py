@@ -12,7 +12,7 @@ MOST = {
     "measure": 7184,
     "transport merging guided_emission": 5706,
     "planning": 1731,
-    "emitters": 2326,
+    "emitters": 2286,
     "cli": 1810,
     "media": 1349,
     "geometry": 1518,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 42050}
+OUTSIDE = {"scripts": 2931, "tests": 41895}
 MOST_WORDS = 29086
 
 

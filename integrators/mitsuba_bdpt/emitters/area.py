@@ -16,7 +16,7 @@ from ..geometry.smooth_meshes import is_flat
 from ..host import renamed
 from ..host.introspection import LEAVES, children, named, number, own_parameters
 from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
-from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Place
+from .records import Chosen, Direct, Emission, Factor, Place
 from .surfaces import Surfaces
 from .tables import Mask, look_up, rows, table
 from .textured import is_mapped
@@ -111,8 +111,6 @@ class AreaEmitters(Group):
         self._any_cone = any(sphere.cone_radius > 0 for sphere in found)
         self._spheres = table(found)
 
-    # -- densities of points ----------------------------------------------------------------
-
     def pdf_a(self, emitter, index, at, n, active):
         """Density of y_0 = ``at`` with the normal ``n`` in emission (area measure), without the selection."""
         density = self._own_pdf_a(index, at.uv, active)
@@ -168,9 +166,7 @@ class AreaEmitters(Group):
         sphere = look_up(self._spheres, index, active)
         return dr.select(active, cone_pdf_w(sphere.center, sphere.cone_radius, p), 0)
 
-    # -- directions of emission -------------------------------------------------------------
-
-    def with_guide(self, guide: EmissionGuide | None) -> Group:
+    def with_guide(self, guide) -> Group:
         other = super().with_guide(guide)
         other._tables = table(rows(self._emitters, _Table(), self._directions))
         return other
@@ -200,7 +196,7 @@ class AreaEmitters(Group):
         curved = plain * own + (1 - plain) * dr.select(cos > 0, density * dr.inv_two_pi, 0)
         return dr.select(flat, own * density, curved)
 
-    def _plain(self, guide: EmissionGuide, index, active):
+    def _plain(self, guide, index, active):
         return dr.select(guide.is_guided(index, active), PLAIN, 1)
 
     def _sample_direction(self, index, si, u, active):
@@ -222,8 +218,6 @@ class AreaEmitters(Group):
         d = dr.select(flat, of_flat, dr.select(by_table, turned, own))
         pdf_w = self._direction_pdf_w(index, dr.dot(si.sh_frame.n, d), d, active)
         return d, si.to_local(d), pdf_w
-
-    # -- emission ---------------------------------------------------------------------------
 
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         ps, n = self._surfaces.sample(chosen, u_point, shared, active)
@@ -262,8 +256,6 @@ class AreaEmitters(Group):
         si = mi.SurfaceInteraction3f(emission.si)
         si.wi = si.to_local(d)
         return chosen.emitter.eval(si, active)
-
-    # -- next-event estimation and hits -----------------------------------------------------
 
     def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
         ds, shading_pdf_w, weight = self._corrected(chosen, ds, weight, si, u, active)

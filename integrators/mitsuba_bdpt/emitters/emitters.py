@@ -24,7 +24,7 @@ from .infinite import contrast
 from .kinds import GROUPS, group_of, is_third_party
 from .order import in_order
 from .radiance import BlackEmitters
-from .records import Chosen, Direct, Emission, EmissionGuide, Factor, Place
+from .records import Chosen, Direct, Emission, Factor, Place
 from .tables import Mask, inverse_table
 
 
@@ -121,9 +121,7 @@ class Emitters:
         """Largest `infinite.contrast`; infinite unless all light comes from environments."""
         return max((contrast(emitter) for emitter in self.objects), default=math.inf)
 
-    # -- hooks of guided emission -------------------------------------------------------------
-
-    def with_guide(self, guide: EmissionGuide | None = None, is_guided: Sequence[bool] = ()) -> Emitters:
+    def with_guide(self, guide=None, is_guided: Sequence[bool] = ()) -> Emitters:
         """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
         other = copy(self)
         other.indexed = True
@@ -137,8 +135,6 @@ class Emitters:
         """``place`` and ``factor`` of a `Group`; only for copies made by `with_guide`."""
         place = self._query("place", index, active, index, p, d)
         return place, self._query("factor", index, active, index, p, d, cos, side)
-
-    # -- selection and dispatch -------------------------------------------------------------
 
     def _select(self, u, active: mi.Bool):
         """Choose an emitter; also returns the reused part of ``u``."""
@@ -181,8 +177,6 @@ class Emitters:
         """`Disks.covers`; true where no light subpath starts at infinity."""
         return self.disks.covers(p, d) if self.disks is not None else mi.Bool(True)
 
-    # -- emission ---------------------------------------------------------------------------
-
     def sample_emission(self, u_point, u_direction, shared, active) -> Emission:
         """Sample y_0 and the direction to y_1; ``shared``: time and wavelengths.
 
@@ -221,8 +215,6 @@ class Emitters:
         chosen = self._chosen(emission.index, active)
         return self._query("radiance_towards", emission.index, active, chosen, emission, d)
 
-    # -- next-event estimation --------------------------------------------------------------
-
     def sample_direct(self, si, u, active) -> Direct:
         """Sample y_0 for the camera vertex ``si``; ``u`` in [0, 1)^2 also selects."""
         chosen, u_x = self._select(u.x, active)
@@ -237,8 +229,6 @@ class Emitters:
         if self.shape_errors.small:
             direct.met = rounding.met(chosen.emitter.get_shape())
         return direct
-
-    # -- hits by camera subpaths ------------------------------------------------------------
 
     def emitted(self, si, active):
         """Radiance of the emitter hit (or missed into) at ``si`` towards ``si.wi``."""

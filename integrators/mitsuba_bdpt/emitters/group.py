@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import named
-from .records import Chosen, EmissionGuide
+from .records import Chosen
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class Group:
     See `Emitters` for their results. The last argument is the mask ``active``; other lanes are undefined.
 
     * ``at_infinity``: light subpaths start at infinity, on its ``disks``.
-    * ``guide``: the tables that guide its emission, or None.
+    * ``guide``: a `guided_emission.tables.EmissionGuide` of its emission, or None.
     * ``redraws``: per emitter of the scene, whether next-event points are sampled here, not by Mitsuba.
     * ``limits``: why it does not support all.
     """
@@ -56,7 +57,7 @@ class Group:
     at_infinity = False
     redraws: Sequence[bool] = ()
     limits = ""
-    guide: EmissionGuide | None = None
+    guide: Any = None
 
     @classmethod
     def of(cls, emitter) -> type[Group]:
@@ -83,7 +84,7 @@ class Group:
         """Number of squares of primary numbers of this emitter (`Place`); 0: not guidable."""
         return 0
 
-    def with_guide(self, guide: EmissionGuide | None) -> Group:
+    def with_guide(self, guide) -> Group:
         """Return a copy that has ``place``, guided by ``guide`` (None: unguided)."""
         other = copy(self)
         other.guide = guide

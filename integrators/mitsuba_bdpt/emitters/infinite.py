@@ -51,8 +51,6 @@ class InfiniteEmitters(Group):
         self.disks = Disks(context.scene, context.facts.about)
         self._directional = Mask(rows(emitters, None, _is_directional))
 
-    # -- points of emission -----------------------------------------------------------------
-
     def _bin(self, index, d, active):
         """Index of the emitter's table for light along ``d``."""
         directional = self._directional.at(index, active)
@@ -89,8 +87,6 @@ class InfiniteEmitters(Group):
 
         return self.disks.start(d, u, self._share(guide, index, active), warp, density_at)
 
-    # -- emission ---------------------------------------------------------------------------
-
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         it = dr.zeros(mi.Interaction3f)
         it.p, it.time, it.wavelengths = mi.Point3f(self.disks.scene.center), shared.time, shared.wavelengths
@@ -125,8 +121,6 @@ class InfiniteEmitters(Group):
             density = emission.pdf_first * emission.pdf_second
             value = dr.select(directional, emission.weight * density, value)
         return value
-
-    # -- next-event estimation and hits -----------------------------------------------------
 
     def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
         directional = self._directional.at(chosen.index, active)

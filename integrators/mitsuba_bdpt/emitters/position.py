@@ -67,8 +67,6 @@ class PositionEmitters(Group):
     def factor(self, index, p, d, cos, side, active) -> Factor:
         return Factor.whole()
 
-    # -- emission ---------------------------------------------------------------------------
-
     def sample_emission(self, chosen: Chosen, u_point, u_direction, shared, active) -> Emission:
         cone = look_up(self._cones, chosen.index, active)
         u, pdf_w = u_direction, cone.pdf_w
@@ -97,8 +95,6 @@ class PositionEmitters(Group):
 
     def radiance_towards(self, chosen: Chosen, emission: Emission, d, active):
         return _intensity(chosen.emitter, emission.si.p, d, emission.si, active)
-
-    # -- next-event estimation --------------------------------------------------------------
 
     def complete_direct(self, chosen: Chosen, ds, weight, si, u, active) -> Direct:
         emitted = self._direction_pdf_w(chosen.index, -ds.d, active)

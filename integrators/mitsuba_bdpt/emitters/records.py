@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import mitsuba as mi
 
@@ -95,15 +94,3 @@ class Cell:
     number: mi.UInt32
     known: mi.Bool
     factor: Factor
-
-
-class EmissionGuide(Protocol):
-    """See `guided_emission.tables.EmissionGuide`."""
-
-    side: int
-
-    def is_guided(self, index: mi.UInt32, active) -> mi.Bool: ...
-
-    def density(self, index: mi.UInt32, place: Place, active) -> mi.Float: ...
-
-    def warp(self, index: mi.UInt32, which: mi.UInt32, u: mi.Point2f, active) -> tuple: ...

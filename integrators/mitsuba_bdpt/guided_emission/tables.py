@@ -122,7 +122,7 @@ class Cells:
 
 
 class EmissionGuide:
-    """`EmissionTables` that a kernel can index, an `emitters.records.EmissionGuide`.
+    """`EmissionTables` that a kernel can index.
 
     ``first``: see `_first_tables`; table 0 is uniform, for unguided emitters.
     """
