@@ -326,10 +326,7 @@ def test_what_makes_no_difference(change):
 
 
 def test_sensors_without_pixels():
-    """Rationale: a meter has no pixels by which to measure a disc. It faces the floor below the plate.
-    Expected: without light subpaths merging finds what t = 1 finds with them, in several passes, since each
-    has photons and a radius of its own.
-    """
+    """Without light subpaths merging finds what t = 1 finds with them, below the plate, in several passes."""
     scene = under_glass(point())
     del scene["sensor"]
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
@@ -345,6 +342,17 @@ def test_sensors_without_pixels():
     b = images(scene, 1 << 14, 8, first=100, max_depth=4)
     assert b.mean() > 0.01
     st.assert_agree(st.compare_images(a.reshape(8, 1), b.reshape(8, 1)))
+
+
+def test_meters_of_one_ray_find_photons():
+    """All samples share a disc, which must not be empty; standard deviation: 1.4 %."""
+    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
+    to_world = transform().look_at(CAMERA, [0, 0, 0], [0, 1, 0])
+    meter = {"type": "radiancemeter", "to_world": to_world, "film": film}
+    at, cos = seen()
+    centre = (ALBEDO / np.pi * under_a_point(at) * transmitted(cos))[SIZE * 4, SIZE * 4]
+    found = images(under_glass(point(), sensor=meter), 64, 4, merging="auto")
+    np.testing.assert_allclose(found, centre, rtol=0.1)
 
 
 # -- photons -----------------------------------------------------------------------------------------------
@@ -393,9 +401,7 @@ def test_cells_may_share_a_bucket(monkeypatch):
 
 
 def test_which_photons_are_near():
-    """Expected: those in the disc, in a flat cylinder about it, whose normals agree to 37 degrees. Twice the
-    rounding error of a hit does not count as height.
-    """
+    """Those in a flat disc, whose normals agree to 37 degrees, but for twice the rounding error of a hit."""
     p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0, 0.99], 0, [0, 0, 0, 0.24, 0.26, 0, 0, 0.19])
     n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7, 0], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51), 1])
     photon = Photon(p, None, n, *[None] * 11)
@@ -407,9 +413,7 @@ def test_which_photons_are_near():
 
 
 def test_discs_hold_few_photons():
-    """Rationale: merges of very many photons are slow. Expected: one photon's subpath for eight of a pass's
-    samples, and no more than 64 for each disc that its film has room for.
-    """
+    """One subpath for eight of a pass's samples, at most 64 for each disc that its film has room for."""
     assert passes.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
     assert passes.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
     assert passes.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
@@ -423,9 +427,7 @@ LEFT_OUT = {"layers": "strategies", "merging": "auto"}
 
 @pytest.mark.parametrize("parameters", [{}, {"layers": "variance"}, LEFT_OUT], ids=str)
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
-    """Rationale: radius and photons of a pass follow from the passes done (of the replicate). Expected: the
-    image of a render that went on is that of the one that never stopped, and so is what it leaves out.
-    """
+    """So is what it leaves out. Radius and photons of a pass follow from the passes done."""
     scene, parameters = mi.load_dict(under_glass(point())), {"merging": True, "spp_per_pass": 8} | parameters
     whole, again = bdpt(**parameters), bdpt(**parameters)
     expected = np.array(whole.render(scene, seed=3, spp=64))
@@ -448,10 +450,7 @@ def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
 
 
 def test_joined_renders_are_their_mean():
-    """Rationale: a part of a render knows nothing of the others. Expected: renders that are joined, of
-    several passes each, are the mean of their images by samples (to rounding of sums, box filter). They say
-    that they are not unbiased.
-    """
+    """By samples, to rounding of sums (box filter); they say that they are not unbiased."""
     scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
     whole, *methods = (bdpt(merging=True, spp_per_pass=8) for _ in range(3))
     snapshots = [

@@ -29,6 +29,10 @@ _PER_DISC = 64
 # their square (experiments, "Which paths are merged").
 _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 
+# Where no pixels can be measured (meters) all camera vertices share few discs: photon subpaths of a pass, at
+# least, and pixels of a film of which as many samples have the same radius.
+_METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
+
 # Bits of the edges and of the subpath's index in the sort key of photons.
 _EDGES_BITS, _LANE_BITS = 12, 32
 
@@ -73,10 +77,12 @@ class Passes:
         ``samples`` of each pixel; ``done``: earlier ones, in all parts of the image, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
-        radius = after(self._radius, done + samples)  # in pixels
-        # Discs of meters have no size on the film.
-        pixels = self._pixels if self._footprints.measured else math.inf
-        count = photons_of_pass(samples * self._pixels, pixels, radius)
+        if self._footprints.measured:
+            radius = after(self._radius, done + samples)  # in pixels
+            count = photons_of_pass(samples * self._pixels, self._pixels, radius)
+        else:
+            radius = after(self._radius, (done + samples) * self._pixels / _METER_PIXELS)
+            count = max(photons_of_pass(samples * self._pixels, math.inf, radius), _METER_PHOTONS)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)

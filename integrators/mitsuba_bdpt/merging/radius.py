@@ -20,7 +20,7 @@ _PROBES = 64
 _LOWEST, _HIGHEST = 1 / 8, 8
 
 # Radius in diagonals of the scene where no pixels can be measured (meters, custom sensors, empty views).
-_OF_DIAGONAL = 1 / 512
+_OF_DIAGONAL = 1 / 64
 
 # Exponent alpha: the radius is proportional to i^((alpha - 1) / 2) (C. Knaus and M. Zwicker, "Progressive
 # Photon Mapping: A Probabilistic Approach", 2011, eq. 15); i is the number of samples over `_OF_SAMPLES`.
@@ -71,10 +71,7 @@ class Radius:
 
 @dataclass(frozen=True)
 class Footprints:
-    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``.
-
-    ``measured``: False where no pixels can be measured.
-    """
+    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``; if ``measured``."""
 
     centre: tuple[float, float, float]
     base: float

@@ -32,9 +32,6 @@ from .wavelength_sets import SETS, WavelengthSets
 # Merging radius in distances between camera samples (of a set of wavelengths) on the film.
 RADIUS = 1.5
 
-# Merging radius in pixels of `Footprints` where these cannot be measured: 1/64 of the scene's diagonal.
-UNMEASURED = 8.0
-
 
 @dataclass
 class Estimate:
@@ -99,7 +96,7 @@ def estimate(
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
     footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
     of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
-    discs = footprints.radius(of_samples if footprints.measured else UNMEASURED)
+    discs = footprints.radius(of_samples if footprints.measured else 1.0)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths)
     unmerged = PhotonStrategy()  # weights know of no merges
