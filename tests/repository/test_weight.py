@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 41895}
-MOST_WORDS = 29086
+OUTSIDE = {"scripts": 2931, "tests": 41894}
+MOST_WORDS = 29076
 
 
 def _lines(files):
