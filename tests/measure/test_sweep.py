@@ -567,7 +567,7 @@ def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
     """
     making.make(job(3))
     calls = []
-    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: calls.append(rounds) or {"2 spp": [1.0]})
+    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: calls.append(rounds) or {"2 spp": [1.0]})
     output = folder / "out"
     for rounds in (1, 1, 2):
         path = preset_file(folder, f"{PRESET}[probes]\nmemory = {rounds}\n")
@@ -575,7 +575,7 @@ def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
         assert swept(*words) == 0
     assert calls == [1, 2]
     assert json.loads((output / "probes.json").read_text())["memory"]["values"] == {"2 spp": [1.0]}
-    monkeypatch.setitem(probes.PROBES, "memory", lambda _, rounds: {"2 spp": [probes.numbers("1 / 0")[-1]]})
+    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: {"2 spp": [probes.numbers("1 / 0")[-1]]})
     preset_file(folder, f"{PRESET}[probes]\nmemory = 3\n")
     assert swept(*words) == 1
     assert "failed: memory: a probe ended with status 1" in capsys.readouterr().out

@@ -202,6 +202,12 @@ class Cells:
         first = self.methods[0]
         self.against = first.parameters, first.sampler, max(subject.spp)
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Cells) and self.possible() == other.possible()
+
+    def __hash__(self) -> int:
+        return hash(self.common["scene_sha256"])
+
     def of(self, budget: int, seed: int, names=None) -> list[Cell]:
         """Return a cell per integrator, of those in ``names``."""
         return [

@@ -1,6 +1,6 @@
 """Costs of a render besides its samples: first image without kernel cache, memory.
 
-Each of `PROBES` takes the project and the number of repetitions, and returns plain numbers. Each repetition
+Each of `PROBES` takes the number of repetitions, and returns plain numbers. Each repetition
 is a process of its own.
 """
 
@@ -15,42 +15,27 @@ from collections.abc import Mapping
 from typing import Any
 
 from .options import VARIANT
-from .project import Project
 
-COLD = f"""
-import time; start = time.perf_counter()
-import mitsuba_bdpt, mitsuba as mi, drjit as dr
-mi.set_variant({VARIANT!r})
-scene = mi.load_dict(mi.cornell_box())
-integrator = mi.load_dict({{'type': '%s', 'max_depth': 6}})
-loaded = time.perf_counter()
-image = mi.render(scene, integrator=integrator, spp=16); dr.eval(image); dr.sync_thread()
-print(time.perf_counter() - loaded)
-"""
-
-FIRST = f"""
+RENDER = f"""
 import json, sys, time
 import mitsuba_bdpt, mitsuba as mi, drjit as dr
 from pathlib import Path
-from mitsuba_bdpt.measure.scenes import SceneFile, integrator_of
+from mitsuba_bdpt.host import memory
+from mitsuba_bdpt.measure.scenes import DictionaryScene, SceneFile, integrator_of
 mi.set_variant({VARIANT!r})
 wanted = json.loads(sys.argv[1])
-scene = SceneFile("first", Path(wanted["file"])).load(wanted["resolution"], wanted["sampler"])
+if "file" in wanted:
+    scene = SceneFile("scene", Path(wanted["file"]))
+else:
+    box = mi.cornell_box()
+    box["sensor"]["film"] |= wanted["film"]
+    scene = DictionaryScene("box", box)
+scene = scene.load(wanted.get("resolution"), wanted.get("sampler"))
 integrator = integrator_of(wanted["parameters"], wanted["max_depth"])
 dr.sync_thread()
 wall, processor = time.perf_counter(), time.process_time()
 image = mi.render(scene, integrator=integrator, spp=wanted["spp"]); dr.eval(image); dr.sync_thread()
-print(time.perf_counter() - wall, time.process_time() - processor)
-"""
-
-MEMORY = f"""
-import mitsuba_bdpt, mitsuba as mi
-from mitsuba_bdpt.host import memory
-mi.set_variant({VARIANT!r})
-d = mi.cornell_box()
-d['sensor']['film']['width'], d['sensor']['film']['height'] = 1920, 1080
-mi.render(mi.load_dict(d), integrator=mi.load_dict({{'type': 'bdpt', 'max_depth': 8}}), spp=%d)
-print(memory.peak() / 2**30)
+print(time.perf_counter() - wall, time.process_time() - processor, memory.peak() / 2**30)
 """
 
 
@@ -63,11 +48,20 @@ def numbers(code: str, *arguments: str, environment: Mapping[str, str] | None = 
     return [float(word) for word in done.stdout.split() if _is_number(word)]
 
 
-def cold(code: str, *arguments: str) -> list[float]:
-    """Like `numbers`, with an empty kernel cache."""
+def rendered(wanted: Mapping[str, Any], **environment: str) -> list[float]:
+    """Return wall seconds, processor seconds and peak resident GiB of a render in a new process.
+
+    ``wanted``: ``parameters`` of the integrator, ``max_depth`` and ``spp``; ``file``, ``resolution`` and
+    ``sampler`` of a scene, else ``film`` of the Cornell box. ``environment``: added to that of the process.
+    """
+    return numbers(RENDER, json.dumps(dict(wanted)), environment=os.environ | environment)[-3:]
+
+
+def first_image(wanted: Mapping[str, Any]) -> dict[str, float]:
+    """Return ``seconds`` and ``cpu_seconds`` of `rendered` with an empty kernel cache, without loading."""
     with tempfile.TemporaryDirectory() as cache:
-        empty = os.environ | {"DRJIT_CACHE_DIR": cache, "HOME": cache}
-        return numbers(code, *arguments, environment=empty)
+        wall, processor, _ = rendered(wanted, DRJIT_CACHE_DIR=cache, HOME=cache)
+    return {"seconds": wall, "cpu_seconds": processor}
 
 
 def _is_number(word: str) -> bool:
@@ -78,32 +72,26 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def coldstart(project: Project, rounds: int) -> dict[str, list[float]]:
+def coldstart(rounds: int) -> dict[str, list[float]]:
     """Return seconds from an empty kernel cache to the first image, by integrator.
 
     Cornell box, 256x256, depth 6, 16 spp; without imports and loading. A value per round.
     """
-    seconds: dict[str, list[float]] = {"path": [], "bdpt": []}
-    for _ in range(rounds):
-        for name, values in seconds.items():
-            values.append(cold(COLD % name)[-1])
-    return seconds
+    wanted = {"film": {}, "max_depth": 6, "spp": 16}
+    turns = [
+        {name: first_image(wanted | {"parameters": {"type": name}})["seconds"] for name in ("path", "bdpt")}
+        for _ in range(rounds)
+    ]
+    return {name: [turn[name] for turn in turns] for name in ("path", "bdpt")}
 
 
-def first_image(wanted: Mapping[str, Any]) -> dict[str, float]:
-    """Return ``seconds`` and ``cpu_seconds`` from an empty kernel cache to the image of a loaded scene.
-
-    ``wanted``: the ``file``, ``resolution``, ``sampler``, ``max_depth``, ``parameters`` and ``spp``.
-    """
-    return dict(zip(("seconds", "cpu_seconds"), cold(FIRST, json.dumps(dict(wanted)))[-2:], strict=True))
-
-
-def memory(project: Project, rounds: int) -> dict[str, list[float]]:
+def memory(rounds: int) -> dict[str, list[float]]:
     """Return the peak resident GiB of a render, by samples per pixel.
 
     Cornell box, 1920x1080, depth 8. A value per round.
     """
-    return {f"{spp} spp": [numbers(MEMORY % spp)[-1] for _ in range(rounds)] for spp in (2, 8)}
+    wanted = {"film": {"width": 1920, "height": 1080}, "parameters": {"type": "bdpt"}, "max_depth": 8}
+    return {f"{spp} spp": [rendered(wanted | {"spp": spp})[-1] for _ in range(rounds)] for spp in (2, 8)}
 
 
 PROBES = {"coldstart": coldstart, "memory": memory}

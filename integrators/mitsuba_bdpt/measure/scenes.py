@@ -121,6 +121,10 @@ class SceneFile(MeasuredScene):
     name: str
     file: Path
 
+    def __reduce__(self):
+        """For workers: without what is cached."""
+        return SceneFile, (self.name, self.file.resolve())
+
     @property
     def called(self) -> str:
         return repr(str(self.file))

@@ -20,7 +20,7 @@ import math
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, lru_cache, partial
@@ -202,20 +202,17 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
     return row | {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}, image
 
 
-def measured(root: str, preset: str, scene: str, cells: list[dict]) -> list:
-    """On a worker: return row and image of each cell, or the text of its error.
-
-    ``root``: of the project; ``preset``: its text; ``scene``: its name.
-    """
+def measured(cells: Cells, group: Sequence[Cell]) -> list:
+    """On a worker: return row and image of each cell of a ``group``, or the text of its error."""
     with workers.one_at_a_time:
         mi.set_variant(VARIANT)
-        bench, found = _bench(root, preset, scene, cells[0]["scene_sha256"]), []
-        for entry in cells:
-            cell = Cell(**entry)
-            if cell.versions != _loaded_software():
-                raise CommandError(f"a worker has other software than the client: {dict(_loaded_software())}")
-            if cell.scene_sha256 != bench.cells.common["scene_sha256"]:
-                raise CommandError(f"a worker has another {scene}.xml, mesh or texture than the client")
+        if group[0].versions != _loaded_software():
+            raise CommandError(f"a worker has other software than the client: {dict(_loaded_software())}")
+        scene = cells.subject.scene
+        if scene.sha256 != cells.common["scene_sha256"]:
+            raise CommandError(f"a worker has another {scene.name}.xml, mesh or texture than the client")
+        bench, found = _bench(cells), []
+        for cell in group:
             try:
                 found.append(measure(bench, cell))
             except Exception as error:  # one cell must not end the others
@@ -230,20 +227,8 @@ def _loaded_software() -> tuple:
 
 
 @lru_cache(maxsize=2)
-def _bench(root: str, preset: str, scene: str, scene_sha256: str) -> Bench:
-    """Return the cached bench of a scene of a preset.
-
-    Identified by the scene's content and the preset's text.
-    """
-    folder = tempfile.TemporaryDirectory(prefix="bdpt_sweep_")
-    file = Path(folder.name) / "preset.toml"
-    file.write_text(preset, encoding="utf-8")
-    project = Project(Path(root))
-    whole = read_preset(file, project)
-    subject = next(subject for subject in whole.subjects if subject.name == scene)
-    bench = Bench(Cells(project, whole, subject), file.parent)
-    bench.folder = folder  # lives as long as the bench
-    return bench
+def _bench(cells: Cells) -> Bench:
+    return Bench(cells, Path(tempfile.mkdtemp(prefix="bdpt_sweep_")))
 
 
 class Sweep:
@@ -311,17 +296,17 @@ class Sweep:
                 self._note(f"{cells.subject.name}: no rows", error)
         return found
 
-    def run(self, progress: Renders, elsewhere=None, seconds: float | None = None):
+    def run(self, progress: Renders, client=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
 
-        ``elsewhere``: a cluster's client and the preset's text, to render there. ``seconds``: limit,
-        shared equally by the scenes; what does not fit is recorded in ``cut``.
+        On a cluster if its ``client`` is given. ``seconds``: limit, shared equally by the scenes; what does not
+        fit is recorded in ``cut``.
         """
         scenes, todo = self.scenes, self._todo
         self._progress = progress
         progress.plan(_work(cell) for missing in todo for cell in missing)
-        if elsewhere:
-            self._remote(*elsewhere, scenes, todo)
+        if client is not None:
+            self._remote(client, scenes, todo)
             return
         self._probes()
         if seconds is not None:
@@ -401,7 +386,7 @@ class Sweep:
             key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
             try:
                 if {k: kept.get(name, {}).get(k) for k in key} != key:
-                    kept[name] = key | {"values": probes.PROBES[name](self.project, rounds)}
+                    kept[name] = key | {"values": probes.PROBES[name](rounds)}
                     write_json(file, kept)
             except Exception as error:  # a probe must not end the sweep
                 self.failed.append(f"{name}: {error}")
@@ -424,9 +409,8 @@ class Sweep:
             self._judges[cells.where()] = judge_of(*cells.where())
         store(self.output, cell, *result, self._judges[cells.where()])
 
-    def _remote(self, cluster, preset: str, scenes: list[Cells], todo: list[list[Cell]]):
+    def _remote(self, client, scenes: list[Cells], todo: list[list[Cell]]):
         """Render the cells of ``todo``, and those that follow, on a cluster."""
-        root = str(self.project.root.resolve())
         while any(
             todo := [missing or self._more(cells) for cells, missing in zip(scenes, todo, strict=True)]
         ):
@@ -435,11 +419,7 @@ class Sweep:
                 for cells, missing in zip(scenes, todo, strict=True)
                 for _, group in groupby(missing, key=lambda cell: (cell.budget, cell.seed))
             ]
-            calls = [
-                (root, preset, cells.subject.name, [asdict(cell) for cell in group])
-                for cells, group in groups
-            ]
-            for index, results in workers.results(cluster, measured, calls):
+            for index, results in workers.results(client, measured, groups):
                 cells, group = groups[index]
                 for cell, result in zip(group, results, strict=True):
                     if isinstance(result, str):
@@ -539,8 +519,19 @@ def swept(
     take half of these at most, unless ``reference_seconds`` says so, and the renders what is left.
     """
     began = time.monotonic()
-    whole, output, text = _read(project, preset, options)
-    _check_cluster(project, preset, whole, options)
+    if isinstance(preset, Mapping):
+        whole, name = preset_of(Path("preset"), preset, project, options.scenes), "sweep"
+    else:
+        file = project.preset(preset)
+        whole, name = read_preset(file, project, options.scenes), file.stem
+    output = options.output or project.root / "results" / name
+    if options.scheduler and project.given:
+        raise CommandError(
+            f"scheduler={options.scheduler} with scene={next(iter(project.given))!r}, a dictionary, is not "
+            "possible: workers load files; write it into one"
+        )
+    if options.scheduler and options.seconds is not None:
+        raise CommandError(f"seconds={options.seconds:g} with scheduler={options.scheduler} is not possible")
     for told in (*whole.left_out, *whole.resized()):
         print(told, flush=True)
     sweep = Sweep(project, whole, output)
@@ -554,8 +545,8 @@ def swept(
         left = max(options.seconds - (time.monotonic() - began), 0.0)
     with Renders(left) as progress:
         if options.scheduler:
-            with workers.connected(options.scheduler) as cluster:
-                sweep.run(progress, (cluster, text))
+            with workers.connected(options.scheduler) as client:
+                sweep.run(progress, client)
         else:
             sweep.run(progress, seconds=left)
     table = sweep.rows()
@@ -578,39 +569,6 @@ def swept(
             "measured and two seeds of the smallest budget are rendered in any case"
         )
     return table, sweep.failed
-
-
-def _read(
-    project: Project, preset: str | Mapping[str, Any], options: SweepOptions | Namespace
-) -> tuple[Preset, Path, str]:
-    """Return the preset that the ``options`` ask for, the folder of its rows, and its text."""
-    if isinstance(preset, Mapping):
-        whole, name, text = preset_of(Path("preset"), preset, project, options.scenes), "sweep", ""
-    else:
-        file = project.preset(preset)
-        whole, name = read_preset(file, project, options.scenes), file.stem
-        text = file.read_text(encoding="utf-8")
-    return whole, options.output or project.root / "results" / name, text
-
-
-def _check_cluster(
-    project: Project, preset: str | Mapping[str, Any], whole: Preset, options: SweepOptions | Namespace
-) -> None:
-    """Raise ``CommandError`` for what workers cannot render."""
-    if not options.scheduler:
-        return
-    if project.given or isinstance(preset, Mapping):
-        what = f"scene={next(iter(project.given))!r}" if project.given else "the preset"
-        raise CommandError(
-            f"scheduler={options.scheduler} with {what}, a dictionary, is not possible: workers load files; "
-            "write it into one"
-        )
-    if whole.scenes is None:
-        raise CommandError(
-            f"scheduler={options.scheduler} needs a preset with scenes: workers read it; list them there"
-        )
-    if options.seconds is not None:
-        raise CommandError(f"seconds={options.seconds:g} with scheduler={options.scheduler} is not possible")
 
 
 def _tell(sweep: Sweep, table: list[Row]) -> None:
