@@ -11,8 +11,7 @@ from pathlib import Path
 import command_line
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.cli.values import number, within
-from mitsuba_bdpt.measure.options import REFERENCE_SECONDS, RESOLUTION, SECONDS, VARIANT, WIDTH
+from mitsuba_bdpt.measure.options import REFERENCE_SECONDS, RESOLUTION, SECONDS, VARIANT, WIDTH, Number
 from mitsuba_bdpt.measure.project import Project
 
 import mitsuba as mi  # isort: skip
@@ -23,19 +22,19 @@ from instruments import fireflies
 def main(arguments=None) -> int:
     """Print the table."""
     parser = command_line.parser(__doc__)
-    add, one = parser.add_argument, number(int, 1)
+    add, one = parser.add_argument, Number(int, 1)
     add("scenes", nargs="+", help="scene files, or names in PROJECT/scenes")
     add("--project", type=Path, default=repository.ROOT, metavar="DIR", help="default: this repository")
     add("--seeds", type=one, default=5, help="renders of each scene (default: %(default)s)")
     add("--spp", type=one, default=64, help="samples per pixel (default: %(default)s)")
-    add("--resolution", type=within(WIDTH), default=RESOLUTION, help="width (default: %(default)s)")
+    add("--resolution", type=WIDTH, default=RESOLUTION, help="width (default: %(default)s)")
     add("--max-depth", type=one, help="longest path in edges; default: as in presets/benchmark.toml")
     text = "values of its pixel by which a sample is off (default: %(default)s)"
-    add("--level", type=number(float, 1e-9), default=0.5, help=text)
+    add("--level", type=Number(float, 1e-9), default=0.5, help=text)
     add("--top", type=one, default=12, help="samples examined of each render (default: %(default)s)")
     add("--lines", type=one, default=6, help="kinds of paths of each scene (default: %(default)s)")
     text = "seconds that making a missing reference may take (default: %(default)g)"
-    add("--reference-seconds", type=within(SECONDS), default=REFERENCE_SECONDS, help=text)
+    add("--reference-seconds", type=SECONDS, default=REFERENCE_SECONDS, help=text)
     options = parser.parse_args(arguments)
     mi.set_variant(VARIANT)
     print(fireflies.text(Project(options.project), options.scenes, options))

@@ -36,11 +36,11 @@ import numpy as np
 import repository
 import room
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.cli.values import number
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
+from mitsuba_bdpt.measure.options import Number
 from mitsuba_bdpt.measure.tables import met_text, ratio, table
 
 import drjit as dr  # isort: skip
@@ -547,7 +547,7 @@ def parsed(kind: Kind, size: int | str) -> int | str:
             raise CommandError(f"size={size!r} is not known; use some of {', '.join(map(str, kind.sizes))}")
         return size
     try:
-        return int(number(int, 1)(str(size)))
+        return int(Number(int, 1)(str(size)))
     except argparse.ArgumentTypeError as error:
         raise CommandError(f"size={size!r}: {error}") from None
 

@@ -741,7 +741,7 @@ def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, w
         (["rendr", "plain.xml"], "did you mean render?"),
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
         (["render", "plain.xml", "--traget-error=1"], "did you mean --target-error?"),
-        (["explain", "plain.xml", "--integrator", "path"], "that is an option of render"),
+        (["explain", "plain.xml", "--integrator", "path"], "that is an option of another command"),
         (
             ["render", "plain.xml", "--light-groups", "auto"],
             "that is a parameter of the integrator: -P light_groups=VALUE",

@@ -12,20 +12,21 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import NoReturn
+from typing import ClassVar, NoReturn
 
 import mitsuba_bdpt
 
 from .. import removed
 from ..errors import did_you_mean
 from ..host import signals
+from ..measure.options import SEED, STOPS, Number
 from ..progress import KINDS
 from ..settings import PARAMETERS
 from . import measuring, mistakes
-from .values import crop, definition, frames, number, property_, resume, size, weight
+from .values import crop, definition, frames, property_, size, weight
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -59,20 +60,18 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser without abbreviations, which suggests commands and options.
+    """A parser without abbreviations, which suggests commands and options."""
 
-    ``options`` of its own; ``commands``: parsers of its subcommands.
-    """
+    known: ClassVar[list[str]] = []
+    """Names of commands and options of all parsers."""
 
     def __init__(self, **settings):
-        self.options: list[str] = []
-        self.commands: Mapping[str, Parser] = {}
         # An abbreviation may become ambiguous in the next version.
         super().__init__(allow_abbrev=False, **settings)
 
     def add_argument(self, *names, **settings):
         """Declare an argument, like argparse."""
-        self.options += [name for name in names if name.startswith("-")]
+        self.known.extend(name for name in names if name.startswith("-"))
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
@@ -81,24 +80,22 @@ class Parser(argparse.ArgumentParser):
         value = re.search(r"argument (--\S+): invalid choice: '(.*?)'", message)
         question = ""
         if wrong:
-            question = self._question(wrong[1] or wrong[2], command=bool(wrong[1]))
+            question = self._question(wrong[1] or wrong[2])
         elif value:
             question = removed.remedy(f"{value[1]} {value[2]}")
         question = question.rstrip() or f"see {self.prog} --help"
         self.exit(mistakes.USAGE, f"{self.prog}: error: {message}; {question}\n")
 
-    def _question(self, name: str, command: bool) -> str:
-        """Suggest a ``command``, or an option, for an unknown ``name``."""
-        having = [command for command, parser in self.commands.items() if name in parser.options]
-        if having or name in self.options:
-            return f"that is an option of {' and '.join(having) or self.prog}"
-        if command and name.lower().endswith(".xml"):
-            return f"did you mean render {name}?"
+    def _question(self, name: str) -> str:
+        """Suggest a command or an option for an unknown ``name``."""
         parameter = name.lstrip("-").replace("-", "_")
+        if name in self.known:
+            return "that is an option of another command"
+        if name.lower().endswith(".xml"):
+            return f"did you mean render {name}?"
         if parameter in PARAMETERS:
             return f"that is a parameter of the integrator: -P {parameter}=VALUE"
-        of_commands = (option for parser in self.commands.values() for option in parser.options)
-        return removed.remedy(name) or did_you_mean(name, [*self.options, *self.commands, *of_commands])
+        return removed.remedy(name) or did_you_mean(name, self.known)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -109,9 +106,9 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=_versions())
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    parser.commands = commands.choices
 
     def add_command(name: str, text: str) -> Parser:
+        parser.known.append(name)
         return commands.add_parser(name, help=text, description=text)
 
     doctor = add_command("doctor", "print versions, variants and the LLVM library, and render a tiny image")
@@ -141,7 +138,7 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
     text = "brightness of the PNG in stops; default: %(default)s"
-    add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
+    add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)
 
 
 def _versions() -> str:
@@ -158,7 +155,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
-    add("--spp", type=number(int, 1), help="samples per pixel; default: the scene's")
+    add("--spp", type=Number(int, 1), help="samples per pixel; default: the scene's")
     text = "value of a parameter $KEY of the scene; may be repeated"
     add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
     text = "property of the integrator, such as skip=none; may be repeated"
@@ -172,7 +169,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
         help=text,
     )
     text = "index of the sensor; default: %(default)s"
-    add("-s", "--sensor", type=number(int, 0), default=0, metavar="INDEX", help=text)
+    add("-s", "--sensor", type=Number(int, 0), default=0, metavar="INDEX", help=text)
     text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
     add("-a", "--append", type=Path, action="append", default=[], metavar="FOLDER", help=text)
     text = "size of the image in pixels; overrides the size of every film except meters'"
@@ -180,12 +177,12 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     text = "render this part of the image alone, in pixels from the upper left corner"
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)
     text = "number of threads; default: one for each core"
-    add("--threads", type=number(int, 1), metavar="N", help=text)
+    add("--threads", type=Number(int, 1), metavar="N", help=text)
     text = (
         "memory that the process may take: films that need more are an error before the first sample; "
         "default: the limits of the machine, of its control groups and of ulimit"
     )
-    add("--memory", type=number(float, 1e-3), metavar="GIB", help=text)
+    add("--memory", type=Number(float, 1e-3), metavar="GIB", help=text)
     text = "log more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
     add("-v", "--verbose", action="count", default=0, help=text)
 
@@ -196,16 +193,16 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"
     add("-o", "--output", type=Path, help=text)
     text = "stop after the first pass that ends later than SECONDS; without --spp, at 65536 spp at the latest"
-    add("--time", type=number(float, 0), metavar="SECONDS", help=text)
+    add("--time", type=Number(float, 0), metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
-    add("--target-error", type=number(float, 1e-12), metavar="X", help=text)
+    add("--target-error", type=Number(float, 1e-12), metavar="X", help=text)
     text = "write a checkpoint beside the image every MINUTES; deleted when the render is finished"
-    add("--checkpoint", type=number(float, 0), metavar="MINUTES", help=text)
+    add("--checkpoint", type=Number(float, 0), metavar="MINUTES", help=text)
     text = (
         "with --checkpoint MINUTES: continue from the checkpoint of an interrupted render, auto (default) if "
         "there is one, must (also --resume without WHEN) or end with an error, never (begin anew)"
     )
-    add("--resume", nargs="?", type=resume, const="must", metavar="WHEN", help=text)
+    add("--resume", nargs="?", choices=("auto", "must", "never"), const="must", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
     add("--statistics", type=Path, metavar="FILE", help=text)
     text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
@@ -216,11 +213,11 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--progress", choices=KINDS, default="auto", help=text)
     text = "rewrite the PNG with the image so far every SECONDS"
-    add("--preview", type=number(float, 0), metavar="SECONDS", help=text)
+    add("--preview", type=Number(float, 0), metavar="SECONDS", help=text)
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)
     text = "number of parts of a render on a cluster; default: 4 for each worker"
-    add("--parts", type=number(int, 1), metavar="N", help=text)
+    add("--parts", type=Number(int, 1), metavar="N", help=text)
     text = "add a denoised image as a layer, which the PNG then shows (extra [denoise]); the raw one stays"
     add("--denoise", action="store_true", help=text)
     text = (
@@ -229,6 +226,6 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
     text = "of the random numbers; each of the --frames adds its number; default: %(default)s"
-    add("--seed", type=number(int, 0, 2**32 - 1), default=0, help=text)
+    add("--seed", type=SEED, default=0, help=text)
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
-    add("--exposure", type=number(float, -100, 100), default=0.0, metavar="EV", help=text)
+    add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)

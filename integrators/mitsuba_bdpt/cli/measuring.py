@@ -15,7 +15,7 @@ from pathlib import Path
 from ..errors import CommandError
 from ..measure import options
 from . import mistakes
-from .values import property_, within
+from .values import property_
 
 NEEDED = ("colour", "flip_evaluator", "markdown_it", "matplotlib", "pyarrow", "pydantic", "scipy")
 """What the extra ``[measure]`` installs, as modules."""
@@ -69,19 +69,11 @@ def parameters(text: str) -> dict:
 def declare(parser: argparse.ArgumentParser, kind: type) -> None:
     """Declare the options of a measurement, a dataclass of `measure.options`."""
     for field in options.options_of(kind):
-        given = dict(field.metadata["declared"])
-        bounds, short = field.metadata["bounds"], given.pop("short", None)
-        name = f"--{field.name.replace('_', '-')}"
-        given["choices" if isinstance(bounds, options.Choice) else "type"] = _parsed(bounds)
-        names = [short, name] if short else [name]
+        given, kind = dict(field.metadata["declared"]), field.metadata["kind"]
+        names = [given.pop("short")] if "short" in given else []
+        given["choices" if isinstance(kind, tuple) else "type"] = kind
+        names.append(f"--{field.name.replace('_', '-')}")
         parser.add_argument(*names, default=field.default, help=field.metadata["text"], **given)
-
-
-def _parsed(bounds):
-    """Return argparse's arguments for these bounds: choices, or a type."""
-    if isinstance(bounds, options.Choice):
-        return bounds.names
-    return bounds if isinstance(bounds, type) else within(bounds)
 
 
 _SCENE = ("scene", {"help": "a scene file, or a name in PROJECT/scenes"})

@@ -4,49 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import math
 import re
-from collections.abc import Callable
-
-from ..measure.options import Number
 
 PropertyValue = bool | int | float | str
 
-RESUME = ("auto", "must", "never")
-"""When a render goes on from a checkpoint: if there is one, in any case, or not at all."""
-
-MOST_EXACT = 2**53
-"""Up to this all whole numbers are exact as ``float``."""
-
 MOST_FRAMES = 1 << 20
 """Sensors in a range, at most."""
-
-
-def number(kind: type, least: float, most: float = math.inf) -> Callable[[str], float]:
-    """Return an argparse type: a finite number of ``kind`` in [``least``, ``most``]."""
-    return within(Number(kind, least, most))
-
-
-def within(bounds: Number) -> Callable[[str], float]:
-    read = whole if bounds.kind is int else bounds.kind
-
-    def parse(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            if bounds.holds(value := read(text)):
-                return value
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {bounds}")
-
-    return parse
-
-
-def whole(text: str) -> int:
-    """Parse a whole number, also with an exponent such as ``1e6``; ``ValueError`` for others."""
-    with contextlib.suppress(ValueError):
-        return int(text)
-    value = float(text)
-    if not value.is_integer() or abs(value) > MOST_EXACT:
-        raise ValueError(text)
-    return int(value)
 
 
 def _utf8(text: str) -> str:
@@ -99,13 +62,6 @@ def frames(text: str) -> list[int]:
             raise argparse.ArgumentTypeError(f"got {text!r}, which must be {MOST_FRAMES} numbers at most")
         found += numbers
     return found
-
-
-def resume(text: str) -> str:
-    if text not in RESUME:
-        scene = "; write the scene before --resume" if text.lower().endswith(".xml") else ""
-        raise argparse.ArgumentTypeError(f"got {text!r}, which must be {', '.join(RESUME)} or nothing{scene}")
-    return text
 
 
 def definition(text: str) -> tuple[str, str]:

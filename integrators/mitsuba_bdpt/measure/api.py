@@ -130,7 +130,7 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
     from .project import Project
     from .scenes import DictionaryScene
 
-    root, before, given, names = available.path_of("project", project), mi.variant(), {}, []
+    root, before, given, names = Path(available.text_of_path("project", project)), mi.variant(), {}, []
     mi.set_variant(VARIANT)
     try:
         for scene in [scenes] if isinstance(scenes, _SCENES) else scenes:

@@ -5,11 +5,12 @@ A dataclass per measurement. Imports only the standard library, since the comman
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import math
-from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from ..errors import CommandError, UsageTypeError
 
@@ -25,7 +26,10 @@ REFERENCE_SECONDS = 600.0
 
 @dataclass(frozen=True)
 class Number:
-    """A finite number in [least, most], multiple of ``step``; or the value ``apart``."""
+    """A finite number in [least, most], multiple of ``step``; or the value ``apart``.
+
+    Called with such a number, or its text, returns the number; else raises argparse's error.
+    """
 
     kind: type
     least: float
@@ -42,41 +46,47 @@ class Number:
             found += f", divisible by {self.step}"
         return found if self.apart is None else f"{found}, or {self.apart}"
 
-    def holds(self, value: object) -> bool:
-        """Return whether ``value`` is such a number."""
+    def __call__(self, given: Any) -> Any:
+        value = given
+        with contextlib.suppress(ValueError):
+            if isinstance(given, str):
+                value = whole(given) if self.kind is int else float(given)
+        if not self._holds(value):
+            raise argparse.ArgumentTypeError(f"got {given!r}, which must be {self}")
+        return value
+
+    def _holds(self, value: Any) -> bool:
         if isinstance(value, bool) or not isinstance(value, int if self.kind is int else int | float):
             return False
-        if value == self.apart:
-            return True
         fits = self.step == 1 or value % self.step == 0
         finite = isinstance(value, int) or math.isfinite(value)
-        return self.least <= value <= self.most and finite and fits
+        return value == self.apart or (self.least <= value <= self.most and finite and fits)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """One of ``names``."""
+MOST_EXACT = 2**53
+"""Up to this all whole numbers are exact as ``float``."""
 
-    names: tuple[str, ...]
 
-    def __str__(self) -> str:
-        return f"one of {', '.join(self.names)}"
-
-    def holds(self, value: object) -> bool:
-        """Return whether ``value`` is one of the names."""
-        return value in self.names
+def whole(text: str) -> int:
+    """Parse a whole number, also with an exponent such as ``1e6``; ``ValueError`` for others."""
+    with contextlib.suppress(ValueError):
+        return int(text)
+    value = float(text)
+    if not value.is_integer() or abs(value) > MOST_EXACT:
+        raise ValueError(text)
+    return int(value)
 
 
 WHOLE, SEED, STOPS = Number(int, 1), Number(int, 0, 2**32 - 1), Number(float, -100, 100)
 SECONDS, WIDTH = Number(float, 0), Number(int, 4, step=4)
 
 
-def option(default: Any, bounds: Number | Choice | type, text: str, **declared: Any) -> Any:
-    """Return a field: default (None is valid beside the bounds), bounds and help.
+def option(default: Any, kind: Any, text: str, **declared: Any) -> Any:
+    """Return a field: default (None is valid beside the ``kind``), argparse's type or choices, and help.
 
     ``declared``: further arguments for argparse, and ``short``, another name there.
     """
-    return field(default=default, metadata={"bounds": bounds, "text": text, "declared": declared})
+    return field(default=default, metadata={"kind": kind, "text": text, "declared": declared})
 
 
 def _width(default: int | None = RESOLUTION) -> Any:
@@ -106,28 +116,6 @@ def _columns(default: int) -> Any:
     return option(default, Number(int, 1, 2), text)
 
 
-class Options:
-    """Base of all options."""
-
-    def __post_init__(self):
-        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none."""
-        for found in options_of(type(self)):
-            value: Any = getattr(self, found.name)
-            bounds = found.metadata["bounds"]
-            if value is None and found.default is None:
-                continue
-            if bounds is Path:
-                object.__setattr__(self, found.name, path_of(found.name, value))
-                continue
-            several = isinstance(value, list | tuple) and takes_several(found)
-            values = cast(Sequence[object], value if several else [value])
-            if bounds is str:
-                texts = [text_of_path(found.name, one) for one in values]
-                object.__setattr__(self, found.name, tuple(texts) if several else texts[0])
-            elif not all(map(bounds.holds, values)):
-                raise CommandError(f"{found.name}={value!r} must be {bounds}")
-
-
 def text_of_path(name: str, value: Any) -> str:
     """Return the ``value`` of an argument as text; raises ``UsageTypeError`` unless it is that or a path."""
     if not isinstance(value, str | Path):
@@ -135,9 +123,27 @@ def text_of_path(name: str, value: Any) -> str:
     return str(value)
 
 
-def path_of(name: str, value: Any) -> Path:
-    """Return the path that the argument ``name`` is; raises ``UsageTypeError`` if it is none."""
-    return Path(text_of_path(name, value))
+class Options:
+    """Base of all options."""
+
+    def __post_init__(self):
+        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none."""
+        for found in options_of(type(self)):
+            name, value, kind = found.name, getattr(self, found.name), found.metadata["kind"]
+            if value is None and found.default is None:
+                continue
+            several = isinstance(value, list | tuple) and takes_several(found)
+            values = tuple(value) if several else (value,)
+            if kind in (str, Path):
+                made = tuple(kind(text_of_path(name, one)) for one in values)
+                object.__setattr__(self, name, made if several else made[0])
+            elif isinstance(kind, Number):
+                try:
+                    all(map(kind, values))
+                except argparse.ArgumentTypeError as error:
+                    raise CommandError(f"{name}={value!r} must be {kind}") from error
+            elif value not in kind:
+                raise CommandError(f"{name}={value!r} must be one of {', '.join(kind)}")
 
 
 def takes_several(found: Field[Any]) -> bool:
@@ -146,7 +152,7 @@ def takes_several(found: Field[Any]) -> bool:
 
 
 def options_of(kind: type) -> list[Field[Any]]:
-    return [found for found in fields(kind) if "bounds" in found.metadata]
+    return [found for found in fields(kind) if "kind" in found.metadata]
 
 
 @dataclass(frozen=True)
@@ -199,7 +205,7 @@ class Figure(Options):
     )
     plot: str = option(
         "samples",
-        Choice(("samples", "seconds", "efficiency", "rays", "crops")),
+        ("samples", "seconds", "efficiency", "rays", "crops"),
         "relMSE over samples or seconds, efficiencies, rays by kind, or images (at equal time, unless the "
         "preset has match = 'spp') with magnified windows and errors in false colours; default: %(default)s",
     )
@@ -240,7 +246,7 @@ class MakeReference(Options):
     )
     by: str | None = option(
         None,
-        Choice(("path", "bdpt", "merging")),
+        ("path", "bdpt", "merging"),
         "what renders it, path (with media: volpath) only where that converges, merging (bdpt with it) where "
         "nothing else finds all light; default: as references/scenes.toml says, else bdpt",
     )
@@ -304,10 +310,10 @@ def _documented(kind: type[Options]) -> str:
     """Return the docstring of a dataclass of options, with the meaning of each."""
     lines = [kind.__doc__ or "", ""]
     for found in options_of(kind):
-        bounds, text = found.metadata["bounds"], found.metadata["text"] % {"default": found.default}
-        lines.append(
-            f"* ``{found.name}``" + ("" if isinstance(bounds, type) else f" ({bounds})") + f": {text}"
-        )
+        bounds, text = found.metadata["kind"], found.metadata["text"] % {"default": found.default}
+        if isinstance(bounds, tuple):
+            bounds = f"one of {', '.join(bounds)}"
+        lines.append(f"* ``{found.name}``{'' if isinstance(bounds, type) else f' ({bounds})'}: {text}")
     return "\n".join(lines)
 
 
