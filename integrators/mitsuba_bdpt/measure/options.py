@@ -8,9 +8,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import math
+from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..errors import CommandError, UsageTypeError
 
@@ -90,24 +91,21 @@ def option(default: Any, kind: Any, text: str, **declared: Any) -> Any:
 
 
 def _width(default: int | None = RESOLUTION) -> Any:
-    text = f"width of image and reference; default: {RESOLUTION}"
-    return option(default, WIDTH, text, metavar="PIXELS")
+    return option(default, WIDTH, f"width of image and reference in pixels; default: {RESOLUTION}")
 
 
 def _reference_seconds(default: float = REFERENCE_SECONDS) -> Any:
-    text = "seconds that making a reference may take where there is none, per scene; default: %(default)g"
-    return option(default, SECONDS, text, metavar="SECONDS")
+    return option(default, SECONDS, "limit of making a missing reference, per scene; default: %(default)g")
 
 
 def _windows() -> Any:
-    text = "centres of the two magnified windows, in shares of width and height, such as 0.3,0.6 0.8,0.2; "
-    text += "default: where the errors of the first and the last image differ most"
+    text = "centres of two magnified windows, shares of width and height such as 0.3,0.6 0.8,0.2; default: "
+    text += "where the errors of the first and the last image differ most"
     return option(None, str, text, nargs=2, metavar="X,Y")
 
 
 def _budget() -> Any:
-    text = "samples per pixel of the first integrator, one of the sweep's, at which all are compared; "
-    text += "default: the largest of which all scenes have two renders"
+    text = "budget at which all are compared; default: the largest of which all scenes have two renders"
     return option(None, WHOLE, text)
 
 
@@ -129,11 +127,12 @@ class Options:
     def __post_init__(self):
         """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none."""
         for found in options_of(type(self)):
-            name, value, kind = found.name, getattr(self, found.name), found.metadata["kind"]
+            name, kind = found.name, found.metadata["kind"]
+            value: Any = getattr(self, name)
             if value is None and found.default is None:
                 continue
             several = isinstance(value, list | tuple) and takes_several(found)
-            values = tuple(value) if several else (value,)
+            values: Sequence[Any] = cast(Sequence[Any], value) if several else [value]
             if kind in (str, Path):
                 made = tuple(kind(text_of_path(name, one)) for one in values)
                 object.__setattr__(self, name, made if several else made[0])
@@ -160,32 +159,18 @@ class Sweep(Options):
     """Options of sweeps."""
 
     scenes: tuple[str, ...] | None = option(
-        None,
-        str,
-        "scenes of the preset to render, or scene files where it lists none; rows of others stay as they "
-        "are; default: all",
-        nargs="+",
-        metavar="SCENE",
+        None, str, "scenes of the preset, or files where it lists none; default: all", nargs="+"
     )
-    output: Path | None = option(
-        None, Path, "folder of the rows; default: PROJECT/results/NAME_OF_PRESET", short="-o"
-    )
-    scheduler: str | None = option(
-        None, str, "address of a dask.distributed cluster to render on (extra [cluster])", metavar="ADDRESS"
-    )
+    output: Path | None = option(None, Path, "folder; default: PROJECT/results/NAME_OF_PRESET", short="-o")
+    scheduler: str | None = option(None, str, "address of a dask.distributed scheduler (extra [cluster])")
     reference_seconds: float | None = option(
         None,
         SECONDS,
-        f"seconds that making a reference may take where there is none, per scene; default: "
-        f"{REFERENCE_SECONDS:g}; with --seconds half of these, shared by the scenes",
-        metavar="SECONDS",
+        f"limit of making a missing reference, per scene; default: {REFERENCE_SECONDS:g}; with --seconds "
+        "half of these, shared by the scenes",
     )
     seconds: float | None = option(
-        None,
-        SECONDS,
-        "seconds of everything; what does not fit is cut, large budgets and later seeds first, and said; "
-        "default: no limit",
-        metavar="SECONDS",
+        None, SECONDS, "limit of everything: large budgets and later seeds are cut first; default: none"
     )
 
 
@@ -197,28 +182,18 @@ class Figure(Options):
     """Options of figures of a sweep."""
 
     output: Path | None = option(
-        None,
-        Path,
-        "file to write, PDF, SVG or PNG by its ending; default: FOLDER/PLOT.pdf",
-        short="-o",
-        metavar="FILE",
+        None, Path, "PDF, SVG or PNG file by its ending; default: FOLDER/PLOT.pdf", short="-o"
     )
     plot: str = option(
         "samples",
         ("samples", "seconds", "efficiency", "rays", "crops"),
         "relMSE over samples or seconds, efficiencies, rays by kind, or images (at equal time, unless the "
-        "preset has match = 'spp') with magnified windows and errors in false colours; default: %(default)s",
+        "preset has match = 'spp') with windows and errors in false colours; default: %(default)s",
     )
     columns: int = _columns(1)
-    scenes: tuple[str, ...] | None = option(
-        None, str, "scenes to draw; default: all", nargs="+", metavar="SCENE"
-    )
+    scenes: tuple[str, ...] | None = option(None, str, "scenes to draw; default: all", nargs="+")
     integrators: tuple[str, ...] | None = option(
-        None,
-        str,
-        "integrators to draw beside the first one, by their names in the preset; default: all compared ones",
-        nargs="+",
-        metavar="NAME",
+        None, str, "names of integrators beside the first; default: all compared ones", nargs="+"
     )
     spp: int | None = _budget()
     windows: tuple[str, ...] | None = _windows()
@@ -236,13 +211,12 @@ class MakeReference(Options):
     """Options of references."""
 
     spp: int = option(64, WHOLE, "samples per pixel of the renders to judge; default: %(default)s")
-    seconds: float = option(REFERENCE_SECONDS, SECONDS, "seconds per scene; default: %(default)g")
+    seconds: float = option(REFERENCE_SECONDS, SECONDS, "limit per scene; default: %(default)g")
     resolution: int = _width()
     max_depth: int | None = option(
         None,
         Number(int, 1, apart=-1),
-        "longest path in edges, -1: no limit; default: that of presets/benchmark.toml, else of the "
-        "scene's file",
+        "longest path in edges, -1: no limit; default: of presets/benchmark.toml, else of the scene's file",
     )
     by: str | None = option(
         None,
@@ -269,10 +243,7 @@ class EqualTime(Options):
     spp: int = option(64, WHOLE, "samples per pixel of the last integrator; default: %(default)s")
     sampler: str | None = option(None, str, "type of the sensor's sampler; default: the scene's")
     reference: Path | None = option(
-        None,
-        Path,
-        "image to take errors against, at its own size; default: a reference of the project",
-        metavar="EXR",
+        None, Path, "EXR to take errors against, at its own size; default: a reference of the project"
     )
     resolution: int | None = _width(None)
     reference_seconds: float = _reference_seconds(60.0)
@@ -280,7 +251,7 @@ class EqualTime(Options):
     output: Path | None = option(
         None,
         Path,
-        "file to write, PDF, SVG or PNG by its ending; default: PROJECT/renders/equal_time_SCENE.png",
+        "PDF, SVG or PNG file by its ending; default: PROJECT/renders/equal_time_SCENE.png",
         short="-o",
     )
     columns: int = _columns(2)
@@ -293,8 +264,8 @@ class Pyramid(Options):
     output: Path | None = option(
         None,
         Path,
-        "EXR file to write, with PNGs beside it; or pyramids as PDF, SVG or PNG by its ending, "
-        "with the EXR beside them; default: PROJECT/renders/pyramid_SCENE.exr",
+        "EXR file with PNGs beside it, or pyramids as PDF, SVG or PNG with the EXR beside them; default: "
+        "PROJECT/renders/pyramid_SCENE.exr",
         short="-o",
     )
     columns: int = _columns(2)
@@ -310,9 +281,10 @@ def _documented(kind: type[Options]) -> str:
     """Return the docstring of a dataclass of options, with the meaning of each."""
     lines = [kind.__doc__ or "", ""]
     for found in options_of(kind):
-        bounds, text = found.metadata["kind"], found.metadata["text"] % {"default": found.default}
+        bounds: Any = found.metadata["kind"]
+        text = found.metadata["text"] % {"default": found.default}
         if isinstance(bounds, tuple):
-            bounds = f"one of {', '.join(bounds)}"
+            bounds = f"one of {', '.join(cast(tuple[str, ...], bounds))}"
         lines.append(f"* ``{found.name}``{'' if isinstance(bounds, type) else f' ({bounds})'}: {text}")
     return "\n".join(lines)
 

@@ -77,7 +77,7 @@ def coldstart(rounds: int) -> dict[str, list[float]]:
 
     Cornell box, 256x256, depth 6, 16 spp; without imports and loading. A value per round.
     """
-    wanted = {"film": {}, "max_depth": 6, "spp": 16}
+    wanted: dict[str, Any] = {"film": {}, "max_depth": 6, "spp": 16}
     turns = [
         {name: first_image(wanted | {"parameters": {"type": name}})["seconds"] for name in ("path", "bdpt")}
         for _ in range(rounds)
