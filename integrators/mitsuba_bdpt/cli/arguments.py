@@ -129,10 +129,9 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("image", type=Path, help="EXR file that was rendered with light_groups or path_layers")
     text = (
-        "factor of the light of a group or path layer (of one kind at a time), or three for red, green and "
-        "blue; 1 for layers that are left out; * and ? in a name stand for any characters; without any, the "
-        "layers are listed"
+        "factor of a group or path layer, or three for red, green and blue; 1 for others; * and ? in a name "
     )
+    text += "stand for any characters; without any, the layers are listed"
     add("weights", type=weight, nargs="*", metavar="LAYER=X[,Y,Z]", help=text)
     text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
     add("-o", "--output", type=Path, help=text)
@@ -159,15 +158,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     text = "value of a parameter $KEY of the scene; may be repeated"
     add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
     text = "property of the integrator, such as skip=none; may be repeated"
-    add(
-        "-P",
-        dest="properties",
-        type=property_,
-        action="append",
-        default=[],
-        metavar="K=V",
-        help=text,
-    )
+    add("-P", dest="properties", type=property_, action="append", default=[], metavar="K=V", help=text)
     text = "index of the sensor; default: %(default)s"
     add("-s", "--sensor", type=Number(int, 0), default=0, metavar="INDEX", help=text)
     text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
@@ -178,10 +169,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)
     text = "number of threads; default: one for each core"
     add("--threads", type=Number(int, 1), metavar="N", help=text)
-    text = (
-        "memory that the process may take: films that need more are an error before the first sample; "
-        "default: the limits of the machine, of its control groups and of ulimit"
-    )
+    text = "memory that the process may take; default: limits of the machine, its control groups and ulimit"
     add("--memory", type=Number(float, 1e-3), metavar="GIB", help=text)
     text = "log more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
     add("-v", "--verbose", action="count", default=0, help=text)
@@ -199,18 +187,15 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "write a checkpoint beside the image every MINUTES; deleted when the render is finished"
     add("--checkpoint", type=Number(float, 0), metavar="MINUTES", help=text)
     text = (
-        "with --checkpoint MINUTES: continue from the checkpoint of an interrupted render, auto (default) if "
-        "there is one, must (also --resume without WHEN) or end with an error, never (begin anew)"
+        "continue from the checkpoint of an interrupted render: auto (default) if there is one, must (also "
     )
+    text += "--resume without a value) or end with an error, never (begin anew)"
     add("--resume", nargs="?", choices=("auto", "must", "never"), const="must", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
     add("--statistics", type=Path, metavar="FILE", help=text)
     text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
     add("--frames", type=frames, metavar="RANGE", help=text)
-    text = (
-        "bar, lines (for logs, the first after ten seconds) or none; default: a bar on a terminal, lines "
-        "elsewhere"
-    )
+    text = "bar, lines (for logs, from ten seconds on) or none; default: a bar on a terminal, lines elsewhere"
     add("--progress", choices=KINDS, default="auto", help=text)
     text = "rewrite the PNG with the image so far every SECONDS"
     add("--preview", type=Number(float, 0), metavar="SECONDS", help=text)
@@ -222,8 +207,8 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--denoise", action="store_true", help=text)
     text = (
         "integrator to render with, or scene for the scene file's own; it takes over the file's max_depth, "
-        "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     )
+    text += "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
     text = "of the random numbers; each of the --frames adds its number; default: %(default)s"
     add("--seed", type=SEED, default=0, help=text)

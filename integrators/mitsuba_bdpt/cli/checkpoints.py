@@ -14,7 +14,7 @@ from pathlib import Path
 from ..errors import CommandError
 from ..files.images import attribute
 from ..files.loading import named_files, parsed_anyway, searching, spectra
-from ..files.whole import check_writable, replacing
+from ..files.whole import replacing
 from ..host.introspection import versions
 from ..run.snapshot import Snapshot, read
 
@@ -51,26 +51,19 @@ def identity(options: Namespace, spp: int) -> str:
     return hashlib.sha256(json.dumps(values).encode()).hexdigest()
 
 
-def is_done(options: Namespace, output: Path, spp: int) -> bool:
+def is_done(options: Namespace, spp: int) -> bool:
     """Return whether an earlier run of this command with checkpoints made the frame's image."""
     if options.frames is None or options.checkpoint is None or options.resume == "never":
         return False
-    return attribute(output, IDENTITY) == identity(options, spp)
+    return attribute(options.output, IDENTITY) == identity(options, spp)
 
 
-def check(options: Namespace, output: Path) -> None:
-    """Raise an error if no checkpoint can be written."""
-    path = path_of(output)
-    if options.checkpoint is not None:
-        check_writable(path)
-
-
-def start(options: Namespace, output: Path) -> Snapshot | None:
+def start(options: Namespace) -> Snapshot | None:
     """Return the snapshot to continue from, or None.
 
     Raises ``CommandError`` for a snapshot of another scene, or for a missing one that is required.
     """
-    path = path_of(output)
+    path = path_of(options.output)
     if options.checkpoint is None or options.resume == "never":
         return None
     if not path.exists():
@@ -95,8 +88,12 @@ def start(options: Namespace, output: Path) -> Snapshot | None:
 class Checkpoints:
     """Checkpoints of one render: `after_pass` at intervals, `write` at once."""
 
-    def __init__(self, options: Namespace, output: Path, start: Snapshot | None = None):
-        self.path, self._seconds, self._scene = path_of(output), 60 * options.checkpoint, digest(options)
+    def __init__(self, options: Namespace, start: Snapshot | None = None):
+        self.path, self._seconds, self._scene = (
+            path_of(options.output),
+            60 * options.checkpoint,
+            digest(options),
+        )
         self._kept = 0 if start is None else start.spp  # samples per pixel in the file
         self._last, self._report = time.monotonic(), None
 

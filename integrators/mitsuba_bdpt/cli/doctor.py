@@ -157,13 +157,13 @@ def variants(installed: list[str], backends: list[str]) -> Finding:
 
 def why_not(variant: str, backends: list[str]) -> str:
     """Return why bdpt cannot render with ``variant``; empty if it can."""
-    if variant.startswith("scalar"):
-        return "bdpt has no scalar variant"
-    if variant.startswith("metal"):
-        return "bdpt does not support Metal"
-    if variant.startswith("cuda"):
-        return "" if "CUDA" in backends else "no CUDA device or driver was found"
-    return "" if "LLVM" in backends else "no LLVM library was found"
+    reasons = {
+        "scalar": "bdpt has no scalar variant",
+        "metal": "bdpt does not support Metal",
+        "cuda": "" if "CUDA" in backends else "no CUDA device or driver was found",
+        "llvm": "" if "LLVM" in backends else "no LLVM library was found",
+    }
+    return reasons[variant.partition("_")[0]]
 
 
 def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Finding:

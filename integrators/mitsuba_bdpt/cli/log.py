@@ -9,13 +9,8 @@ from collections.abc import Iterator
 
 import mitsuba as mi
 
-LEVELS = {
-    mi.LogLevel.Trace: "trace",
-    mi.LogLevel.Debug: "debug",
-    mi.LogLevel.Info: "info",
-    mi.LogLevel.Warn: "warning",
-    mi.LogLevel.Error: "error",
-}
+LEVELS = {level: level.name.lower() for level in (mi.LogLevel.Trace, mi.LogLevel.Debug, mi.LogLevel.Info)}
+LEVELS |= {mi.LogLevel.Warn: "warning", mi.LogLevel.Error: "error"}
 
 # `mi.Log` prepends the name of the calling function.
 CALLER = re.compile(r"[\w<>]+(\(\))?: (?=bdpt: )")
@@ -48,8 +43,7 @@ def lines(verbose: int) -> Iterator[None]:
     logger.add_appender(_Lines())
     logger.set_formatter(own)
     if verbose:
-        levels = (mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)
-        mi.set_log_level(levels[min(verbose, len(levels)) - 1])
+        mi.set_log_level((mi.LogLevel.Info, mi.LogLevel.Debug, mi.LogLevel.Trace)[min(verbose, 3) - 1])
     try:
         yield
     finally:

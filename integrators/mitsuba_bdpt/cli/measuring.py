@@ -61,11 +61,6 @@ def integrator(text: str) -> tuple[str, dict]:
     return text, {"type": kind} | dict(map(property_, properties))
 
 
-def parameters(text: str) -> dict:
-    """Argparse type: like `integrator`, returns the parameters alone."""
-    return integrator(text)[1]
-
-
 def declare(parser: argparse.ArgumentParser, kind: type) -> None:
     """Declare the options of a measurement, a dataclass of `measure.options`."""
     for field in options.options_of(kind):
@@ -120,7 +115,15 @@ COMMANDS: dict[str, tuple] = {
         "two configurations, rendered alternately: time, error, efficiency of the first over the second",
         "compare",
         options.Compare,
-        ("sides", {"nargs": 2, "type": parameters, "metavar": "CONFIGURATION", "help": _CONFIGURATION}),
+        (
+            "sides",
+            {
+                "nargs": 2,
+                "type": lambda text: integrator(text)[1],
+                "metavar": "CONFIGURATION",
+                "help": _CONFIGURATION,
+            },
+        ),
         ("--scenes", {"nargs": "+", "required": True} | _SCENES),
     ),
     "equal-time": (

@@ -11,6 +11,7 @@ from argparse import Namespace
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -66,7 +67,6 @@ def run(options: Namespace) -> int | None:
 
 
 def _ended(command: Callable[[Ending], int]) -> int | None:
-    """Return the exit status of a ``command`` that signals end."""
     with terminable() as ending:
         status = answered(lambda: command(ending), signals.NOTHING_WRITTEN)
     return ending.status if status == INTERRUPTED else status
@@ -151,7 +151,7 @@ def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, endin
     Writing ignores signals, and the checkpoint is removed afterwards.
     """
     sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
-    if checkpoints.is_done(job, job.output, spp):
+    if checkpoints.is_done(job, spp):
         say(f"{job.output}: rendered before by the same command")
         return True
     outcome = render(scene, integrator, job, spp)
@@ -194,11 +194,7 @@ def is_open_ended(options: Namespace) -> bool:
 
 
 def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
-    """Write the image of a job with these attributes.
-
-    If that fails (a network drive, for example), writes it to the system's temporary folder and raises an
-    error with its path.
-    """
+    """Write the image of a job; where that fails into a temporary folder, which the error names."""
     try:
         write_images(film, job.output, attributes, job.exposure)
     except OSError as error:
@@ -253,7 +249,8 @@ def check_options(options: Namespace) -> None:
                 f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is not "
                 f"possible: the option sets {name} itself; leave out one or the other."
             )
-    checkpoints.check(options, options.output)
+    if options.checkpoint is not None:
+        check_writable(checkpoints.path_of(options.output))
 
 
 def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
@@ -278,7 +275,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
         return render_here(scene, integrator, options, spp, watchers)
     started = time.perf_counter()
     with closing(display(options.progress)) as shown:
-        watch = all_of([shown, *watchers])
+        watch = partial(_call_all, [shown, *watchers])
         statistics, ended = cluster.render(scene, integrator, options, spp, watch)
     seconds, done = time.perf_counter() - started, sum(statistics["passes"])
     error = ended if isinstance(ended, Exception) else None
@@ -306,9 +303,9 @@ class Preview:
         self._last = time.monotonic()
 
 
-def all_of(watchers: list[Callable]) -> Callable[[PassReport], object]:
-    """Return a function that calls all ``watchers`` with a report."""
-    return lambda report: [watcher(report) for watcher in watchers]
+def _call_all(watchers: Iterable[Callable], report: PassReport) -> None:
+    for watcher in watchers:
+        watcher(report)
 
 
 def render_here(scene, integrator, options: Namespace, spp: int, watchers: list) -> Outcome:
@@ -316,16 +313,16 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     started, interrupted = time.perf_counter(), False
     integrator.statistics = {}  # not those of the previous render
     kept, limit = None, options.time
-    start = checkpoints.start(options, options.output)
+    start = checkpoints.start(options)
     if start is not None:
         total = start.identity["spp"]
         print(f"resume: the checkpoint has {start.spp} of {total} samples per pixel", file=sys.stderr)
         limit = limit and limit + start.progress.work.seconds
     if options.checkpoint is not None:
-        kept = checkpoints.Checkpoints(options, options.output, start)
+        kept = checkpoints.Checkpoints(options, start)
         watchers = [kept.after_pass, *watchers]
     with closing(display(options.progress, limit, is_open_ended(options))) as shown:
-        integrator.on_pass = all_of([*watchers, shown])
+        integrator.on_pass = partial(_call_all, [*watchers, shown])
         try:
             integrator.render(scene, options.sensor, options.seed, spp, develop=False, start=start)
             dr.sync_thread()
@@ -382,10 +379,8 @@ def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
 
 def settings(options: Namespace, spp: int) -> dict:
     """Return the command line as JSON values."""
-    values = {key: str(v) if isinstance(v, Path) else v for key, v in vars(options).items()}
-    values |= {"spp": spp, "defines": dict(options.defines), "append": list(map(str, options.append))}
-    values["properties"] = dict(options.properties)
-    return values
+    pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
+    return {key: plain(value) for key, value in (vars(options) | {"spp": spp} | pairs).items()}
 
 
 def report(outcome: Outcome) -> dict:
