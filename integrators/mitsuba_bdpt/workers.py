@@ -80,8 +80,8 @@ def _result(future, index: int):
 
 
 def worker_count(client) -> int:
-    """Return the number of workers of a ``distributed.Client``."""
-    return len(client.scheduler_info(n_workers=-1)["workers"])
+    """Return the number of workers of a ``distributed.Client``; 0 while it has no scheduler."""
+    return len(client.scheduler_info(n_workers=-1).get("workers", ()))
 
 
 @contextmanager

@@ -49,10 +49,9 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
     "name, merges", [("cornell_box", False), ("fog_lamp", False), ("smallvcm_cornell_point", True)]
 )
 def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, merges):
-    """Expected: the image is that of the same parts rendered here one after the other and joined, also with
-    merging, whose radius goes on from part to part; the pilot ran once, its decisions are in the statistics.
-    Tolerance: rounding of atomic sums and of half precision.
-    """
+    """The image is that of the same parts rendered here one after the other and joined, also with merging,
+    whose radius goes on from part to part; the pilot ran once, its decisions are in the statistics.
+    Tolerance: rounding of atomic sums and of half precision."""
     path, given = SCENE.with_stem(name), ["-P", "merging=true"] * merges
     assert main(arguments(workers, tmp_path / "a.exr", *given, scene=path)) == 0
     pixels, statistics = rendered.image(tmp_path / "a.exr", "RGB")
@@ -95,10 +94,6 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     [([], True), ([("skip", "none")], False), ([("light_paths", 0)], False), ([("merging", True)], True)],
 )
 def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
-    """Expected: parts of a render whose strategies parameters fix have these alone, since decisions beside
-    them are contradictory; parts of others have the client's decisions, none of a render without a pilot.
-    They merge if the client does: a snapshot with another parameter is that of another render, also where the
-    scene has nothing to merge."""
     arguments = ["render", str(SCENE), "--spp", "1", "-D", "resolution=8"]
     options = build_parser().parse_args(arguments)
     options.properties = properties
@@ -110,9 +105,8 @@ def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
 
 
 def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
-    """Rationale: each part has statistics of its own, in which there was no pilot. Expected: its seconds, the
-    values that it lost (as the client counts them, here 7) and why it leaves strategies out are those of the
-    pilot that the client asked; with decisions by hand there are none."""
+    """Its seconds, the values that it lost (as the client counts them, here 7) and why it leaves strategies
+    out are those of the pilot that the client asked; with decisions by hand there are none."""
     measure = pilot.measure
     monkeypatch.setattr(pilot, "measure", lambda *a: replace(measure(*a), non_finite=7))
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
@@ -129,8 +123,6 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
 
 
 def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch):
-    """Expected: with a worker killed in the middle the render ends with the same image and the same counts of
-    rays: its part is made by another worker, with the same seed, and counted once."""
     assert main(arguments(workers, tmp_path / "calm.exr")) == 0
     killed = []
     original = cluster.Merged.add
@@ -155,8 +147,7 @@ def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch)
 
 
 def test_parts_are_added_in_their_order():
-    """Rationale: the sum of doubles depends on the order. Expected: whatever comes first, parts are joined
-    0, 1, 2, …; a second copy of one is ignored."""
+    """Whatever comes first, parts are joined 0, 1, 2, …; a second copy of one is ignored."""
 
     class Text:
         def __init__(self, text):
@@ -172,8 +163,6 @@ def test_parts_are_added_in_their_order():
 
 
 def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
-    """Expected: with two workers of which one never ends its part, the other ends it in the end; each
-    index comes once."""
     released = threading.Event()
 
     class Future:
@@ -222,7 +211,6 @@ def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
 
 
 def test_a_failing_part_is_named(workers):
-    """Expected: what a worker raises ends the render with one message, not with silence."""
     failed = pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error")
     with connected(workers.scheduler_address) as cluster, failed:
         list(results(cluster, math.sqrt, [(-1.0,)]))
@@ -230,9 +218,8 @@ def test_a_failing_part_is_named(workers):
 
 @pytest.mark.parametrize("come", [0, 3])
 def test_parts_that_have_come_are_kept(workers, tmp_path, monkeypatch, capsys, come):
-    """Rationale: hours of a farm must not be lost with one part, or with the scheduler. Expected: an image of
-    those that had come before, though the first of all is missing, the error, and exit status 1; no image
-    where none had."""
+    """An image of those that had come before, though the first of all is missing, the error, and exit status
+    1; no image where none had."""
     original = cluster.results
 
     def broken(*given):
@@ -249,8 +236,8 @@ def test_parts_that_have_come_are_kept(workers, tmp_path, monkeypatch, capsys, c
 
 
 def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
-    """Rationale: workers keep the scene of a render. Expected: after an edit of the file, the next render on
-    the same workers shows it: twice the light, twice the mean (10 % for noise)."""
+    """After an edit of the file, the next render on the same workers shows it: twice the light, twice the
+    mean (10 % for noise)."""
     scene = tmp_path / "scene.xml"
     means = []
     for radiance in ("1", "2"):

@@ -49,9 +49,6 @@ def test_installed_script_survives_a_failing_import_too():
 
 
 def test_what_the_command_itself_does_not_need_may_be_missing(tmp_path):
-    """Rationale: it says what to install. Expected: without NumPy and rich it names the failing import, and
-    there is no traceback.
-    """
     for name in ("numpy", "rich"):
         (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')")
     done = command("doctor", PYTHONPATH=str(tmp_path))
@@ -86,8 +83,6 @@ def test_error_of_the_child_is_repeated():
 
 
 def test_a_variant_without_its_device_says_why():
-    """Rationale: Dr.Jit's own error about a missing driver names its initialization, which is no remedy.
-    Expected: the reason that the line of the variants gives; other errors as they are."""
     last = "Traceback\nImportError: jit_init_thread_state(): the CUDA backend hasn't been initialized.\n"
     for backends, text in (
         ('["LLVM"]', "cuda_ad_rgb cannot render here: no CUDA device or driver was found"),
@@ -114,7 +109,6 @@ def test_hanging_child_is_a_failure():
 
 
 def test_which_variants_can_render_here():
-    """Expected: each variant once, with the reason where it cannot."""
     installed = ["scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb", "metal_ad_rgb"]
     finding = doctor.variants(installed, ["LLVM"])
     assert finding.state == "ok" and finding.text.startswith(

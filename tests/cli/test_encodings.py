@@ -36,8 +36,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_output_does_not_fail_for_its_encoding(monkeypatch):
-    """Rationale: a pipe on Windows has cp1252, and a path that it lacks ended the command after the render.
-    Expected: such characters are escaped, and the exit status is 0."""
+    """Such characters are escaped, and the exit status is 0."""
     for name in ("stdout", "stderr"):
         monkeypatch.setattr(sys, name, io.TextIOWrapper(io.BytesIO(), encoding="cp1252"))
     assert [main(command) for command in COMMANDS] == [0, 0, 0]
@@ -49,7 +48,6 @@ def test_output_does_not_fail_for_its_encoding(monkeypatch):
 
 
 def test_commands_in_a_locale_of_ascii():
-    """Expected: files whose names are not ASCII are read and written, and ids are those of the scene."""
     ascii_alone = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     code = "import sys, mitsuba_bdpt.cli.arguments as a; sys.exit(a.main(sys.argv[1:]))"
     for command in ([*RENDER, "--checkpoint", "0"], *COMMANDS[1:]):
@@ -63,8 +61,6 @@ def test_commands_in_a_locale_of_ascii():
 
 
 def test_what_utf8_cannot_write():
-    """Expected: an error in words for a file name in another encoding, which Mitsuba cannot open; texts have
-    such characters escaped."""
     name = os.fsdecode(b"sc\xe9ne.xml")
     os.rename("光.xml", name)
     assert main(["render", name, "--spp", "1"]) == 2
@@ -75,7 +71,6 @@ def test_what_utf8_cannot_write():
 
 
 def test_files_of_text_have_an_encoding():
-    """Expected: no file is read or written in the encoding of the locale, but those of the system (host)."""
     text = re.compile(r"\.(read|write)_text\((?!.*encoding)|\bopen\((?!.*(b\"|encoded))")
     files = [file for file in Path(mitsuba_bdpt.__file__).parent.rglob("*.py") if file.parent.name != "host"]
     lines = [line for file in files for line in file.read_text(encoding="utf-8").splitlines()]

@@ -35,9 +35,8 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_sigterm_ends_as_ctrl_c_does():
-    """Rationale: farms end renders by SIGTERM, and by SIGKILL some seconds later. Expected: what is done is
-    written, an image and a checkpoint, and the exit status is 128 + 15; a second signal changes nothing.
-    """
+    """What is done is written, an image and a checkpoint, and the exit status is 128 + 15; a second signal
+    changes nothing."""
     command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "4000000", "--checkpoint", "600"]
     process = subprocess.Popen(
         [*command, "-o", "ended.exr", "--preview", "0"],
@@ -59,10 +58,9 @@ def test_sigterm_ends_as_ctrl_c_does():
 
 
 def test_size_and_crop():
-    """Expected: the image's size and its proportions are those asked for; a crop window is that part of the
-    whole image, by other points: of all parts of that size it is nearest to the one that was asked for, by
-    far (measured: 0.03 there, 0.88 one pixel beside it).
-    """
+    """The image's size and its proportions are those asked for; a crop window is that part of the whole
+    image, by other points: of all parts of that size it is nearest to the one that was asked for, by far
+    (measured: 0.03 there, 0.88 one pixel beside it)."""
     arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "64"]
     assert main([*arguments, "-o", "whole.exr"]) == 0
     whole = rendered.image("whole.exr", "RGB")[0]
@@ -92,10 +90,6 @@ LAMP = (
 
 
 def test_size_leaves_meters_alone(capsys):
-    """Rationale: a meter has a film of one pixel, which belongs to its shape or ray; a radiance meter with
-    another one fails in Mitsuba. Expected: the camera beside it has the size that was asked for; where the
-    meter itself is rendered, an error names the option.
-    """
     Path("meters.xml").write_text(
         f'<scene version="3.0.0">{LAMP}<film type="hdrfilm" id="pixel"><integer name="width" value="1"/>'
         '<integer name="height" value="1"/><rfilter type="box"/></film>'
@@ -120,9 +114,7 @@ def test_size_leaves_meters_alone(capsys):
 
 
 def test_equal_meters_on_two_shapes():
-    """Rationale: Mitsuba's loader makes one of equal objects, and a sensor can be on one shape alone.
-    Expected: a file with two equal meters loads; each reads the irradiance of its own small plate, 3 h / r^3.
-    """
+    """A file with two equal meters loads; each reads the irradiance of its own small plate, 3 h / r^3."""
     sensor = f'<sensor type="irradiancemeter">{PIXEL}</sensor>'
     plates = "".join(
         f'<shape type="rectangle"><transform name="to_world"><scale value="0.01"/><translate x="{x}"/>'
@@ -139,8 +131,6 @@ def test_equal_meters_on_two_shapes():
 
 
 def test_meshes_that_mitsuba_cannot_merge():
-    """Rationale: the inner side of hollow glass has ``flip_normals``, and Mitsuba merges no such mesh with
-    another. Expected: the file renders, by the command and in a sweep."""
     walls = "".join(
         f'<shape type="cube"><transform name="to_world"><scale value="{size}"/></transform>'
         f'<boolean name="flip_normals" value="{flipped}"/><ref id="glass"/></shape>'
@@ -216,9 +206,6 @@ def sensors(count):
 
 
 def test_frames_are_sensors(capsys):
-    """Expected: an image of each, with its number in the name, of a seed of its own; a sensor that is not
-    there, and options of one image, are errors before any is rendered.
-    """
     sensors(3)
     assert main(["render", "frames.xml", "--frames", "0-2:2", "--spp", "2", "-o", "out/shot.exr"]) == 0
     assert sorted(p.name for p in Path("out").glob("*.exr")) == ["shot.0000.exr", "shot.0002.exr"]
@@ -242,10 +229,6 @@ def test_frames_are_sensors(capsys):
 
 
 def test_frames_go_on_where_they_were(capsys, monkeypatch):
-    """Rationale: a queue repeats a command of a hundred frames that was ended at the fifty-seventh. Expected:
-    with checkpoints, frames that are done are not rendered again by the same command, the one that was
-    interrupted goes on, the others begin; by another command, or an edited scene, all are.
-    """
     sensors(3)
     arguments = ["render", "frames.xml", "--frames", "0-2", "--spp", "8", "-P", "spp_per_pass=2"]
     arguments += ["-o", "shot.exr", "--checkpoint", "60", "--statistics", "shot.json"]
@@ -286,8 +269,6 @@ def test_frames_go_on_where_they_were(capsys, monkeypatch):
 
 
 def test_frames_keep_scene_and_kernels():
-    """Expected: the scene is loaded once, and only its first frame compiles kernels, though the sensors
-    differ in place and angle."""
     sensors(3)
     text = Path("frames.xml").read_text()
     for number, angle in enumerate((30, 40, 50)):
@@ -301,8 +282,6 @@ def test_frames_keep_scene_and_kernels():
 
 
 def test_statistics_are_a_file(capsys):
-    """Expected: what the header of the image has, with settings and memory, as JSON without Infinity or NaN;
-    a folder that is made; an error before the render where it cannot be written."""
     arguments = [*SMALL, "--spp", "8", "-o", "a.exr", "--statistics"]
     assert main([*arguments, "new/a.json", "-P", "layers=variance"]) == 0
     text = Path("new/a.json").read_text()
@@ -318,15 +297,11 @@ def test_statistics_are_a_file(capsys):
 
 
 def test_plain_values_are_json():
-    """Expected: statistics become values that JSON knows: non-finite numbers None, paths and others text."""
     odd = {"a": [math.inf, 1.5, (np.float64(2), np.float32(3))], 4: None, "b": {"c": Path("x")}, "d": True}
     assert render.plain(odd) == {"a": [None, 1.5, [2.0, "3.0"]], "4": None, "b": {"c": "x"}, "d": True}
 
 
 def test_files_elsewhere(capsys):
-    """Expected: a texture in a folder that is appended is found, and is part of what a checkpoint belongs to;
-    a folder that is not there is an error.
-    """
     Path("textures").mkdir()
     Path("scene").mkdir()
     mi.Bitmap(np.full((2, 2, 3), 0.5, np.float32)).write("textures/appended_sky.exr")
@@ -347,7 +322,6 @@ def test_files_elsewhere(capsys):
 
 
 def test_a_film_that_takes_more_memory_than_is_asked_for_is_refused_before_the_render(capsys):
-    """Expected: at once, by render and explain, with the size and what there is."""
     for command in ("render", "explain"):
         assert main([command, str(SCENE), "--size", "4096x4096", "--spp", "1", "--memory", "2"]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
@@ -356,7 +330,6 @@ def test_a_film_that_takes_more_memory_than_is_asked_for_is_refused_before_the_r
 
 
 def test_threads_and_log(capfd):
-    """Expected: Dr.Jit has one thread; -v shows what the integrator logs, with its time."""
     before, level = dr.thread_count(), mi.log_level()
     try:
         assert main([*SMALL, "--spp", "1", "--threads", "1", "-v"]) == 0
@@ -378,7 +351,6 @@ WARNED = """<scene version="3.0.0">
 
 
 def test_a_warning_is_one_line_on_standard_error(tmp_path, capfd):
-    """Expected: its text alone: no colours, no name of a function, no date; the log is as before then."""
     scene = tmp_path / "scene.xml"
     scene.write_text(WARNED)
     output = str(tmp_path / "a.exr")
@@ -399,8 +371,7 @@ def test_version_names_mitsubas(capsys):
 
 
 def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_path):
-    """Rationale: a network drive may be there when a render begins and gone when it ends. Expected: the image
-    is among the temporary files, the error says where, and the exit status is 1."""
+    """The image is among the temporary files, the error says where, and the exit status is 1."""
     original = render.write_images
 
     def gone(film, output, *others):
@@ -418,8 +389,6 @@ def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_p
 
 
 def test_a_scheduler_that_does_not_answer_is_said_soon(capsys, monkeypatch):
-    """Expected: of an address where nothing answers, though it can be reached, an error, once the time is
-    over that a scheduler has: some seconds (half a one here; what the rest takes depends on the load)."""
     assert 1 <= workers.ANSWERS_WITHIN <= 5
     monkeypatch.setattr(workers, "ANSWERS_WITHIN", 0.5)
     with socket.create_server(("127.0.0.1", 0), backlog=1) as silent:
@@ -429,7 +398,6 @@ def test_a_scheduler_that_does_not_answer_is_said_soon(capsys, monkeypatch):
 
 
 def test_a_preview_is_rewritten(monkeypatch):
-    """Expected: the PNG is there, with the image so far, before the EXR is; the last one is the EXR's."""
     seen, write = [], render.write_png
 
     def noted(film, bitmap, path, exposure):
@@ -451,8 +419,6 @@ def test_a_preview_is_rewritten(monkeypatch):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_load_at_once(number):
-    """Rationale: Mitsuba's loader leaves no time to handlers of Python. Expected: the command ends within the
-    load of a mesh whose file is a pipe that nobody writes, in one line, with the status of the signal."""
     os.mkfifo("mesh.ply")
     mesh = '<shape type="ply"><string name="filename" value="mesh.ply"/></shape>'
     Path("scene.xml").write_text(f'<scene version="3.0.0">{mesh}</scene>')
@@ -466,7 +432,6 @@ def test_a_signal_ends_a_load_at_once(number):
 
 @pytest.mark.parametrize("command", ["render", "explain"])
 def test_a_signal_while_an_import_loads_is_answered_after_it(monkeypatch, capsys, command):
-    """Rationale: an exception of a handler within an import of Mitsuba became a ``SystemError``."""
 
     def load(options):
         try:
@@ -480,11 +445,6 @@ def test_a_signal_while_an_import_loads_is_answered_after_it(monkeypatch, capsys
 
 
 def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
-    """Rationale: farms send a signal, and another one some seconds later, whatever is being done.
-
-    Expected: an image that is being written gets whole, and a finished render's checkpoint goes after that;
-    the exit status is that of the signal.
-    """
     write = render.write_images
 
     def interrupted(*arguments):
@@ -499,9 +459,6 @@ def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
 
 
 def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, capsys):
-    """Rationale: disks are full in the end, not at the start. Expected: an error with the file and a remedy,
-    and a checkpoint to go on from, of which --resume writes the image at once.
-    """
 
     def full(*arguments):
         raise OSError(28, "No space left on device", "a.exr")
@@ -517,7 +474,6 @@ def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, caps
 
 
 def test_nobody_listens_any_more():
-    """Expected: a render whose standard output is closed writes its image and ends well."""
     command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "8", "-o", "a.exr"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.close()

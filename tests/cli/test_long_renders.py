@@ -44,10 +44,9 @@ main(sys.argv[1:])"""
 
 
 def test_a_killed_render_is_resumed():
-    """Rationale: machines are switched off. Expected: a render that got SIGKILL between its checkpoints goes
-    on with --resume and ends with the image and the counts of the uninterrupted one; the checkpoint is
-    removed. Tolerance: the rounding of atomic sums, and half precision in the file.
-    """
+    """A render that got SIGKILL between its checkpoints goes on with --resume and ends with the image and the
+    counts of the uninterrupted one; the checkpoint is removed. Tolerance: the rounding of atomic sums, and
+    half precision in the file."""
     spp = ["--spp", "256"]
     assert main([*ARGUMENTS, *spp, "-o", "whole.exr"]) == 0
     expected, whole = rendered.image("whole.exr")
@@ -82,9 +81,6 @@ def interrupt(monkeypatch, arguments, after=3):
 
 
 def test_the_same_command_goes_on_or_begins(monkeypatch, capsys):
-    """Rationale: a queue repeats a command that was ended, word for word. Expected: it begins without a
-    checkpoint and goes on with one, to the image of the uninterrupted render; ``--resume never`` begins anew
-    in place of the checkpoint."""
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     assert main([*ARGUMENTS, "--spp", "32", "-o", "whole.exr"]) == 0
     expected = rendered.image("whole.exr")[0]
@@ -101,8 +97,6 @@ def test_the_same_command_goes_on_or_begins(monkeypatch, capsys):
 
 
 def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsys):
-    """Expected: Ctrl-C writes a checkpoint at once, whatever the minutes; going on needs the same scene and
-    parameters; ``--resume`` alone needs a checkpoint."""
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     interrupt(monkeypatch, arguments)
     assert read(Path("a.checkpoint.npz")).spp < 32
@@ -127,8 +121,6 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
     [(0, "checkpoint 'a.checkpoint.npz' is missing: no later pass was over"), (1, "checkpoint 'a.ch")],
 )
 def test_ctrl_c_within_a_pass_tells_what_the_checkpoint_lacks(monkeypatch, capsys, after, text):
-    """Rationale: the image had the pass, the checkpoint did not, and the next run began anew without a word.
-    Expected: a line names the samples of both; what is there is gone on from."""
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     original, reports = Render.report, []
 
@@ -170,9 +162,6 @@ PART = """<scene version="3.0.0">
 
 
 def test_what_a_scene_names_is_part_of_it():
-    """Expected: whatever a scene file names, in any order of attributes, by a parameter, in a file that it
-    includes and in one that this includes, beside the scene file or in a <path> of it: an edit of it makes
-    another scene. What stands in a comment is not named."""
     Path("more/meshes").mkdir(parents=True)
     files = ["turned.ply", "default.exr", "light.spd", "more/meshes/inner.obj", "more/plain.xml"]
     for name in [*files, "given.exr", "gone.ply"]:
@@ -197,9 +186,6 @@ def test_what_a_scene_names_is_part_of_it():
 
 
 def test_many_files_of_a_scene(monkeypatch):
-    """Rationale: scenes of ten thousand meshes exist, many of which share a texture. Expected: each file
-    once, in the order of the scene file, and found without comparing it with those before it: fewer than
-    two comparisons of paths per name."""
     names = [f"{i}.ply" for i in range(100)]
     for name in names:
         Path(name).write_text("a mesh")
@@ -218,9 +204,6 @@ def test_many_files_of_a_scene(monkeypatch):
     "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin1"]
 )
 def test_encodings_of_a_scene_file(encoding):
-    """Rationale: Mitsuba takes more encodings than UTF-8, such a file with a byte order mark or without one,
-    and comments that XML does not. Expected: what the file names is found, and a render with checkpoints
-    begins."""
     name = "k\u00fche.ply"
     Path(name).write_text("a mesh")
     shape = f'<shape type="ply"><string name="filename" value="{name}"/></shape>'
@@ -236,7 +219,6 @@ def test_encodings_of_a_scene_file(encoding):
 
 
 def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
-    """Rationale: the image would be half of one scene, half of the other."""
     Path("a.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')
     Path("part.xml").write_text(SCENE.read_text())
     command = [ARGUMENTS[0], "a.xml", *ARGUMENTS[2:]]
@@ -250,9 +232,6 @@ def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
 
 
 def test_an_interruption_inside_a_pass(monkeypatch):
-    """Rationale: Ctrl-C comes while a pass is being traced, not between two. Expected: what is written is the
-    state after the last whole pass (here also the end of a replicate), and the render that goes on from it
-    is the uninterrupted one, its estimate of the error included."""
     arguments = [*ARGUMENTS, "--spp", "63", "-P", "layers=variance"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0
     original, close_pass, waits, closed = Meter.wait, Accumulator.close_pass, [], []
@@ -280,7 +259,6 @@ def test_an_interruption_inside_a_pass(monkeypatch):
 
 
 def test_an_hour_a_night():
-    """Expected: a render that --time ends keeps its checkpoint and goes on the next time, where it was."""
     arguments = [*ARGUMENTS, "--time", "0.2", "-o", "a.exr", "--checkpoint", "60"]
     assert main(arguments) == 0
     first = read(Path("a.checkpoint.npz")).spp
@@ -301,8 +279,6 @@ def test_a_full_disk_does_not_cost_the_render(monkeypatch, capsys):
 
 
 def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
-    """Rationale: killed between its last pass and the image. Expected: --resume writes the image of the
-    passes that there are."""
     arguments = [*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr", "--checkpoint", "0"]
     with monkeypatch.context() as patch:
         patch.setattr(checkpoints.Checkpoints, "remove", lambda self: None)
@@ -329,8 +305,8 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
 
 
 def test_until_an_error(capsys):
-    """Expected: the render ends at 2^n * 32 spp with an estimate below what is asked for, and the image
-    has the layers of the variance."""
+    """The render ends at 2^n * 32 spp with an estimate below what is asked for, and the image has the layers
+    of the variance."""
     assert main([*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr"]) == 0
     channels = OpenEXR.File("a.exr", separate_channels=True).channels()
     assert "variance.R" in channels
@@ -368,8 +344,6 @@ def test_defaults_of_the_command_line():
 
 
 def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
-    """Expected: with the parameters instead of --target-error the checkpoint goes as well when the error is
-    reached, and the closing line says so when it is not."""
     asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "layers=variance", "-o", "a.exr"]
     assert main([*asked, "--spp", "1024", "-P", "target_error=0.5"]) == 0
     assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out

@@ -39,8 +39,6 @@ def rendered(path, alpha=False, groups=GROUPS, paths=(), features=(), lamps=None
 
 @pytest.mark.parametrize("alpha", [False, True])
 def test_the_command_scales_the_layers(tmp_path, alpha):
-    """Expected: an EXR of the scaled layers' sum, exactly, with the alpha of the image, and a PNG; a group
-    that is left out keeps its weight."""
     layers = rendered(tmp_path / "a.exr", alpha)
     output = tmp_path / "mixed.exr"
     assert main(["mix", str(tmp_path / "a.exr"), "sky=0.2,0.5,0.25", "-o", str(output)]) == 0
@@ -52,7 +50,6 @@ def test_the_command_scales_the_layers(tmp_path, alpha):
 
 
 def test_a_png_lies_beside_the_image(tmp_path):
-    """Expected: without an output the PNG is IMAGE.mixed.png; two stops more are four times the weights."""
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "key=0.1", "sky=0.2", "--exposure", "2"]) == 0
     bright = np.array(mi.Bitmap(str(tmp_path / "a.mixed.png")))
@@ -61,8 +58,6 @@ def test_a_png_lies_beside_the_image(tmp_path):
 
 
 def test_path_layers_are_mixed_like_groups(tmp_path):
-    """Expected: weights of path layers scale these, beside light groups too; names may have the prefix of
-    their kind."""
     rendered(tmp_path / "a.exr", groups=(), paths=PATHS)
     mixed = np.array(mix(tmp_path / "a.exr", {"caustic": 2, "direct": (0, 1, 1)}))
     assert (mixed == np.array([21.0, 23.0, 23.0])).all()
@@ -73,7 +68,6 @@ def test_path_layers_are_mixed_like_groups(tmp_path):
 
 
 def test_names_may_be_patterns(tmp_path):
-    """Expected: * and ? stand for any characters, of layers of one kind; exact names win over patterns."""
     names = ("lamp-key", "lamp-fill", "emit")
     layers = rendered(tmp_path / "a.exr", groups=names, paths=PATHS)
 
@@ -90,7 +84,6 @@ def test_names_may_be_patterns(tmp_path):
 
 
 def test_without_weights_the_layers_are_listed(tmp_path, capsys):
-    """Expected: a line for each layer, with the emitters of each light group."""
     lamps = {"A_1_2": [["A.1", "bulb"]], "desk": [["Key Light"], ["Lämpchen=1"]], "none": []}
     rendered(tmp_path / "a.exr", groups=lamps, paths=PATHS, lamps=lamps)
     assert main(["mix", str(tmp_path / "a.exr")]) == 0
@@ -101,8 +94,6 @@ def test_without_weights_the_layers_are_listed(tmp_path, capsys):
 
 
 def test_a_pattern_may_match_no_layer(tmp_path, capsys):
-    """Rationale: one command mixes all shots. Expected: a warning, and the mix of the other weights, whose
-    kind counts; errors for a name in full, and for an invalid weight."""
     layers = rendered(tmp_path / "a.exr", groups=("key", "rest"), paths=PATHS)
     output = ["-o", str(tmp_path / "b.exr")]
     assert main(["mix", str(tmp_path / "a.exr"), "torch*=2", "key=0", *output]) == 0
@@ -120,7 +111,6 @@ def test_a_pattern_may_match_no_layer(tmp_path, capsys):
 
 
 def test_a_mix_records_its_weights(tmp_path):
-    """Expected: the header of a mixed EXR has the weights of each layer that an argument names."""
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "k*=0.5,1,2", "-o", str(tmp_path / "b.exr")]) == 0
     assert json.loads(attribute(tmp_path / "b.exr", "bdptMix") or "") == {"groups.key": [0.5, 1, 2]}
@@ -133,7 +123,7 @@ def test_a_mix_records_its_weights(tmp_path):
 
 
 def test_a_denoised_render_is_mixed_with_its_noise(tmp_path, capsys):
-    """Expected: a line says so where the file has a denoised image, and none elsewhere."""
+    """A line says so where the file has a denoised image, and none elsewhere."""
     for features, count in (((), 0), ([f"denoised.{c}" for c in "RGB"], 1)):
         rendered(tmp_path / "a.exr", features=features)
         assert main(["mix", str(tmp_path / "a.exr"), "key=2", "-o", str(tmp_path / "b.png")]) == 0
@@ -142,7 +132,6 @@ def test_a_denoised_render_is_mixed_with_its_noise(tmp_path, capsys):
 
 
 def test_weights_may_be_colours(tmp_path):
-    """Expected: colours of scalar and vectorised variants are three numbers."""
     layers = rendered(tmp_path / "a.exr")
     expected = layers["sky"] + layers["key"] * np.array([1.0, 2.0, 3.0])
     for weight in (mi.Color3f(1, 2, 3), mi.ScalarColor3f(1, 2, 3), [1, 2, 3]):
@@ -162,7 +151,6 @@ def test_weights_may_be_colours(tmp_path):
     ],
 )
 def test_weights_of_both_kinds(tmp_path, weights, words):
-    """Expected: an error that names the layers and what to do."""
     rendered(tmp_path / "a.exr", groups=("direct", "sky"), paths=PATHS)
     with pytest.raises(CommandError, match=words):
         mix(tmp_path / "a.exr", weights)
@@ -184,14 +172,12 @@ def test_weights_of_both_kinds(tmp_path, weights, words):
     ],
 )
 def test_what_cannot_be_mixed(tmp_path, weights, words):
-    """Expected: an error that names the group, the value and what to do."""
     rendered(tmp_path / "a.exr")
     with pytest.raises(CommandError, match=words):
         mix(tmp_path / "a.exr", weights)
 
 
 def test_images_that_cannot_be_mixed(tmp_path, capsys):
-    """Expected: errors for no image, one without groups, and other files; by the command in one line."""
     rendered(tmp_path / "a.exr", groups=())
     with pytest.raises(CommandError, match="has no layers of light groups or paths; give the EXR"):
         mix(tmp_path / "a.exr", {})
@@ -219,8 +205,6 @@ def test_images_that_cannot_be_mixed(tmp_path, capsys):
 
 
 def test_features_are_no_layers(tmp_path):
-    """Expected: channels named like layers, but without a layer's name or with other colours than the
-    image, are not mixed; a file that has no others has no layers."""
     features = [f"groups.{c}" for c in "RGB"] + ["path.T", "groups.n.X", "groups.n.Y", "groups.n.Z"]
     layers = rendered(tmp_path / "a.exr", features=features)
     assert np.array_equal(np.array(mix(tmp_path / "a.exr", {"key": 0})), layers["sky"])
@@ -236,8 +220,6 @@ def test_features_are_no_layers(tmp_path):
     ("own", "colours"), [("RGB", "RGB"), ("Y", "RGB"), ("XYZ", "RGB"), (("low", "high"), ("low", "high"))]
 )
 def test_layers_have_the_colours_of_the_film(own, colours, depth):
-    """Expected: layers of films of luminance or XYZ are RGB, and so is their mix; those of a ``specfilm``
-    have its bands; depth that is called Z is none."""
     names = [*dict.fromkeys([*own, *depth]), "A", *(f"path.direct.{c}" for c in colours)]
     pixels = np.full((2, 2, len(names)), 2.0, dtype=np.float32)
     mixed = mix(mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, names), {"direct": 3})
@@ -246,8 +228,6 @@ def test_layers_have_the_colours_of_the_film(own, colours, depth):
 
 
 def test_a_layer_of_weight_0_is_left_out(tmp_path):
-    """Rationale: half precision overflows to infinity at 65504. Expected: infinite light of a layer that
-    is switched off is not in the mix."""
     pixels = np.full((2, 2, 9), 1.0, dtype=np.float32)
     pixels[..., :6] = np.inf
     names = ["R", "G", "B", *(f"groups.{g}.{c}" for g in GROUPS for c in "RGB")]
@@ -258,8 +238,6 @@ def test_a_layer_of_weight_0_is_left_out(tmp_path):
 
 @pytest.mark.parametrize("output", ["a.exr", "A/../a.exr", "link.exr", "a.png", "linked.exr"])
 def test_a_mix_does_not_replace_its_image(tmp_path, output, capsys, monkeypatch):
-    """Expected: an error where the output is the image that is mixed, or the PNG beside it, by whichever
-    spelling or link of the path; both files keep their content."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "A").mkdir()
     rendered(tmp_path / "a.exr")

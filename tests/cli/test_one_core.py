@@ -37,10 +37,6 @@ print(dr.thread_count(), status)
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes cannot be pinned here")
 def test_images_are_read_and_written_on_one_processor(tmp_path):
-    """Rationale: Mitsuba's EXR reader and writer wait for another thread than the caller's. Expected: images
-    of the user, maps of a scene, renders and mixes are read and written on one processor, also if the user
-    sets one thread, restored after the last caller. A process that hangs is killed after ten minutes.
-    """
     (tmp_path / "scene.xml").write_text(SCENE)
     for threads, count in (("default", 2), ("own", 1)):
         command = [sys.executable, "-c", PINNED, threads]

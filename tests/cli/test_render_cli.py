@@ -135,8 +135,6 @@ def test_definitions_seed_spp_and_exposure(scene):
 
 
 def test_a_width_changes_the_height_in_proportion(scene):
-    """Expected: of a file whose film has both; not where the height is given, not of a film that is square
-    in any case, and nothing of text that is not XML, about which Mitsuba has its own words."""
     heights = """<default value="256" name="resolution"/><default name="resolution_y" value="144"/>"""
     film = '<film type="hdrfilm">'
     film = f'{film}<integer name="width" value="$resolution"/><integer name="height" value="$resolution_y"/>'
@@ -152,8 +150,8 @@ def test_a_width_changes_the_height_in_proportion(scene):
 
 
 def test_film_component_format_is_kept(scene):
-    """Expected: but for features that are no colours: half floats are exact up to 2,048. Depth that is called
-    Z, or a layer's Z, has that name, which compositors look for."""
+    """But for features that are no colours: half floats are exact up to 2,048. Depth that is called Z, or a
+    layer's Z, has that name, which compositors look for."""
     aovs = "aovs=Z:depth,far.Z:depth,d:depth,p:position,al:albedo"
     assert (
         main(["render", str(scene), "-Dformat=float16", "-Dintegrator=bdpt", "-P", aovs, "-o", "half.exr"])
@@ -181,8 +179,8 @@ def test_aovs_are_kept_beside_the_image(scene):
 
 
 def test_a_spectral_film_is_shown_in_grey(scene):
-    """Expected: the EXR holds the bands (radiance 2 times the integral 50 of each response, exactly, for
-    they are equal) and the features by name, the PNG, whose units nobody knows, is white."""
+    """The EXR holds the bands (radiance 2 times the integral 50 of each response, exactly, for they are
+    equal) and the features by name, the PNG, whose units nobody knows, is white."""
     band = '<spectrum name="{}" value="500:0, 550:1, 600:0"/>'
     scene.write_text(
         SCENE.replace("hdrfilm", "specfilm")
@@ -237,9 +235,9 @@ def loaded(scene, *arguments):
 
 
 def test_bdpt_in_place_of_integrators_around_others_keeps_their_layers(around):
-    """Expected: the layers of the film are Mitsuba's of these names (depth 0 and normal 0 of an empty scene;
-    the inner image apart, which is the image), depth and roulette are those of the inner integrator, the
-    timeout is the outermost, which Mitsuba's integrators have too; what the command line says comes first."""
+    """The layers of the film are Mitsuba's of these names (depth 0 and normal 0 of an empty scene; the inner
+    image apart, which is the image), depth and roulette are those of the inner integrator, the timeout is the
+    outermost, which Mitsuba's integrators have too; what the command line says comes first."""
     settings = loaded(around, "--integrator", "bdpt").settings
     assert (settings.max_depth, settings.rr_depth, settings.hide_emitters) == (3, 2, True)
     assert (settings.timeout, settings.aovs) == (50, "dd:depth,nn:sh_normal,in.uv:uv")
@@ -272,29 +270,12 @@ def test_layers_of_bdpt_inside_of_aov_are_kept_too(around):
 
 
 def test_other_integrators_take_the_place_inside(around):
-    """Expected: the integrators around stay; only the innermost is another, with its depth."""
     integrator = loaded(around, "--integrator", "volpath")
     assert {"dd.T", "in.uv.V", "in.img.R"} <= set(integrator.aov_names())
     assert re.search(r"Volumetric\w+\[\s+max_depth = 3,\s+rr_depth = 2", str(integrator))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (('type="aov" name="in"', 'type="moment" name="in"'), "integrator moment.*second moments.*variance"),
-        (('<integrator name="img"', '<integrator type="path"/><integrator name="img"'), "'img'.*just one"),
-    ],
-)
-def test_layers_that_bdpt_cannot_have_are_named(around, capsys, change, words):
-    assert change[0] in around.read_text()
-    around.write_text(around.read_text().replace(*change))
-    assert main(["render", str(around), "--integrator", "bdpt"]) == 2
-    assert re.search(words, capsys.readouterr().err)
-
-
 def test_bdpt_in_place_of_stokes_has_its_layers(around):
-    """Expected: in a polarized variant the parameter ``stokes`` and the other layers, named as in Mitsuba; in
-    others words."""
     around.write_text(around.read_text().replace('type="aov">', 'type="stokes">'))
     polarized = "-m", "llvm_ad_mono_polarized"
     settings = loaded(around, "--integrator", "bdpt", *polarized).settings
@@ -304,8 +285,8 @@ def test_bdpt_in_place_of_stokes_has_its_layers(around):
 
 
 def test_denoise_adds_to_the_layers(around):
-    """Expected: ``--denoise`` keeps the layers of the command line, of the file's own `bdpt`, and of an
-    integrator around it."""
+    """``--denoise`` keeps the layers of the command line, of the file's own `bdpt`, and of an integrator
+    around it."""
     given = "-P", "layers=variance"
     assert loaded(around, "--integrator", "bdpt", "--denoise").settings.layers == ("denoised",)
     none = ["--integrator", "bdpt", "--denoise", "-P", "layers=none"]
@@ -323,8 +304,6 @@ def test_denoise_adds_to_the_layers(around):
 
 
 def test_direct_is_replaced_with_its_depth(around):
-    """Rationale: `direct` has no `max_depth`, and what took its place went on without end. Expected: emission
-    and direct light, inside of others too, unless the command line says otherwise."""
     plain = around.read_text().replace('<integer name="max_depth" value="3"/>', "")
     around.write_text(plain.replace('<integer name="rr_depth" value="2"/>', ""))
     settings = loaded(around, "-Dintegrator=direct", "--integrator", "bdpt").settings
@@ -334,9 +313,8 @@ def test_direct_is_replaced_with_its_depth(around):
 
 
 def test_files_of_version_06_keep_their_parameters(scene):
-    """Rationale: `maxDepth` was renamed after the integrator was replaced, and paths had no limit. Expected:
-    depth, Russian roulette and hidden emitters as in a file of version 3; -P and --crop replace what has the
-    old name, --size meets the crop window; the file's own integrator takes -P too."""
+    """Depth, Russian roulette and hidden emitters as in a file of version 3; -P and --crop replace what has
+    the old name, --size meets the crop window; the file's own integrator takes -P too."""
     old = SCENE.replace("3.0.0", "0.6.0").replace('value="path"', 'value="volpath"')
     for now, then in (
         ("max_depth", "maxDepth"),
@@ -367,36 +345,11 @@ def test_files_of_version_06_keep_their_parameters(scene):
 
 @pytest.mark.parametrize("kind", ["direct_projective", "prb", "prb_basic", "prb_projective", "prbvolpath"])
 def test_integrators_that_end_paths_by_themselves_are_replaced_with_their_depth(scene, kind):
-    """Expected: the ``max_depth`` that the integrator has where the file gives none; else the file's."""
     text = scene.read_text()
     assert loaded(scene, f"-Dintegrator={kind}", "--integrator", "bdpt").settings.max_depth == 3
     scene.write_text(text.replace('<integer name="max_depth" value="3"/>', ""))
     own = loaded(scene, f"-Dintegrator={kind}").max_depth
     assert loaded(scene, f"-Dintegrator={kind}", "--integrator", "bdpt").settings.max_depth == own
-
-
-def test_an_integrator_around_none_is_named(around, capsys):
-    text = around.read_text()
-    start, end = text.index('<integrator name="img"'), text.index("</integrator>") + len("</integrator>")
-    around.write_text(
-        text.replace(text[start:end], "").replace('<default name="integrator" value="path"/>', "")
-    )
-    assert main(["render", str(around), "--integrator", "bdpt"]) == 2
-    assert "aov is around none" in (error := capsys.readouterr().err) and "write one inside of it" in error
-
-
-@pytest.mark.parametrize(
-    "text", ['<bsdf version="3.0.0" type="diffuse"/>', '<shape version="3.0.0" type="cube"/>']
-)
-def test_a_file_without_a_scene_is_reported(scene, capsys, text):
-    scene.write_text(text)
-    assert main(["render", str(scene)]) == 2
-    error = capsys.readouterr().err
-    assert "plain.xml' holds a single object" in error and "no <scene>" in error
-
-
-def test_an_integrator_without_max_depth_can_replace_one_with_it(scene):
-    assert main(["render", str(scene), "--integrator", "direct"]) == 0
 
 
 def test_scene_without_integrator_is_rendered_by_bdpt(scene):
@@ -439,62 +392,80 @@ def test_interruption_before_the_first_pass_writes_nothing(scene, capsys):
     assert "no image written" in capsys.readouterr().err
 
 
+INTEGRATOR = re.search("<integrator.*</integrator>", SCENE, re.DOTALL)[0]
+SENSOR = re.search("<sensor.*</sensor>", SCENE, re.DOTALL)[0]
+AOV = '<integrator type="aov"><string name="aovs" value="a:depth"/>'
+OWN = "--integrator", "scene", "-D", "integrator=bdpt"
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("edits", "arguments", "words"),
     [
-        (["-o", "a.png"], "output='a.png' must end in .exr"),
-        (["-o", "a"], "output='a' must end in .exr"),
-        (["-m", "llvm_rgb"], "variant='llvm_rgb' is not one of Mitsuba's: scalar_rgb"),
-        (["-s", "3"], "sensor=3 is not in the scene; the last one is 0"),
-        (["-P", "nonsense=1"], "nonsense"),
-        (["-Dnonsense=1"], "nonsense"),
-        (["--integrator", "no_such_plugin"], "no_such_plugin"),
-        (["-Players=strategies", "-Pmax_depth=17", "--integrator=bdpt"], "smaller max_depth"),
-        (["--integrator", "bdpt", "-P", "max_depth=0.5"], "max_depth=0.5 must be"),
+        ([], ["-o", "a.png"], "output='a.png' must end in .exr"),
+        ([], ["-o", "/proc/none/a.exr"], r"output='/proc/none/a.exr' cannot be written \(No such file"),
+        ([], ["-o", "plain.xml/a.exr"], "name another with -o"),
+        ([], ["-m", "LLVM_AD_RGB"], r"variant='LLVM_AD_RGB' is not one of .*; did you mean llvm_ad_rgb\?"),
+        ([], ["-m", "scalar_rgb", "--integrator", "bdpt"], "scalar_rgb is scalar; .*'llvm_ad_rgb'"),
+        ([], ["-s", "3"], "sensor=3 is not in the scene; the last one is 0"),
+        ([], ["-Dlihgt=1"], r"Found unused parameters: - \$lihgt=1"),
+        ([], ["-Dlight=abc"], r'plain.xml \(line 17, col 31\): could not parse RGB value "abc"'),
+        ([], ["--integrator", "bdtp"], 'Plugin "bdtp" not found'),
+        ([], ["--integrator", "diffuse"], 'plugin "diffuse" is of type "bsdf", which does not match'),
+        ([], ["--integrator", ""], "integrator='' names no integrator"),
+        ([], ["--integrator", "aov", "-P", "aovs="], "integrator=aov is for one around another"),
+        ([], ["--integrator", "moment"], "integrator=moment is for one around another"),
+        (
+            [],
+            ["-P", "foo=1", "--integrator", "scene"],
+            'plugin of type "path": - integer "foo": 1',
+        ),
+        ([], ["-Players=strategies", "-Pmax_depth=17"], "smaller max_depth"),
+        ([], ["-P", "layers=stokes"], "layers=stokes needs a .*'llvm_ad_spectral_polarized'"),
+        ([], ["-P", "max_depth=0.5"], "max_depth=0.5 must be an integer: the longest path"),
+        ([], ["-P", "max_dept=4"], r"max_dept=4 is not a parameter; did you mean max_depth\? Parameters:"),
+        ([], ["-P", "decisions=[]"], r"decisions='\[\]': the parameter was removed; set light_paths and"),
+        ([], ["--spp", "9999999999"], "spp=9999999999 must be an integer from 1 to 4294967295, or 0"),
+        ([('"width" value="6"', '"width" value="0"')], [], "width=0 of the film must be 1 or more pixels"),
+        ([('"width" value="6"', '"width" value="1000001"')], [], "for a PNG, whose sides have 1000000"),
+        ([('count" value="4"', 'count" value="0"')], [], "sample_count=0: nothing is to"),
+        ([('<default name="light" value="2"/>', "")], [], r"col 31\): undefined parameter: \$light"),
+        ([(SENSOR, ""), ('<default name="format" value="float32"/>', "")], [], "no sensor"),
+        ([(SCENE, '<bsdf version="3.0.0" type="diffuse"/>')], [], "holds a single object.*no <scene>"),
+        (
+            [("<boolean", '<integer name="max_dept" value="4"/><boolean')],
+            [*OWN, "-P", "skip=none"],
+            r"plain.xml \(line 6, col 6\): failed.*bdpt: max_dept=4 is not a parameter",
+        ),
+        ([(INTEGRATOR, f"{AOV}</integrator>")], [], "aov is around none.*write one inside of it"),
+        (
+            [(INTEGRATOR, f"{AOV}{INTEGRATOR}</integrator>")],
+            [*OWN, "-Paovs=b:depth"],
+            "takes aov and stokes over",
+        ),
+        (
+            [(INTEGRATOR, f'<integrator type="moment">{INTEGRATOR}</integrator>')],
+            [],
+            "integrator moment.*second moments.*variance.*own by --integrator scene",
+        ),
+        (
+            [(INTEGRATOR, f'<integrator type="aov"><integrator type="path"/>{INTEGRATOR}</integrator>')],
+            [],
+            "just one",
+        ),
     ],
 )
-def test_mistakes_are_reported_in_one_message(scene, capsys, arguments, message):
+def test_mistakes_are_one_line_with_a_remedy(scene, capsys, edits, arguments, words):
+    text = SCENE
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new, 1)
+    if "$integrator" not in text:
+        text = text.replace('<default name="integrator" value="path"/>', "")
+    scene.write_text(text)
     assert main(["render", str(scene), *arguments]) == 2
     captured = capsys.readouterr()
-    assert captured.err.startswith("error: ") and message in captured.err and not captured.out
-    assert "Traceback" not in captured.err
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "arguments", "message"),
-    [
-        (
-            'name="width" value="6"',
-            'name="width" value="0"',
-            [],
-            "width=0 of the film must be 1 or more pixels",
-        ),
-        (
-            'name="height" value="4"',
-            'name="height" value="-4"',
-            [],
-            "height=-4 of the film must be 1 or more",
-        ),
-        ('name="width" value="6"', 'name="width" value="1000001"', [], "for a PNG, whose sides have 1000000"),
-        (
-            'name="sample_count" value="4"',
-            'name="sample_count" value="0"',
-            [],
-            "sample_count=0: nothing is to",
-        ),
-        ("<emitter", "<emitter", ["--integrator", "aov"], "integrator=aov is for one around another"),
-        ("<emitter", "<emitter", ["--integrator", "aov", "-P", "aovs="], "integrator=aov is for one around"),
-        ("<emitter", "<emitter", ["--integrator", "moment"], "integrator=moment is for one around another"),
-    ],
-)
-def test_images_that_cannot_be_are_refused(scene, capsys, old, new, arguments, message):
-    """Rationale: a film of 0 pixels was said to have a field of view that is too wide; a PNG too long failed
-    after the render; a sampler without samples ended the process under `path`; `moment` around nothing gave
-    an image. Expected: words, before anything is rendered."""
-    scene.write_text(SCENE.replace(old, new, 1))
-    assert main(["render", str(scene), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and message in error
+    *_, last = captured.err.splitlines()
+    assert last.startswith("error: ") and re.search(words, last) and not captured.out, last
 
 
 def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
@@ -516,8 +487,7 @@ def test_no_time_at_all_is_one_pass(scene, capsys):
 @pytest.mark.parametrize("kind", ["prb", "prbvolpath"])
 @pytest.mark.parametrize("time", [[], ["--time", "0"]], ids=" ".join)
 def test_integrators_that_must_develop_their_image_render_too(scene, kind, time):
-    """Rationale: Mitsuba's integrators for derivatives raise an error if they are to leave the image to the
-    film, as the command asks of `bdpt`. Expected: the image, 2 everywhere."""
+    """The image, 2 everywhere."""
     assert main(["render", str(scene), "--integrator", kind, *time, "-o", "a.exr"]) == 0
     np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
 
@@ -549,8 +519,8 @@ def wrapped(error):
     ],
 )
 def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, error, status):
-    """Expected: 2 for what would happen again, 1 for what may not, in one line; a path that is gone while a
-    render runs is a failure, though one that was never there is a usage error."""
+    """2 for what would happen again, 1 for what may not, in one line; a path that is gone while a render runs
+    is a failure, though one that was never there is a usage error."""
 
     def broken(*_):
         raise error
@@ -574,8 +544,6 @@ def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, 
     ],
 )
 def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
-    """Rationale: a bug in the code that Dr.Jit records is a RuntimeError, too. Expected: an error that names
-    nothing of the user's, nor a lack of memory, is raised as it is."""
 
     def broken(*_):
         raise error
@@ -588,8 +556,6 @@ def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
 
 @pytest.mark.parametrize("kind", ["bdpt", "path"])
 def test_an_error_of_a_plugin_is_one_line(tmp_path, capsys, kind):
-    """Rationale: Mitsuba finds while rendering that a lamp's texture has no spectra. Expected: its whole
-    message in one line, and a usage error."""
     mi.Bitmap(np.ones((2, 2, 3), dtype=np.float32)).write(str(tmp_path / "t.exr"))
     text = (
         '<scene version="3.0.0"><sensor type="perspective"><film type="hdrfilm"><integer name="width" '
@@ -608,9 +574,7 @@ def test_an_error_of_a_plugin_is_one_line(tmp_path, capsys, kind):
 
 @pytest.mark.parametrize("kind", ["path", "ptracer"])
 def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
-    """Rationale: Mitsuba's integrators render all samples at once in vectorised variants, whatever their
-    timeout. Expected: seeds of 16 spp until the time is over, their mean in the film (2 everywhere).
-    """
+    """Seeds of 16 spp until the time is over, their mean in the film (2 everywhere)."""
     assert main(["render", str(scene), "--integrator", kind, "--time", "0.3", "-o", "a.exr"]) == 0
     statistics = json.loads(read("a.exr")[1]["bdptStatistics"])
     assert statistics["spp"] >= 16 and statistics["spp"] % 16 == 0
@@ -639,29 +603,8 @@ def test_missing_scene_is_reported(scene, capsys, name, words):
     assert not Path("renders").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--integrator", "bdtp"], 'Plugin "bdtp" not found'),
-        (
-            ["--integrator", "diffuse"],
-            'plugin "diffuse" is of type "bsdf", which does not match the expected',
-        ),
-        (["-Dlight=abc"], 'plain.xml (line 17, col 31): could not parse RGB value "abc"'),
-        (["--integrator", ""], "integrator='' names no integrator"),
-        (["-Dlihgt=1"], "Found unused parameters: - $lihgt=1"),
-    ],
-)
-def test_mistyped_names_are_answered_by_mitsuba(scene, capsys, arguments, words):
-    """Expected: its own message, with its place in the file, in one line."""
-    assert main(["render", str(scene), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("error: ") and words in error and error.count("\n") == 1
-
-
 @pytest.mark.parametrize("kind", ["diffuse", "cli_mirror"])
 def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, capsys, kind):
-    """Expected: the same of plugins in Python, whose type Mitsuba does not know before they are made."""
     mi.set_variant("llvm_ad_rgb")
     mi.register_bsdf("cli_mirror", lambda properties: mi.load_dict({"type": "conductor"}))
     start, end = SCENE.index("<integrator"), SCENE.index("<sensor")
@@ -670,68 +613,6 @@ def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, caps
     assert main(["render", str(scene), "--integrator", kind]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"error: integrator={kind!r} is a plugin of ") and error.count("\n") == 1
-
-
-@pytest.mark.parametrize(
-    ("change", "arguments", "words"),
-    [
-        ((), ["-P", "foo=1", "-P", "bar=x", "--integrator", "scene"])
-        + ('integrator plugin of type "path": - integer "foo": 1',),
-        ((), ["-m", "LLVM_AD_RGB"], "; did you mean llvm_ad_rgb?"),
-        ((), ["-P", "layers=stokes", "--integrator", "bdpt"])
-        + ("layers=stokes needs a .*'llvm_ad_spectral_polarized'",),
-        ((), ["-m", "scalar_rgb", "--integrator", "bdpt"])
-        + ("the variant scalar_rgb is scalar; .*'llvm_ad_rgb'",),
-        (
-            ("<boolean", '<string name="layers" value="stokes"/><boolean'),
-            ["--integrator", "scene", "-D", "integrator=bdpt"],
-            "layers=stokes needs a .*'llvm_ad_spectral_polarized'",
-        ),
-        ((), ["-o", "/proc/none/a.exr"], "output='/proc/none/a.exr' cannot be written (No such file"),
-        ((), ["-o", "plain.xml/a.exr"], "name another with -o"),
-        (
-            (),
-            ["--integrator", "bdpt", "--spp", "9999999999"],
-            "spp=9999999999 must be an integer from 1 to 4294967295, or 0 for the sampler's sample_count\n",
-        ),
-        ((), ["-P", "max_dept=4", "--integrator", "bdpt"])
-        + ("max_dept=4 is not a parameter; did you mean max_depth? Parameters:",),
-        ((), ["-P", "max_depth=four", "--integrator", "bdpt"])
-        + ("max_depth='four' must be an integer: the longest path",),
-        ((), ["-P", "decisions=[]", "--integrator", "bdpt"])
-        + ("decisions='[]': the parameter was removed; set light_paths and connections",),
-        (
-            ("<boolean", '<integer name="max_dept" value="4"/><boolean'),
-            ["-P", "skip=none", "--integrator", "scene", "-D", "integrator=bdpt"],
-            "plain.xml (line 6, col 6): failed.*bdpt: max_dept=4 is not a parameter",
-        ),
-        (('"constant"', '"cnstant"'), [], 'Plugin "cnstant" not found!'),
-        (("<emitter", '<bsdf type="hair"><float name="xyzzy" value="1"/></bsdf><emitter'), [])
-        + ('"xyzzy": 1\n',),
-        (("<emitter", '<shape type="obj"><string name="filename" value="no/x.obj"/></shape><emitter'), [])
-        + ("{folder}/plain.xml",),
-        (
-            (
-                'type="$integrator">',
-                'type="aov"><string name="aovs" value="a:depth"/><integrator type="bdpt">',
-            ),
-            ["-P", "aovs=b:depth", "--integrator", "scene"],
-            "--integrator bdpt of the command takes aov and stokes over",
-        ),
-    ],
-)
-def test_mistakes_are_answered_with_a_remedy(scene, capsys, change, arguments, words):
-    if change:
-        assert change[0] in SCENE
-        text = SCENE.replace(*change)
-        if "bdpt" in change[1]:
-            text = text.replace("</integrator>", "</integrator></integrator>")
-            text = text.replace('<default name="integrator" value="path"/>', "")
-        scene.write_text(text)
-    assert main(["render", str(scene), *arguments]) == 2
-    error = capsys.readouterr().err
-    words = re.escape(words.replace("{folder}", str(scene.parent))).replace(r"\.\*", ".*")
-    assert "error: " in error and re.search(words, error), error
 
 
 @pytest.mark.parametrize(
@@ -757,23 +638,8 @@ def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys
     assert caught.value.code == 2 and capsys.readouterr().err.endswith(f"; {question}\n")
 
 
-def test_a_parameter_without_a_value_is_reported(scene, capsys):
-    scene.write_text(SCENE.replace('<default name="light" value="2"/>', ""))
-    assert main(["render", str(scene)]) == 2
-    assert "plain.xml (line 17, col 31): undefined parameter: $light" in capsys.readouterr().err
-
-
-def test_scene_without_sensor_is_reported(scene, capsys):
-    start, end = SCENE.index("<sensor"), SCENE.index("</sensor>") + len("</sensor>")
-    text = SCENE.replace(SCENE[start:end], "")
-    scene.write_text(text.replace('<default name="format" value="float32"/>', ""))
-    assert main(["render", str(scene)]) == 2
-    assert "no sensor" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("name", ["a.exr", "a.png"])
 def test_a_file_of_another_format_is_not_overwritten(scene, capsys, name):
-    """A name given by mistake must not cost the user the file; a former image may go."""
     Path(name).write_text("precious")
     assert main(["render", str(scene), "-o", "a.exr"]) == 2
     assert Path(name).read_text() == "precious"
@@ -784,9 +650,6 @@ def test_a_file_of_another_format_is_not_overwritten(scene, capsys, name):
 
 @pytest.mark.parametrize("missing", [1, 100, 5000])
 def test_a_full_disk_leaves_the_former_image(tmp_path, monkeypatch, missing):
-    """Rationale: Mitsuba closes a file without a look at what could not be written; a PNG of which only the
-    last bytes do not fit passed for whole. Expected: an error, however few bytes are missing, the former
-    image as it was and nothing beside it."""
     pixels = (np.random.default_rng(1).random((64, 64, 3)) * 255).astype(np.uint8)
     image, png, path = mi.Bitmap(pixels), mi.Bitmap.FileFormat.PNG, tmp_path / "a.png"
     images.write_whole(image, path, png)
@@ -804,8 +667,6 @@ def test_a_full_disk_leaves_the_former_image(tmp_path, monkeypatch, missing):
 
 @pytest.mark.parametrize("kind", ["folder", "folder.png", "pipe", "name", "checkpoint"])
 def test_an_output_that_cannot_be_written_is_refused_before_the_render(scene, capsys, monkeypatch, kind):
-    """Rationale: what can be known at once must not come out after hours; opening a pipe would wait for
-    ever. Expected: an error before anything is rendered."""
     monkeypatch.setattr(render, "render", lambda *arguments: pytest.fail("rendered"))
     output = Path("a.exr") if kind != "name" else Path("a" * 251 + ".exr")
     if kind == "pipe":
@@ -848,7 +709,6 @@ def test_bad_values_are_usage_errors(arguments, capsys):
     [("1e9", 10**9), ("1.5e1", 15), ("16", 16), ("1.5", None), ("1e99", None), ("nan", None)],
 )
 def test_whole_numbers_may_have_an_exponent(text, value, capsys):
-    """Expected: any notation of a whole number that a float holds exactly; others are usage errors."""
     arguments = ["render", "scene.xml", "--spp", text, "--threads", text]
     if value is None:
         with pytest.raises(SystemExit):
@@ -859,23 +719,15 @@ def test_whole_numbers_may_have_an_exponent(text, value, capsys):
         assert options.spp == value == options.threads and isinstance(options.spp, int)
 
 
-@pytest.mark.parametrize(
-    "words", [["--help"], *([name, "--help"] for name in ("render", "explain", "doctor"))], ids=" ".join
-)
+@pytest.mark.parametrize("words", [[], ["render"], ["explain"], ["doctor"], ["mix"], ["sweep"], ["figure"]])
 def test_help_does_nothing_else(scene, capsys, words):
-    """Expected: the usage by the command's own name, status 0, no file; the exit statuses in the top-level
-    help alone."""
     with pytest.raises(SystemExit) as ended:
-        main(words)
-    said = capsys.readouterr().out
-    assert ended.value.code == 0 and said.startswith(f"usage: {' '.join(['mitsuba-bdpt', *words[:-1]])} [")
-    statuses = re.search(r"0 done; 1\s+failed.* 2\s+usage\s+error.* 130\s+.* 143\s+", said, re.DOTALL)
-    assert bool(statuses) == (words == ["--help"])
+        main([*words, "--help"])
+    assert ended.value.code == 0 and capsys.readouterr().out.startswith("usage: mitsuba-bdpt ")
     assert [path.name for path in Path().iterdir()] == ["plain.xml"]
 
 
 def test_commands_of_the_readme_are_understood():
-    """Expected: each names a scene that exists, and options that there are."""
     root = SCRIPT.parents[1]
     found = re.findall(r"^    python -m mitsuba_bdpt (.*)", (root / "README.md").read_text(), re.MULTILINE)
     scenes = [build_parser().parse_args(shlex.split(line, comments=True)).scene for line in found]
@@ -883,7 +735,6 @@ def test_commands_of_the_readme_are_understood():
 
 
 def test_script_is_the_command(scene):
-    """One real process, from another directory."""
     command = [sys.executable, str(SCRIPT), str(scene), "--spp", "1", "-o", "a.exr"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -907,18 +758,12 @@ def test_script_is_the_command(scene):
     ],
 )
 def test_bdpt_renders_unless_the_command_line_says_otherwise(scene, capsys, arguments, used, line):
-    """Rationale: nearly all scene files ask for `path`, and who has installed bdpt takes the image for its.
-
-    Expected: `bdpt` with the path tracer's parameters, any other only by ``--integrator``; the first line
-    says which one it is, and how the file's own is had.
-    """
     assert main(["render", str(scene), "-o", "a.exr", *arguments]) == 0
     assert capsys.readouterr().err.startswith(f"integrator: {line}")
     assert ("rays" in json.loads(read("a.exr")[1]["bdptStatistics"])) == (used == "bdpt")
 
 
 def test_parameters_of_bdpt_in_the_scene_file_count(scene):
-    """Expected: by default and by ``--integrator scene``, other parameters than a path tracer's too."""
     text = SCENE.replace(
         '<integer name="max_depth"', '<string name="skip" value="none"/><integer name="max_depth"'
     )
@@ -929,8 +774,6 @@ def test_parameters_of_bdpt_in_the_scene_file_count(scene):
 
 
 def test_what_bdpt_cannot_replace_is_rendered_by_the_files_own(around, capsys):
-    """Rationale: `moment` around a path tracer rendered before bdpt was the default. Expected: an error that
-    names the option with which it does."""
     around.write_text(around.read_text().replace('type="aov">', 'type="moment">', 1))
     assert main(["render", str(around), "-o", "a.exr"]) != 0
     assert "own by --integrator scene" in capsys.readouterr().err
@@ -940,7 +783,7 @@ def test_what_bdpt_cannot_replace_is_rendered_by_the_files_own(around, capsys):
 
 
 def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys):
-    """Rationale: ``explain | head -1``. Expected: status 0, and nothing on standard error."""
+    """Status 0, and nothing on standard error."""
 
     class Closed:
         def write(self, text):
@@ -955,8 +798,6 @@ def test_a_pipe_that_closes_ends_the_command_quietly(scene, monkeypatch, capsys)
 
 
 def test_explain(scene, capsys):
-    """Expected: the command says what a render would do, by bdpt whatever integrator the scene has, with the
-    scene's samples, definitions and properties; no image is written. What is wrong is said as by render."""
     assert main(["explain", str(scene), "-P", "max_depth=1", "-Dlight=3"]) == 0
     said = capsys.readouterr().out
     assert "used: s=0" in said and "max_depth=1 allows no such path" in said and "no pilot" in said

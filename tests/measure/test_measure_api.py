@@ -50,8 +50,6 @@ def here(tmp_path, monkeypatch):
 
 
 def test_a_dictionary_is_loaded_as_a_file_of_it_is(here):
-    """Expected: the same size, depth and images, at another size and with another sampler, and the same
-    answers about media; the dictionary of the user stays as it was."""
     given = room()
     # A transform of a file is a matrix of decimals.
     config = mi.parser.ParserConfig(mi.variant())
@@ -81,8 +79,6 @@ def test_a_dictionary_is_loaded_as_a_file_of_it_is(here):
     ids=["number", "transform", "plugin", "bitmap", "object", "file"],
 )
 def test_a_dictionary_that_changes_is_another_scene(here, change):
-    """Expected: a reference is not taken for one of an edited scene, be it a number, an array, an object or a
-    file that the dictionary names; a dictionary of the same content is the same scene."""
     Path("wall.ply").write_text("a mesh")
     mesh = {"mesh": {"type": "ply", "filename": "wall.ply"}}
     before, same = (DictionaryScene.named_by_content(room(**mesh)) for _ in range(2))
@@ -95,9 +91,6 @@ def test_a_dictionary_that_changes_is_another_scene(here, change):
 
 
 def test_spectra_and_included_files_belong_to_a_scene_file(tmp_path):
-    """Rationale: Mitsuba's parser reads tables of spectra and included files itself, beside the scene file.
-    Expected: from another working directory too the height follows the width, and after an edit of either
-    file it is another scene."""
     (tmp_path / "grey.spd").write_text("400 0.5\n700 0.5\n")
     ball = '<spectrum name="reflectance" filename="grey.spd"/>'
     ball = f'<shape type="sphere"><bsdf type="diffuse">{ball}</bsdf></shape>'
@@ -117,15 +110,14 @@ def test_spectra_and_included_files_belong_to_a_scene_file(tmp_path):
 
 
 def test_equal_objects_are_the_same_scene():
-    """Expected: what counts is what an object is, not which one."""
     balls = (mi.load_dict({"type": "sphere", "radius": 0.5}) for _ in range(2))
     first, second = (DictionaryScene("room", room(ball=ball)).sha256 for ball in balls)
     assert first == second
 
 
 def test_measurements_take_dictionaries(here):
-    """Expected: each makes or takes the reference of the scene in the project, and returns what it measured;
-    the variant of the caller stays."""
+    """Each makes or takes the reference of the scene in the project, and returns what it measured; the
+    variant of the caller stays."""
     common = {"project": "project", "resolution": 8}
     mi.set_variant("llvm_ad_mono")
     reference = measure.make_reference(room(), seconds=0, spp=4, **common)
@@ -147,8 +139,6 @@ def test_measurements_take_dictionaries(here):
 
 
 def test_a_sweep_takes_dictionaries(here):
-    """Expected: the scenes of a preset by the names of the dictionaries; rows of both seeds, whose errors are
-    against the reference that the sweep makes; no cluster, whose workers would not know them."""
     Path("mine.toml").write_text(PRESET)
     dictionaries = [measure.SceneDict("room", room())]
     rows = measure.run_sweep("mine.toml", dictionaries, reference_seconds=0, output=Path("rows"))
@@ -184,14 +174,11 @@ def test_a_sweep_takes_dictionaries(here):
     ],
 )
 def test_what_cannot_be_measured_is_named(here, call, words):
-    """Expected: the error names the argument, its value and what it must be."""
     with pytest.raises(ValueError, match=words):
         call()
 
 
 def test_paths_are_texts_or_paths(here):
-    """Rationale: an ``output`` given as text failed by dividing texts. Expected: wherever a path is taken, a
-    text does as well, with the same files; anything else is named."""
     mine, given = measure.SceneDict("mine", room()), {"resolution": 8, "spp": [2], "seeds": 2}
     Path("mine.toml").write_text('scenes = ["mine"]\nresolution = 8\nspp = [2]\nseeds = 2\n')
     for kind in (str, Path):
@@ -219,7 +206,6 @@ def test_paths_are_texts_or_paths(here):
 
 
 def test_a_sweep_of_a_dictionary_says_where_its_results_go(here, capsys):
-    """Expected: the folder, before the reference is made; a preset that fails leaves none."""
     mine, given = measure.SceneDict("mine", room()), {"resolution": 8, "spp": [2], "seeds": 2}
     failing = given | {"integrator": [{"type": "bdp"}]}
     with pytest.raises(ValueError, match="bdp"):
@@ -232,8 +218,6 @@ def test_a_sweep_of_a_dictionary_says_where_its_results_go(here, capsys):
 
 
 def test_a_reference_of_another_dictionary_is_made_anew(here, capsys):
-    """Expected: under one name, that of an edited scene is none; the call that makes it better is named, with
-    its limit of time."""
     common = {"project": "project", "resolution": 8, "spp": 4}
     measure.make_reference(measure.SceneDict("mine", room()), seconds=0, **common)
     edited = room()
@@ -250,7 +234,6 @@ def test_a_reference_of_another_dictionary_is_made_anew(here, capsys):
 
 @pytest.mark.parametrize("name", ["reference", "compare", "equal-time", "pyramid", "sweep"])
 def test_the_command_has_the_same_options(name):
-    """Expected: all options of Python with the same defaults."""
     kinds = {"reference": options.MakeReference, "equal-time": options.EqualTime}
     kind = kinds.get(name) or getattr(options, name.capitalize())
     words = {"compare": ["bdpt", "path", "--scenes", "x"]}.get(name, ["x"])
@@ -263,8 +246,6 @@ def test_the_command_has_the_same_options(name):
 
 @pytest.mark.parametrize("kind", options.Options.__subclasses__(), ids=lambda kind: kind.__name__)
 def test_the_meaning_of_each_option_is_in_the_docstring(kind):
-    """Expected: a line with the text of the command's help, its default in words, for each; so the page of
-    the API shows it."""
     lines = kind.__doc__.splitlines()
     for found in options.options_of(kind):
         text = found.metadata["text"].replace("%(default)s", str(found.default))
@@ -275,7 +256,6 @@ def test_the_meaning_of_each_option_is_in_the_docstring(kind):
 
 
 def test_a_sweep_that_fails_is_no_usage_error(here, monkeypatch):
-    """Expected: failed renders raise a `FailureError` that names them, since the arguments were right."""
     Path("mine.toml").write_text(PRESET)
     monkeypatch.setattr(sweep, "swept", lambda *_: ([], ["room, 4 spp, seed 1: no memory"]))
     with pytest.raises(FailureError, match="1 failed: room, 4 spp, seed 1: no memory"):
@@ -283,7 +263,6 @@ def test_a_sweep_that_fails_is_no_usage_error(here, monkeypatch):
 
 
 def test_a_project_knows_its_dictionaries():
-    """Expected: a project finds a scene given as a dictionary by its name, and its depth."""
     scene = DictionaryScene("mine", room())
     project = Project(Path(), {"mine": scene})
     assert project.scene("mine") is scene and project.called(scene) == "mine" and project.depth(scene) == 3

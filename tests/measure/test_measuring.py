@@ -84,9 +84,6 @@ def command(*words):
 
 
 def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
-    """Expected: from a scene file anywhere and a preset in the project come a reference, made on the way and
-    said to be, the rows of all renders, tables, plots and the page, each by the installed command, all in the
-    project's folder; a second sweep renders and makes nothing."""
     said = command("sweep", "mine", "--project", "project")
     assert "room: no reference at 16 and depth 4 yet; making one" in said and ": 30 rows" in said
     results = here / "project" / "results" / "mine"
@@ -110,8 +107,6 @@ def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
 
 
 def test_other_commands_take_the_users_scene(here, capsys):
-    """Expected: compare, equal-time and pyramid make their reference in the project, once, and
-    leave their pictures there."""
     common = ["--resolution", "16", "--project", "project"]
     room = "elsewhere/room.xml"
     words = ["compare", "bdpt skip=none", "path sampler=stratified", "--scenes", room, "--spp", "4"]
@@ -130,8 +125,6 @@ def test_other_commands_take_the_users_scene(here, capsys):
 
 
 def test_the_first_integrator_may_be_any(here):
-    """Rationale: tables looked for rays and pilots, which Mitsuba does not tell. Expected: a sweep
-    of `path` alone is reported and shown."""
     preset = here / "project" / "presets" / "alone.toml"
     head = PRESET.partition("[[integrator]]")[0]
     preset.write_text(head + '[[integrator]]\ntype = "path"\n')
@@ -142,8 +135,6 @@ def test_the_first_integrator_may_be_any(here):
 
 
 def test_commands_in_messages_can_be_pasted(here, capsys):
-    """Rationale: a command without the project made its files elsewhere. Expected: the words that a message
-    quotes, read as a shell does, name the project and the file, and do what the message says."""
     project = here / "my project"
     (project / "presets").mkdir(parents=True)
     (project / "presets" / "mine.toml").write_text(PRESET)
@@ -177,7 +168,7 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
     ],
 )
 def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
-    """Expected: one line, a status that is not 0, no render."""
+    """One line, a status that is not 0, no render."""
     (here / "named" / "scenes").mkdir(parents=True)
     (here / "named" / "scenes" / "room.xml").write_text(ROOM)
     (here / "badly" / "references").mkdir(parents=True)
@@ -190,7 +181,6 @@ def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
 
 
 def test_a_width_that_fits_is_named(here):
-    """Expected: the size that a scene has cannot be divided into tiles; the one that is advised can."""
     file = here / "elsewhere" / "room.xml"
     file.write_text(ROOM.format(height=36, sampler=""))
     scene = SceneFile("room", file)
@@ -212,9 +202,7 @@ def test_a_width_that_fits_is_named(here):
     ids=lambda words: words.split()[0],
 )
 def test_commands_render_at_a_width_that_fits(here, capsys, words):
-    """Rationale: `sweep` took the nearest width that divides into tiles, the others refused another, after
-    they had announced a reference. Expected: all do as `sweep`, and say it, first: of 64 x 36 pixels
-    and a width of 16 these are 8 x 4."""
+    """All do as `sweep`, and say it, first: of 64 x 36 pixels and a width of 16 these are 8 x 4."""
     (here / "elsewhere" / "room.xml").write_text(ROOM.format(height=36, sampler=""))
     assert main([*words.split(), "--resolution", "16"]) in (0, 1)
     said = capsys.readouterr().out
@@ -225,10 +213,9 @@ def test_commands_render_at_a_width_that_fits(here, capsys, words):
 
 
 def test_samples_are_those_that_a_sampler_takes(here, capfd):
-    """Rationale: Mitsuba warned of 35 samples, which nobody had asked for, and named neither scene nor
-    integrator; comparisons took them for 32. Expected: no warning, also where the scene file has a count
-    that the sampler of references does not take; rows and captions have the samples that were rendered: of
-    32 and 128 `multijitter` makes 5 x 7 and 11 x 12, `bdpt` none."""
+    """No warning, also where the scene file has a count that the sampler of references does not take; rows
+    and captions have the samples that were rendered: of 32 and 128 `multijitter` makes 5 x 7 and 11 x 12,
+    `bdpt` none."""
     count = '<sampler type="independent"><integer name="sample_count" value="32"/></sampler>'
     (here / "elsewhere" / "room.xml").write_text(ROOM.format(height=64, sampler=count))
     preset = 'resolution = 8\nscenes = ["elsewhere/room.xml"]\nspp = [32]\nseeds = 2\n[[integrator]]\n'
@@ -251,8 +238,6 @@ def test_samples_are_those_that_a_sampler_takes(here, capfd):
 
 
 def test_a_sample_is_timed_where_a_sampler_rounds_up(here, monkeypatch):
-    """Rationale: 35 samples were timed as 32. Expected: of renders whose seconds are the samples that they
-    take, equal time is at equal samples."""
     head = 'resolution = 8\nscenes = ["elsewhere/room.xml"]\nspp = [32]\nseeds = 2\n[[integrator]]\n'
     strata = 'type = "path"\nsampler = "multijitter"\n'
     (here / "mine.toml").write_text(f'{head}type = "bdpt"\n[[integrator]]\n{strata}')
@@ -281,10 +266,6 @@ CROPPED = "".join(
     [("$resolution", "48"), ("160", "$resolution"), ("$resolution", "$resolution_y"), ("160", "48")],
 )
 def test_films_keep_their_shape(here, width, height, sensors, crop, wanted):
-    """Rationale: of a film whose width alone is ``$resolution`` 64 x 19 pixels were checked for tiles, and 68
-    x 48 rendered. Expected: however a file sets the size of the first sensor's film, its aspect ratio is
-    kept, tiles divide it, and what is loaded has the size that is said; as a film of plain numbers has it.
-    """
     film = f'"{{width}}"/><integer name="height" value="{{height}}"/>{crop}'
     start, _, rest = ROOM.format(height=32, sampler="").partition('"64"/><integer name="height" value="32"/>')
     camera, end, shapes = (start + film + rest).partition("</sensor>")
@@ -307,9 +288,9 @@ def test_films_keep_their_shape(here, width, height, sensors, crop, wanted):
 
 @pytest.mark.parametrize("sampler", ["", STRATIFIED])
 def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
-    """Expected: without parameters in the file the film and the sampler are as asked for; the picture is
-    that of the file's own film, half as wide: pixels agree with means of 2 x 2 ones (box filters and the same
-    light: to the noise of 1024 samples)."""
+    """Without parameters in the file the film and the sampler are as asked for; the picture is that of the
+    file's own film, half as wide: pixels agree with means of 2 x 2 ones (box filters and the same light: to
+    the noise of 1024 samples)."""
     file = here / "elsewhere" / "room.xml"
     text = ROOM.format(height=32, sampler=sampler)
     file.write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
@@ -326,8 +307,6 @@ def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
 
 
 def test_recipes_say_what_makes_a_reference(here):
-    """Expected: `path` by recipe or by the command line, in place of `bdpt`; `bdpt` with merging; a radiance
-    that is known."""
     references = here / "project" / "references"
     references.mkdir()
     recipe = references / "scenes.toml"
@@ -369,8 +348,7 @@ def test_recipes_say_what_makes_a_reference(here):
 
 @pytest.mark.parametrize("command", measuring.COMMANDS)
 def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, capsys):
-    """Expected: one line that names what is missing and the extra, status 2; nothing of `measure` is imported
-    before."""
+    """One line that names what is missing and the extra, status 2."""
     arguments = {
         "sweep": ["x"],
         "report": ["x"],
@@ -389,8 +367,6 @@ def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, ca
 
 
 def test_the_parser_needs_nothing_of_the_extra():
-    """Expected: the command line is declared, and rendering works, without any package of the extra; of the
-    measurements their options alone are imported."""
     code = (
         "import sys\n"
         f"for name in {measuring.NEEDED!r}: sys.modules[name] = None\n"
@@ -405,7 +381,6 @@ def test_the_parser_needs_nothing_of_the_extra():
 
 
 def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
-    """Expected: no traceback, and the exit status of an interrupted process."""
     parsed = build_parser().parse_args(["report", "x"])
 
     def interrupted(arguments):
@@ -417,14 +392,11 @@ def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
 
 
 def test_the_frame_of_the_page_is_in_the_package():
-    """Expected: the file lies beside the module, where the wheel, which takes the whole package, has it."""
     frame = importlib.resources.files("mitsuba_bdpt.measure").joinpath("page.html")
     assert "@DATA@" in frame.read_text()
 
 
 def test_a_default_that_nothing_uses_is_no_parameter(here):
-    """Rationale: Mitsuba refuses a value for a parameter that the file declares and does not use. Expected: a
-    scene file with such a ``resolution`` is loaded at any size all the same."""
     file = here / "elsewhere" / "room.xml"
     declared = '<default name="resolution" value="64"/>'
     file.write_text(ROOM.format(height=32, sampler="").replace("<integrator", f"{declared}<integrator", 1))
@@ -439,8 +411,6 @@ def refused(*words) -> str:
 
 
 def test_mistakes_that_only_a_render_finds_are_one_line(here):
-    """Rationale: Mitsuba wraps what its plugins raise. Expected: one line that names the parameter, before a
-    reference is made where no render is needed to find it, and no traceback."""
     room, preset = here / "elsewhere" / "room.xml", here / "project" / "presets" / "mine.toml"
     options = ["--scenes", str(room), "--resolution", "16", "--spp", "4", "--pairs", "1"]
     words = ["compare", "bdpt skp=none", "bdpt", *options, "--project", "project"]
@@ -458,8 +428,6 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here):
 
 
 def test_a_sweep_says_what_its_reference_is_too_noisy_for(here, capsys, monkeypatch):
-    """Rationale: only the report said so, hours later. Expected: of a reference cut short, a warning that
-    names the integrator and the command that goes on with it; none when it is good enough."""
     preset = here / "project" / "presets" / "mine.toml"
     preset.write_text(
         PRESET.split("[[integrator]]")[0].replace("[8, 2]", "[2, 2]").replace("[2, 4]", "[2, 64]")
@@ -484,8 +452,6 @@ def test_a_sweep_says_what_its_reference_is_too_noisy_for(here, capsys, monkeypa
 
 
 def test_damaged_files_are_named_with_what_to_do(here, capsys):
-    """Rationale: a full disk or a copy that broke off leaves files without an end. Expected: one
-    line that names the file and what to do, which mends it."""
     preset = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "1") + '[[integrator]]\ntype = "path"\n'
     (here / "project" / "presets" / "mine.toml").write_text(preset)
     sweep_words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
@@ -520,8 +486,6 @@ def test_damaged_files_are_named_with_what_to_do(here, capsys):
 
 
 def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
-    """Rationale: a sweep with an output elsewhere named references/, read-only, and no way out.
-    Expected: the option, the folder and the reason; nothing is rendered, no folder is left."""
     (here / "project" / "references").write_text("")
     (here / "file").write_text("")
     words = ["--scenes", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
@@ -542,8 +506,6 @@ def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
 
 
 def test_a_report_that_cannot_be_written_names_the_folder(here, capsys, monkeypatch):
-    """Rationale: the error named a temporary file, '.README.md.12413.tmp'. Expected: the folder, the reason,
-    and what to do."""
     assert main(["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]) == 0
 
     def refused(path):
@@ -556,10 +518,6 @@ def test_a_report_that_cannot_be_written_names_the_folder(here, capsys, monkeypa
 
 
 def test_an_edited_scene_is_rendered_anew(here, capsys):
-    """Rationale: an edit ended the sweep; after it images of both versions lay side by side, under names that
-    did not tell them apart. Expected: the reference of the edited scene is made anew in the limit of time;
-    its renders replace the others in the tables and among the named images, which is said, with their number,
-    those of another scene stay; when the edit is reverted they are used again, and nothing is rendered."""
     text = (here / "elsewhere" / "room.xml").read_text()
     (here / "elsewhere" / "other.xml").write_text(text)
     head = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "2")
@@ -599,8 +557,6 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
 
 
 def test_samples_of_a_render_that_stops_are_its_own(here):
-    """Expected: the row of a render that has reached its target error has the samples that it took; of one
-    that has not, it is said at the end, which is no failure."""
     stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
     own = '[[integrator]]\ntype = "bdpt"\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
@@ -613,8 +569,6 @@ def test_samples_of_a_render_that_stops_are_its_own(here):
 
 
 def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
-    """Rationale: cells are named after the plugin's source, which somebody may edit meanwhile. Expected: the
-    rows of what was rendered are written; a damaged cell is named."""
     digests = iter("abcdefgh" * 99)
     monkeypatch.setattr("mitsuba_bdpt.measure.preset.source_digest", lambda: next(digests))
     words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
@@ -623,10 +577,9 @@ def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
 
 
 def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
-    """Rationale: some scenes fail only while their reference is made. Expected: those that are black or
-    cannot be rendered are left out and named, the rows of the others are written, the status is 1; so it is
-    where the rows of a scene are damaged, and where a film has no colours, which is said before anything is
-    rendered."""
+    """Those that are black or cannot be rendered are left out and named, the rows of the others are written,
+    the status is 1; so it is where the rows of a scene are damaged, and where a film has no colours, which is
+    said before anything is rendered."""
     room = ROOM.format(height=64, sampler="")
     lamp = re.search(r"<emitter.*</emitter>", room, re.DOTALL)[0]
     for name, text in (("dark", room.replace(lamp, "")), ("fog", room.replace(lamp, REFUSED + lamp))):
@@ -652,9 +605,7 @@ def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
 
 
 def test_samples_in_equal_time_are_matched_again(monkeypatch):
-    """Rationale: `path` had 132 samples where 222 take as long as `bdpt`: 64 were timed, much of whose time
-    is fixed. Renders take 1 s and 10 ms per sample. Expected: of 3 s 200 samples, to 5 %; no further renders
-    where the first ones take as long."""
+    """Of 3 s 200 samples, to 5 %; no further renders where the first ones take as long."""
     asked = []
 
     def seconds(scene, made, spp):

@@ -28,8 +28,8 @@ SCENE = """<scene version="3.0.0">
 
 
 def test_pyramid(tmp_path, capsys):
-    """Expected: an EXR whose layers OpenEXR finds by the names of the contract, whose weighted ones add up to
-    the image (float32: 1e-4), and two pictures of the pyramid with a row for k = 2 and one for k = 3."""
+    """An EXR whose layers OpenEXR finds by the names of the contract, whose weighted ones add up to the image
+    (float32: 1e-4), and two pictures of the pyramid with a row for k = 2 and one for k = 3."""
     file = tmp_path / "room.xml"
     file.write_text(SCENE)
     output = tmp_path / "made" / "room.v2.exr"
@@ -66,8 +66,6 @@ def test_pyramid(tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_drawn_leaves_no_file(tmp_path, monkeypatch, capsys, dark, options, message):
-    """Rationale: Mitsuba refuses an image of so many channels after the render. Expected: one line with a
-    remedy, and no file, neither of an output without suffix nor of a black image."""
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "room.xml"
     file.write_text(SCENE.replace('value="3, 2, 1"', 'value="0"') if dark else SCENE)
@@ -77,7 +75,6 @@ def test_what_cannot_be_drawn_leaves_no_file(tmp_path, monkeypatch, capsys, dark
 
 
 def test_panels_have_all_strategies():
-    """Expected: no single edges; of longer paths all strategies, None for those whose layer is black."""
     names = [f"weighted.s{s}t{k + 1 - s}.{c}" for k in (1, 2, 3) for s in range(k + 2) for c in "RGB"]
     image = np.zeros((2, 2, 3 + len(names)))
     for name in ("weighted.s0t2.R", "weighted.s1t2.G"):
@@ -93,9 +90,8 @@ def test_panels_have_all_strategies():
 
 
 def test_strategies_stand_where_they_belong(tmp_path):
-    """Rationale: strategies without light were dropped and the rest of their row moved to its middle.
-    Expected: of k = 2 and 3 edges alone (2, 1, 2) and (3, 3, 1) bring light; their panels, dark, lie at s = 1
-    of four and s = 3 of five places; the other places are empty, and k = 4, without light, has no row."""
+    """Of k = 2 and 3 edges alone (2, 1, 2) and (3, 3, 1) bring light; their panels, dark, lie at s = 1 of
+    four and s = 3 of five places; the other places are empty, and k = 4, without light, has no row."""
     white = np.ones((16, 16, 3))
     keys = [(k, s, k + 1 - s) for k in (2, 3, 4) for s in range(k + 2)]
     found = {key: 0.0 * white + 0.02 if key in ((2, 1, 2), (3, 3, 1)) else None for key in keys}
@@ -111,8 +107,6 @@ def test_strategies_stand_where_they_belong(tmp_path):
 
 
 def test_scenes_by_name_or_file(tmp_path):
-    """Expected: a name in the project's scenes/, or a file, seen from here or from the project; else an error
-    that says what to do."""
     assert PROJECT.scene("cornell_box").file.name == "cornell_box.xml"
     assert PROJECT.scene("scenes/small_casters/area_cube.xml").name == "area_cube"
     file = tmp_path / "cornell_box"

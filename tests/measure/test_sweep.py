@@ -124,10 +124,9 @@ def preset_file(folder, text=PRESET):
 
 
 def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
-    """Expected: the stored image is the rendered one within half precision (2^-11 relative), its own error
-    is at most 0.9 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks
-    are those of at least 8 renders, and the provenance says what made it.
-    """
+    """The stored image is the rendered one within half precision (2^-11 relative), its own error is at most
+    0.9 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks are those
+    of at least 8 renders, and the provenance says what made it."""
     made, reached = making.make(job(2))
     assert reached
     kept = reference_of(project, 2)
@@ -145,7 +144,7 @@ def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
 
 
 def test_furnaces_are_known_without_error(project, job):
-    """Expected: 1 - 2^-3 in every pixel of furnace_emission at depth 3, by no integrator."""
+    """1 - 2^-3 in every pixel of furnace_emission at depth 3, by no integrator."""
     making.make(job(3, "furnace_emission"))
     kept = reference_of(project, 3, "furnace_emission")
     assert (kept.image == 0.875).all() and kept.error == 0
@@ -154,9 +153,7 @@ def test_furnaces_are_known_without_error(project, job):
 
 
 def test_halves_estimate_the_error_of_their_mean():
-    """Rationale: the halves differ by twice the standard error of their mean. Expected: for halves r + e and
-    r - e the mean is r and the error that of r + e against r: e^2 / (r^2 + 0.01 r^2).
-    """
+    """Of halves r + e and r - e the error is that of r + e against r: e^2 / (r^2 + 0.01 r^2)."""
     halves = making.Halves("box")
     r, e = np.full((4, 4, 3), 2.0), 0.1
     for _ in range(4):
@@ -170,9 +167,6 @@ def test_halves_estimate_the_error_of_their_mean():
 
 
 def test_windows_of_halves_have_more_samples():
-    """Expected: each pixel is the mean of all renders it is in, weighted by their samples; the tile
-    means are those of whole images alone.
-    """
     halves = making.Halves("box")
     for value in (1.0, 3.0):
         halves.add([np.full((4, 4, 3), value)] * 2)
@@ -187,9 +181,8 @@ def test_windows_of_halves_have_more_samples():
 
 
 def test_a_run_goes_on_from_the_stored_reference(folder):
-    """Expected: the same image, error and tile means as by one run, up to half precision (2^-11 of a value);
-    seeds that were used do not come again.
-    """
+    """The same image, error and tile means as by one run, up to half precision (2^-11 of a value); seeds that
+    were used do not come again."""
     rng = np.random.default_rng(3)
     halves, window = making.Halves("box"), (slice(0, 4), slice(4, 8))
     for _ in range(agreement.FEWEST_RUNS):
@@ -213,10 +206,9 @@ def test_a_run_goes_on_from_the_stored_reference(folder):
 
 
 def test_windows_cover_the_glass_and_show_the_same():
-    """Expected: all pixels of `glass_caustics` whose camera ray meets glass or a mirror lie in the windows,
-    which fill less than a fifth of the image; a window shows that part of the whole image: depths, which
-    range over 2, agree to 0.02 on average (random positions at the outlines).
-    """
+    """All pixels of `glass_caustics` whose camera ray meets glass or a mirror lie in the windows, which fill
+    less than a fifth of the image; a window shows that part of the whole image: depths, which range over 2,
+    agree to 0.02 on average (random positions at the outlines)."""
     job = Job(REPOSITORY, REPOSITORY.scene("glass_caustics"), 64)
     scene = REPOSITORY.scene("glass_caustics").load(64)
     windows = [
@@ -241,9 +233,8 @@ def test_windows_cover_the_glass_and_show_the_same():
 
 
 def test_references_go_on_where_they_stopped(project, job):
-    """Expected: without time there are eight renders of 4 samples, which are not good enough; a second run
-    adds to them; a third has nothing to do.
-    """
+    """Without time there are eight renders of 4 samples, which are not good enough; a second run adds to
+    them; a third has nothing to do."""
     first, reached = making.make(job(2, seconds=0, by="bdpt"))
     assert not reached and first.provenance["spp"] == 32
     second, reached = making.make(job(2, by="bdpt"))
@@ -253,7 +244,6 @@ def test_references_go_on_where_they_stopped(project, job):
 
 
 def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
-    """Expected: its finished rounds are stored, do not count as a reference, and are part of the next one."""
     render, count = making.mi.render, iter(range(99))
 
     def interrupted(*args, **more):
@@ -271,11 +261,9 @@ def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
 
 
 def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch):
-    """Rationale: a reference "for at most about 7.5 s" took 2 minutes: eight renders of 256 samples. Renders
-    take 1 s per sample here, after 10 s of compilation. Expected: of 266 s 236 remain after measuring, 80 %
-    of which hold eight renders of 16 samples, and the rest three more rounds; `bdpt`, which is judged, is
-    not rendered. Without time eight renders of 4, and a warning before. Another run continues with other
-    seeds, and keeps the means until it has better ones."""
+    """Of 266 s 236 remain after measuring, 80 % of which hold eight renders of 16 samples, and the rest three
+    more rounds; `bdpt`, which is judged, is not rendered. Without time eight renders of 4, and a warning
+    before. Another run continues with other seeds, and keeps the means until it has better ones."""
     clock, seen = [0.0], []
     render, name = making.mi.render, "cornell_box"
 
@@ -303,10 +291,9 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
 
 
 def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
-    """Rationale: of 300 s a sweep spent half on a reference 30 times better than needed. Expected: for
-    renders of 64 samples eight of 128, after two that are timed, and a few more, until its own error is below
-    a tenth of theirs, raw and trimmed, long before the time is over; a better one is made when asked for.
-    Renders have a 32nd of their samples here, and take 10 ms per sample."""
+    """For renders of 64 samples eight of 128, after two that are timed, and a few more, until its own error
+    is below a tenth of theirs, raw and trimmed, long before the time is over; a better one is made when asked
+    for. Renders have a 32nd of their samples here, and take 10 ms per sample."""
     seen, render = [], making.mi.render
 
     def rendered(scene, *, spp, seed, **more):
@@ -322,9 +309,6 @@ def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
 
 
 def test_a_better_reference_stays(project, job):
-    """Expected: what a short run gives does not replace a better one that something else has made; with
-    enough time a new one does.
-    """
     made, _ = making.make(job(2))
     stored = replace(made, provenance=made.provenance | {"sampler": "another"})
     reference.write(reference.reference_path(project, "cornell_box", 8, 2), stored)
@@ -335,8 +319,6 @@ def test_a_better_reference_stays(project, job):
 
 
 def test_a_reference_with_merging_replaces_one_without(project, job):
-    """Rationale: they differ by light, so that it does not count which has less noise. Expected: a short run
-    by merging replaces a better reference without; of two with merging the better one stays."""
     name = "lamp_behind_glass"
     plain, _ = making.make(job(5, name, by="bdpt"))
     assert not plain.merged and not reference_of(project, 5, name).merged
@@ -357,7 +339,6 @@ def test_references_that_half_precision_cannot_hold_are_refused(folder):
 
 
 def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
-    """Expected: the command that makes the reference is named, with its limit of time."""
     command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --seconds 600 "
     command += f"--project {project.root}"
     with pytest.raises(ValueError, match=f"no reference.*{command}"):
@@ -374,9 +355,6 @@ def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
 
 
 def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch, job, swept):
-    """Expected: scenes x integrators x samples x seeds rows, the same in CSV and Parquet; a second run
-    renders nothing; with one cell removed it renders that one.
-    """
     making.make(job(3))
     path, output = preset_file(folder), folder / "out"
     words = path, "-o", output
@@ -401,9 +379,8 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch
 
 
 def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
-    """Expected: the same cells as here, by the same keys, with their images (the same seeds, so the same up
-    to rounding) and errors; further seeds until the interval is narrow enough; nothing is rendered twice.
-    """
+    """The same cells as here, by the same keys, with their images (the same seeds, so the same up to
+    rounding) and errors; further seeds until the interval is narrow enough; nothing is rendered twice."""
     making.make(job(3))
     path = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 3") + MORE)
     assert swept(path, "-o", folder / "here") == 0
@@ -424,7 +401,6 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
 
 
 def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, job, swept):
-    """Expected: renders of another version are not mixed in; the message says what the worker has."""
     making.make(job(3))
     monkeypatch.setattr("mitsuba_bdpt.measure.preset.software", lambda: {"mitsuba-bdpt": "other"})
     there = ["-o", folder / "out", "--scheduler", workers.scheduler_address]
@@ -433,9 +409,6 @@ def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, j
 
 
 def test_one_scene_of_a_preset_anew(folder, job, swept):
-    """Expected: with --scenes the rows of other scenes stay as they are, in the preset's order, though their
-    cells are gone; a scene that the preset lacks is named before anything is rendered.
-    """
     making.make(job(3))
     making.make(job(3, "furnace_emission"))
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
@@ -469,11 +442,10 @@ class Clock(sweep.Bench):
 
 
 def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
-    """Rationale: seconds are what everything is divided by. Expected: `path` is four times as fast and gets
-    four times the samples at every budget, by a ratio that is measured at the largest one; no measured
-    render is the first with its number of samples, which compiles; stratified samplers get the nearest power
-    of two (of 8, 12 and 28: 8, 16 and 32, of which multijitter makes 5 x 7).
-    """
+    """`path` is four times as fast and gets four times the samples at every budget, by a ratio that is
+    measured at the largest one; no measured render is the first with its number of samples, which compiles;
+    stratified samplers get the nearest power of two (of 8, 12 and 28: 8, 16 and 32, of which multijitter
+    makes 5 x 7)."""
     making.make(job(3))
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
     text += 'sampler = "multijitter"\nmatch = "seconds"\n'
@@ -492,9 +464,6 @@ def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
 
 
 def test_ctrl_c_ends_a_sweep(folder, job, swept):
-    """Rationale: `mitsuba.render` wraps what its integrators raise. Expected: the interruption arrives, and
-    is not one failed cell of many.
-    """
 
     class Interrupted(mi.SamplingIntegrator):
         def __init__(self, props):
@@ -513,7 +482,6 @@ def test_ctrl_c_ends_a_sweep(folder, job, swept):
 
 
 def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
-    """Expected: a sweep makes those of its references that are missing before it renders anything."""
     words, began = (preset_file(folder), "-o", folder / "out"), []
 
     measured = sweep.measure
@@ -527,7 +495,6 @@ def test_no_reference_no_renders(folder, project, job, swept, monkeypatch):
 
 
 def test_a_reference_of_a_version_before_is_replaced(job, monkeypatch, capsys):
-    """Expected: after an edit of the scene, a message and a new reference in place of the old one."""
     making.make(job(2))
     monkeypatch.setattr(scenes.SceneFile, "sha256", "second")
     assert making.obtained(job(2, seconds=0)).provenance["scene_sha256"] == "second"
@@ -538,8 +505,6 @@ def test_a_reference_of_a_version_before_is_replaced(job, monkeypatch, capsys):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "references").glob("*.exr")), ids=lambda path: path.stem)
 def test_committed_references_are_of_their_scenes(path):
-    """Rationale: after an edit of a scene `make sweep` makes a reference anew, in ten minutes, not hours.
-    Expected: it is not committed by accident."""
     kept = reference.header_of(path)
     name, resolution, _ = path.stem.rsplit("_", 2)
     assert resolution == "128" and kept["scene_sha256"] == REPOSITORY.scene(name).sha256
@@ -550,8 +515,6 @@ def test_committed_references_are_of_their_scenes(path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
 @pytest.mark.parametrize("pixels", [np.zeros((64, 64, 3)), np.random.default_rng(0).random((256, 256, 3))])
 def test_a_full_disk_leaves_the_old_image(folder, pixels):
-    """Rationale: OpenEXR does not report that a disk is full for files within its buffer, and raises a
-    RuntimeError for others. Expected: an error with the file's name, and the image that was there."""
     file = folder / "image.exr"
     write_layers(file, {"": np.ones((64, 64, 3))}, {})
     before = file.read_bytes()
@@ -562,9 +525,8 @@ def test_a_full_disk_leaves_the_old_image(folder, pixels):
 
 
 def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
-    """Expected: measured once, again when the number of rounds changes; a failure is reported with what the
-    process wrote, and the sweep goes on.
-    """
+    """Measured once, again when the number of rounds changes; a failure is reported with what the process
+    wrote, and the sweep goes on."""
     making.make(job(3))
     calls = []
     monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: calls.append(rounds) or {"2 spp": [1.0]})
@@ -584,7 +546,7 @@ def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
 
 
 def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
-    """Expected: status 1 if one is not good enough or fails, the others are made; bad numbers are refused."""
+    """Status 1 if one is not good enough or fails, the others are made; bad numbers are refused."""
 
     def run(*arguments):
         return making.run(build_parser().parse_args(["reference", "--project", str(folder), *arguments]))
@@ -602,9 +564,6 @@ def test_the_command_line_of_references_tells_what_failed(folder, capsys, projec
 
 
 def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, job):
-    """Rationale: the scene's file had a depth of its own, and a reference of the benchmark's scene could not
-    serve it. Expected: the default is the depth that the preset is read with, its own before that of all
-    scenes before the file's."""
     depths = []
     monkeypatch.setattr(making, "_rendered", lambda job, recipe: (depths.append(job.depth), True))
     monkeypatch.setattr(making, "write", lambda path, made: None)
@@ -619,8 +578,6 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
 
 
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
-    """Expected: cells that cannot be rendered (the variance of fewer samples than it needs) fail, are named,
-    and the others are there."""
     making.make(job(3))
     bad = 'type = "bdpt"\nname = "bad"\nlayers = "variance"'
     path = preset_file(folder, PRESET.replace('type = "path"', bad))
@@ -634,7 +591,6 @@ def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
 
 
 def test_a_plugin_that_does_not_exist_is_refused(folder, job, swept):
-    """Expected: before anything is rendered, by the name of the integrator, and no folder is left."""
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "no_such_plugin"\nname = "bad"'))
     with pytest.raises(CommandError, match="integrator 'bad': .*no_such_plugin"):
         swept(path, "-o", folder / "out")
@@ -656,8 +612,7 @@ os.replace = killed
 
 
 def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
-    """Rationale: who watched the folder from outside could find it full where the machine was busy. Expected:
-    after kill -9 while the sixth file is being written the five in cells/ are whole, and the next run
+    """After kill -9 while the sixth file is being written the five in cells/ are whole, and the next run
     completes."""
     making.make(job(3))
     path, output = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 10")), folder / "out"
@@ -676,7 +631,6 @@ def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
 
 
 def test_flip_is_of_the_first_seed():
-    """Expected: HDR-FLIP, slower than most renders, is taken where asked for; None elsewhere."""
     image = np.random.default_rng(1).random((8, 8, 3)) + 0.5
     ref = reference.Reference(np.ones((8, 8, 3)), np.zeros((8, 8, 3)), None, {})
     assert errors(image, ref, "", False)["flip"] is None
@@ -684,9 +638,6 @@ def test_flip_is_of_the_first_seed():
 
 
 def test_rows_follow_a_better_reference(folder, monkeypatch, project, job, swept):
-    """Expected: with another reference the errors are taken anew from the stored image, nothing is
-    rendered, and the error is that of the image against the new reference.
-    """
     making.make(job(3))
     path, output = preset_file(folder), folder / "out"
     words = path, "-o", output
@@ -708,9 +659,6 @@ def test_rows_follow_a_better_reference(folder, monkeypatch, project, job, swept
 
 
 def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept):
-    """Rationale: three equal ratios had no width. Expected: at least as many seeds as asked for, then
-    one more at a time until the interval of the ratio of efficiencies, which takes five, is narrow enough;
-    only of the integrators named; nothing more on a second run."""
     making.make(job(3))
     path, output = preset_file(folder, PRESET + '[[integrator]]\ntype = "ptracer"\n' + MORE), folder / "out"
     words = path, "-o", output
@@ -769,8 +717,6 @@ def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
 
 @pytest.mark.parametrize("path", sorted((ROOT / "presets").glob("*.toml")), ids=lambda p: p.stem)
 def test_presets_are_read(path):
-    """Expected: every committed preset names scenes, except that for other people's, and integrators that
-    exist."""
     named = ["cornell_box"] if path.stem == "public" else None
     for method in read_preset(path, REPOSITORY, named).methods:
         mi.load_dict(dict(method.parameters))
@@ -778,9 +724,6 @@ def test_presets_are_read(path):
 
 @pytest.mark.parametrize("name", ["cornell_box", "lamp_behind_glass", "fog_lamp", "skin_ball", "cloud_sky"])
 def test_rivals_are_those_that_see_the_media(name):
-    """Rationale: `path` passes through fog as if it were not there. Expected: the benchmark renders scenes by
-    `path` and `ptracer` or by `volpath` and `volpathmis`, where the sensor is in a medium (fog_lamp) or some
-    shape bounds one; the equal-time picture and references "by path" take the first of them."""
     scene = REPOSITORY.scene(name)
     assert scene.has_media == (name in ("fog_lamp", "skin_ball", "cloud_sky"))
     preset = read_preset(REPOSITORY.preset("benchmark"), REPOSITORY)
@@ -793,8 +736,6 @@ def test_rivals_are_those_that_see_the_media(name):
 
 
 def test_equal_time_is_the_default(tmp_path):
-    """Rationale: [[integrator]] without `match` had the samples of the first one, and figures said "equal
-    time". Expected: equal seconds for all but the first; the presets of the project keep their meaning."""
     text = PRESET.replace('match = "seconds"', "") + '[[integrator]]\ntype = "ptracer"\nmatch = "spp"\n'
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     assert [m.match for m in preset.methods] == ["spp", "seconds", "spp"]
@@ -809,8 +750,6 @@ def test_equal_time_is_the_default(tmp_path):
 
 
 def test_three_lines_are_a_preset(tmp_path):
-    """Expected: scenes, samples and seeds alone; the integrators are this package's and the path tracer that
-    sees what is in the scene, in equal time; scenes and samples too may be left out in Python."""
     text = 'scenes = ["cornell_box", "fog_lamp"]\nspp = [4, 16]\nseeds = 5\n'
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     found = [[m.name for m in Cells(REPOSITORY, preset, one).methods] for one in preset.subjects]
@@ -843,9 +782,6 @@ OPEN = 'resolution = 8\nmax_depth = 3\nseeds = 2\nspp = [2]\n[[integrator]]\ntyp
 
 
 def test_a_folder_of_scenes_is_a_preset(tmp_path, others, monkeypatch):
-    """Rationale: scenes of exporters are all called scene_v3.xml, each in a folder of its own. Expected: a
-    pattern finds them all, under the names of the folders, from here, from the project's folder, or from the
-    home folder; a scene that cannot be loaded is left out with the reason and costs the others nothing."""
     monkeypatch.setenv("HOME", str(tmp_path))
     for pattern in (f"{others}/*/scene_v3.xml", "theirs/*/*.xml", "~/theirs/*/scene_v?.xml"):
         text = f'scenes = ["{pattern}"]\n{OPEN}'
@@ -866,9 +802,9 @@ def test_a_folder_of_scenes_is_a_preset(tmp_path, others, monkeypatch):
 
 
 def test_scenes_of_the_command_line(tmp_path, others, swept, capsys):
-    """Expected: a preset without scenes renders the files that --scenes names, and says so without them; rows
-    of an earlier run stay, and another run with the first scene renders nothing anew; a scene that cannot be
-    loaded is named first, and the exit status is 1."""
+    """A preset without scenes renders the files that --scenes names, and says so without them; rows of an
+    earlier run stay, and another run with the first scene renders nothing anew; a scene that cannot be loaded
+    is named first, and the exit status is 1."""
     file = preset_file(tmp_path, OPEN)
     output = tmp_path / "out"
     with pytest.raises(CommandError, match="scenes is missing; list them, or name scene files by --scenes"):
@@ -886,8 +822,8 @@ def test_scenes_of_the_command_line(tmp_path, others, swept, capsys):
 
 
 def test_widths_fit_the_film(tmp_path, others):
-    """Expected: of a film of 12 x 10 pixels, of which no width of 128 divides into tiles of whole pixels, the
-    nearest width that does, 120 with a height of 100; and a reason where there is none."""
+    """Of a film of 12 x 10 pixels, of which no width of 128 divides into tiles of whole pixels, the nearest
+    width that does, 120 with a height of 100; and a reason where there is none."""
     for name, sides in (("attic", (12, 10)), ("cellar", (1009, 4))):
         text = SCENE
         for side in sides:
@@ -902,8 +838,8 @@ def test_widths_fit_the_film(tmp_path, others):
 
 
 def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
-    """Expected: a column with the median seconds of an integrator's first images, measured once, at the
-    smallest budget, in the report as a table; a scene without file has none."""
+    """A column with the median seconds of an integrator's first images, measured once, at the smallest
+    budget, in the report as a table; a scene without file has none."""
     making.make(job(3))
     text = PRESET.replace("seeds = 2", "seeds = 2\nfirst_image = 3")
     values, asked = iter([1.0, 9.0, 3.0, 1.0, 2.0, 1.5] * 2), []
@@ -932,8 +868,6 @@ def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
 
 
 def test_a_first_image_without_kernel_cache():
-    """Expected: a process of its own renders the scene's file as asked, in seconds; the text of one that
-    fails is raised."""
     wanted = {"file": str(ROOT / "scenes" / "cornell_box.xml"), "resolution": 8, "sampler": "independent"}
     wanted |= {"parameters": {"type": "path"}, "max_depth": 3, "spp": 2}
     began = time.perf_counter()
@@ -944,8 +878,8 @@ def test_a_first_image_without_kernel_cache():
 
 
 def test_time_left_follows_from_work(monkeypatch, capsys):
-    """Expected: after a render of a quarter of the work in 10 s, 30 s are left, less where a limit is nearer;
-    lines at most each half a minute where there is no terminal, with the number of renders."""
+    """After a render of a quarter of the work in 10 s, 30 s are left, less where a limit is nearer; lines at
+    most each half a minute where there is no terminal, with the number of renders."""
     clock = [0.0]
     monkeypatch.setattr(showing.time, "monotonic", lambda: clock[0])
     with showing.Renders() as made, showing.Renders(limit=25) as limited:
@@ -967,8 +901,8 @@ def test_time_left_follows_from_work(monkeypatch, capsys):
 
 
 def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
-    """Expected: of 100 seconds the missing references of two scenes take 25 each at most, and the renders
-    what is left; --reference-seconds and no limit as they say. What took longer is said."""
+    """Of 100 seconds the missing references of two scenes take 25 each at most, and the renders what is left;
+    --reference-seconds and no limit as they say. What took longer is said."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool"]')
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     asked = []
@@ -993,9 +927,6 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
 
 
 def test_the_table_is_tidy(tmp_path):
-    """Rationale: 48 columns, five of them JSON, and images named by a hash. Expected: a row per render whose
-    cells are texts or numbers, with the name of its image, which is there under that name, as are other files
-    but those of rows before; parameters, decisions and statistics in a file; all columns in Parquet."""
     row = {
         "scene": "box",
         "method": "path multijitter",
@@ -1041,8 +972,6 @@ def test_the_table_is_tidy(tmp_path):
 
 @pytest.mark.parametrize(("more", "points"), [("", "sobol"), ('points = "independent"\n', "independent")])
 def test_samplers_of_rows_are_those_of_the_table(folder, job, swept, more, points):
-    """Rationale: of `bdpt` rows.csv had its points and the rows the sensor's sampler, which it does not use.
-    Expected: both its points, also of a folder of an earlier version, whose renders all stay."""
     making.make(job(3))
     text = PRESET.replace('type = "bdpt"\n', f'type = "bdpt"\nsampler = "multijitter"\n{more}')
     path, output = preset_file(folder, text.replace("[2, 4]", "[2]")), folder / "out"
@@ -1069,11 +998,11 @@ def test_samplers_of_rows_are_those_of_the_table(folder, job, swept, more, point
 
 
 def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
-    """Expected: renders of a second per sample, 2 and 4 samples, by two integrators and two seeds, each twice
-    as long where its budget compiles: 8, 16, 4 and 8 s. In 29 s all but the last are rendered, in 23 s small
-    ones of later seeds in place of the large one that does not fit; the cut ones are named with the option
-    that has time for them, and a second run with it renders them. Two seeds of the smallest budget are
-    rendered even without time: figures need pairs."""
+    """Renders of a second per sample, 2 and 4 samples, by two integrators and two seeds, each twice as long
+    where its budget compiles: 8, 16, 4 and 8 s. In 29 s all but the last are rendered, in 23 s small ones of
+    later seeds in place of the large one that does not fit; the cut ones are named with the option that has
+    time for them, and a second run with it renders them. Two seeds of the smallest budget are rendered even
+    without time: figures need pairs."""
     preset = read_preset(preset_file(tmp_path), REPOSITORY)
     found, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
@@ -1105,9 +1034,6 @@ def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
 
 
 def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
-    """Expected: a scene that is complete takes no share, what one leaves goes to the next, and what is left
-    at the end to those that still lack renders, until nothing more fits. The message advises
-    the time that these need, and a quarter more."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
     made = sweep.Sweep(REPOSITORY, read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
     made._todo[1], clock, shares = [], [0.0], []
@@ -1139,10 +1065,8 @@ def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
 
 
 def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, job, swept):
-    """Rationale: the same command again predicted 0 s for the large budgets that the first run had cut, began
-    one in the last second, and advised --seconds 0 for the rest. Expected: in 0.1 s, what renders of 64
-    samples take as 0.064 s in the first run is known to be too long for those of 256, and named with time
-    for them."""
+    """In 0.1 s, what renders of 64 samples take as 0.064 s in the first run is known to be too long for those
+    of 256, and named with time for them."""
     making.make(job(3))
     path, output = preset_file(folder, PRESET.replace("[2, 4]", "[2, 64, 6400]")), folder / "out"
     monkeypatch.setattr(sweep, "Bench", Clock)
@@ -1158,8 +1082,8 @@ def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, job, s
 
 
 def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
-    """Expected: a render of 0.5 s and 0.1 s per sample: of the first budget in proportion, of two by the line
-    through both; at least half of the proportion, for noise; that of a known budget is the last one."""
+    """A render of 0.5 s and 0.1 s per sample: of the first budget in proportion, of two by the line through
+    both; at least half of the proportion, for noise; that of a known budget is the last one."""
     preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
     cells = sweep.Cells(REPOSITORY, preset, preset.subjects[0])
     made = limited.Pending(cells, cells.planned(), {})
@@ -1174,9 +1098,8 @@ def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
 
 
 def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
-    """Rationale: at the largest budget it took longer than the whole limit. Expected: of budgets to 400
-    samples, 1.25 ms each of both integrators and four renders, a quarter of the limit allows 4 (16 ms
-    of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit)."""
+    """Of budgets to 400 samples, 1.25 ms each of both integrators and four renders, a quarter of the limit
+    allows 4 (16 ms of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit)."""
     text = PRESET.replace("[2, 4]", "[4, 40, 400]")
     preset = read_preset(preset_file(folder, text), REPOSITORY)
     cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
@@ -1192,8 +1115,6 @@ PER = {"ours": 1e-3, "path": 0.25e-3}
 
 
 def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, swept):
-    """Expected: the scene, its renders and the command that renders them, until a run renders them; a run of
-    another scene leaves that as it is. Rows that another preset wrote into the folder are named."""
     making.make(job(3))
     path, output = preset_file(folder), folder / "out"
     monkeypatch.setattr(sweep, "Bench", Clock)
@@ -1225,7 +1146,6 @@ def keys(folder, text=PRESET):
 
 
 def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):
-    """Expected: another seed, number of samples, depth or source of the plugin is another cell."""
     names = keys(tmp_path)
     assert len(names) == 8
     assert not names & keys(tmp_path, PRESET.replace("max_depth = 3", "max_depth = 4"))

@@ -17,9 +17,8 @@ def recorder(calls, name, seed):
 
 @pytest.mark.parametrize("is_warm", [False, True])
 def test_sides_take_turns(is_warm):
-    """Rationale: the first render compiles, and a machine that grows slower must not speak against the side
-    that comes second. Expected: seed 0 for a start, unless everything is warm; then every other round in
-    reversed order; what a round returns is in the order of the sides."""
+    """Seed 0 for a start, unless everything is warm; then every other round in reversed order; what a round
+    returns is in the order of the sides."""
     calls, seen = [], []
     sides = [partial(recorder, calls, name) for name in ("a", "bb", "ccc")]
     rounds = list(alternating(sides, 2, seen.append, is_warm=is_warm))

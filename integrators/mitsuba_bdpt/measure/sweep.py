@@ -299,8 +299,8 @@ class Sweep:
     def run(self, progress: Renders, client=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
 
-        On a cluster if its ``client`` is given. ``seconds``: limit, shared equally by the scenes; what does not
-        fit is recorded in ``cut``.
+        ``client``: of a cluster, to render there. ``seconds``: limit, shared equally by the scenes; what does
+        not fit is recorded in ``cut``.
         """
         scenes, todo = self.scenes, self._todo
         self._progress = progress
