@@ -9,11 +9,11 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7184,
+    "measure": 7118,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2286,
-    "cli": 1810,
+    "cli": 1729,
     "media": 1349,
     "geometry": 1518,
     "image": 1502,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 41894}
+OUTSIDE = {"scripts": 2931, "tests": 41458}
 MOST_WORDS = 29076
 
 
