@@ -2,11 +2,9 @@
 
 The reference is Mitsuba's `path`, or a closed form where it is blind. Scenes and the table of who takes part
 in what: `scene_parts`. In its open scene the geometry term is bounded, so that single strategies can be
-compared as well: all estimates of paths of k edges by different strategies have one mean.
-
-Statistics: the sample is the mean of a quarter of the image (and of all of it) in one render; renders of
-12 seeds. Against `path` Welch's t-test, against a known value and between the strategies of the same
-renders (which share subpaths) Student's of the differences; Sidak over all comparisons of a test, at 1e-4.
+compared as well. The sample is the mean of a quarter of the image (and of all of it) in one render; renders
+of 12 seeds. Against `path` Welch's t-test, against a known value and between the strategies of the same
+renders (which share subpaths) Student's of the differences; Šidák over all comparisons of a test, at 1e-4.
 Roulette is off (paths of up to 3 edges).
 """
 
@@ -19,6 +17,8 @@ import pytest
 import scene_parts as parts
 import welch as st
 from mitsuba_bdpt.host.jit import evaluated_mode
+
+import scenes
 
 LEVEL = 1e-4
 DEPTH = 3
@@ -33,38 +33,31 @@ T = parts.T
 
 
 def renders(scene, method, samples, first_seed, seeds=SEEDS):
-    """Images of ``seeds`` renders, (seeds, height, width, channels)."""
+    """Images of renders of so many samples in all (of a single pixel in proportion)."""
     width, height = scene.sensors()[0].film().crop_size()
     pixels = width * height
     spp = samples // pixels if pixels > 1 else samples * SAMPLES_OF_A_PIXEL // SAMPLES
-    return np.stack(
-        [np.array(method.render(scene, seed=first_seed + i, spp=spp), dtype=np.float64) for i in range(seeds)]
-    )
+    return scenes.renders(scene, method, spp, seeds, first_seed)
+
+
+def bdpt(**parameters):
+    return scenes.integrator(**{"max_depth": DEPTH, "skip": "none"} | parameters)
+
+
+def path():
+    return scenes.integrator("path", max_depth=DEPTH)
+
+
+def layer(images, method, kind, s, t):
+    """Tiles of the technique image (s, t); None if there is none."""
+    name = f"{kind}.s{s}t{t}"
+    return tiles(scenes.layer(images, method, name)) if f"{name}.R" in method.aov_names() else None
 
 
 def tiles(images):
     """One number for each quarter of the images: (seeds, 4), or (seeds, 1) of a single pixel."""
     count = 2 if images.shape[1] > 1 else 1
     return np.stack([st.tile_means(image, count) @ CHANNELS for image in images[..., :3]])
-
-
-def bdpt(**parameters):
-    settings = {"max_depth": DEPTH, "rr_depth": 100, "skip": "none"} | parameters
-    return mi.load_dict({"type": "bdpt", **settings})
-
-
-def path(max_depth=DEPTH):
-    return mi.load_dict({"type": "path", "max_depth": max_depth, "rr_depth": 100})
-
-
-def layer(images, method, kind, s, t):
-    """Tiles of the technique image (s, t); None if there is none."""
-    names = method.aov_names()
-    name = f"{kind}.s{s}t{t}.R"
-    if name not in names:
-        return None
-    first = images.shape[-1] - len(names) + names.index(name)
-    return tiles(images[..., first : first + 3])
 
 
 def paired(a, b, label):
@@ -121,14 +114,11 @@ def pairs(slow=lambda emitter, sensor: True):
     ("emitter", "sensor"), pairs(lambda e, s: not (s == "perspective" or (e, s) in QUICK))
 )
 def test_pair(emitter, sensor):
-    """Rationale: each pair has its own combination of strategies, measures and special cases.
-
-    Expected: the image with all strategies (skip=none) is `path`'s; the weighted layers add up to the image
-    (1e-4 of its mean: other orders of float32 sums); and for k = 1, 2, 3 every strategy that the table of
-    `scene_parts` gives to the pair has the mean of the first of them, all others are dark. Tolerance: the
-    mean of all renders is known to 1 %; see the module. Light that comes straight from a delta emitter is
-    out of sight (`path` misses it where the sensor has area).
-    """
+    """Each pair has its own combination of strategies, measures and special cases. Expected: the image with
+    all strategies is `path`'s, known to 1 %; the weighted layers add up to it (1e-4 of its mean: other orders
+    of sums); for k = 1, 2, 3 every strategy that the table of `scene_parts` gives to the pair has the mean of
+    the first of them, all others are dark. Light that comes straight from a delta emitter is out of sight
+    (`path` misses it where the sensor has area)."""
     scene = parts.pair(emitter, sensor)
     method = bdpt(layers="strategies")
     images = renders(scene, method, SAMPLES, 0)
@@ -173,11 +163,7 @@ def strategies(images, method, emitter, sensor):
 
 @pytest.mark.parametrize(("emitter", "sensor"), pairs())
 def test_pair_with_defaults(emitter, sensor):
-    """Rationale: as `test_pair`, with the default choice of what to skip: one light subpath for four camera
-    subpaths, one connection, roulette.
-
-    Expected: the image is `path`'s. Tolerance and statistic as there.
-    """
+    """As `test_pair`, with the default choice of what to skip, one connection, roulette."""
     ours = tiles(renders(parts.pair(emitter, sensor), bdpt(skip="auto"), 2 * SAMPLES, 0))
     other = parts.pair(emitter, sensor, reference=True)
     with evaluated_mode(emitter == "timed_sunsky"):
@@ -201,13 +187,10 @@ DISTINCT = {part: PLUGINS[plugin] for plugin, part in parts.EMITTER_PARTS.items(
     [pytest.param(e, marks=[pytest.mark.slow] * (e not in DISTINCT)) for e in PLUGINS.values()],
 )
 def test_explain_names_what_is_impossible(emitter, sensor):
-    """Rationale: a kind that cannot take part in a strategy is skipped in the open, not failed or ignored.
-
-    Expected: `explain` has a line `skipped (impossible): CLASS: why` for each class of strategies that the
-    table of `scene_parts` does not give to the pair, with a reason, for emission that no table can guide, and
-    for no other; and a line that names
-    the emitter if no light subpath starts from it, or next-event estimation cannot choose it.
-    """
+    """`explain` has a line `skipped (impossible): CLASS: why` for each class of strategies that the table of
+    `scene_parts` does not give to the pair, for emission that no table can guide, and for no other; and a
+    line that names the emitter if no light subpath starts from it, or next-event estimation cannot choose
+    it."""
     text = bdpt().explain(parts.pair(emitter, sensor))
     skipped = dict(re.findall(r"skipped \(impossible\): ([^:]+): (.+)", text))
     expected = {c for c, (s, t) in CLASSES.items() if not parts.takes_part(emitter, sensor, s, t)}
@@ -221,13 +204,10 @@ def test_explain_names_what_is_impossible(emitter, sensor):
 
 
 def test_kinds_that_take_part_partly_beside_others():
-    """Rationale: an emitter that starts no light subpaths, or none but these, must not keep others in the
-    scene from what they can do, nor be chosen where it cannot be used.
-
-    Expected: a point light, a plugin of unknown class, a lamp of the class `directionalarea` and an area
-    light together make the sum of the images that each makes alone. Tolerance: the mean of all
-    renders is known to 1 %. Statistic: Welch, see the module.
-    """
+    """An emitter that starts no light subpaths, or none but these, must not keep others in the scene from
+    what they can do, nor be chosen where it cannot be used: a point light, a plugin of unknown class, a lamp
+    of the class `directionalarea` and an area light together make the sum of the images that each makes
+    alone."""
     parts.register_plugins()
     lamps = {
         "a": parts.EMITTERS["sphere"](),
@@ -249,21 +229,6 @@ def test_kinds_that_take_part_partly_beside_others():
 def unlit(part):
     """The entry of a shape without its emitter."""
     return {key: value for key, value in part.items() if key != "emitter"}
-
-
-@pytest.mark.parametrize(("own", "builtin"), [("own lamp", "point"), ("own sky", None)])
-def test_plugins_of_users(own, builtin):
-    """Rationale: an emitter of a class that the package does not know takes part by Mitsuba's calls alone.
-
-    Expected: `own lamp` makes the image of the built-in emitter that it repeats; for both, s = 1 alone (and
-    s = 0) makes what all strategies together make. Statistic: Welch, see the module.
-    """
-    images = renders(parts.pair(own, "perspective"), bdpt(), SAMPLES, 0)
-    if builtin:
-        others = renders(parts.pair(builtin, "perspective"), bdpt(), SAMPLES, 1000)
-    else:
-        others = renders(parts.pair(own, "perspective"), bdpt(light_paths=0), SAMPLES, 1000)
-    assert_agree([st.compare_images(tiles(images), tiles(others), own)])
 
 
 # -- known answers ----------------------------------------------------------------------------
@@ -289,12 +254,9 @@ def beam_scene(sensor, half=0.5, height=1.5):
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
 def test_directionalarea_lights_what_is_below(kind):
-    """Rationale: `path` sees nothing of a directionalarea emitter, which only light subpaths find.
-
-    Expected: of radiance L it has the power L A (Mitsuba's convention), so that the irradiance below it is
-    L and the floor's radiance 0.6 L / pi, in every pixel of a view that lies in the lit square. Statistic:
-    Student's t-test against it per tile.
-    """
+    """`path` sees nothing of it, which only light subpaths find. Of radiance L it has the power L A
+    (Mitsuba's convention), so that the floor's radiance is 0.6 L / pi in every pixel of a view of the lit
+    square."""
     look = T().look_at([1.5, 1, 0], [0, 0, 0], [0, 1, 0])
     sensor = {
         "perspective": lambda: parts.perspective((1.5, 1, 0), (0, 0, 0), fov=12, size=8),
@@ -307,11 +269,8 @@ def test_directionalarea_lights_what_is_below(kind):
 
 
 def test_directionalarea_seen_from_afar():
-    """Rationale: as above, for the sensor that has no film to speak of.
-
-    Expected: the mean radiance over the disk that covers the scene's bounding sphere of radius R: the lit
-    square's radiance times its share of the disk, A cos / (pi R^2). Statistic: Student's t-test.
-    """
+    """The mean radiance over the disk that covers the scene's bounding sphere of radius R: the lit square's
+    radiance times its share of the disk, A cos / (pi R^2)."""
     direction = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)
     scene = beam_scene(parts.distant(direction=direction.tolist()))
     images = renders(scene, bdpt(max_depth=2), SAMPLES, 0)
@@ -321,12 +280,8 @@ def test_directionalarea_seen_from_afar():
 
 
 def test_directionalarea_by_inner_connections():
-    """Rationale: (2,2) and (3,1) make the same paths; with a lamp that no camera path can find, nothing
-    else checks them.
-
-    Expected: for k = 3 their unweighted images agree, and so does (2,1) with the image for k = 2, in the
-    scene of a floor, a ball and a box. Statistic: Student's t-test of the differences.
-    """
+    """(2,2) and (3,1) make the same paths; with a lamp that no camera path can find, nothing else checks
+    them."""
     method = bdpt(layers="strategies")
     images = renders(parts.pair("directionalarea", "perspective"), method, 4 * SAMPLES, 0)
     inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
@@ -395,12 +350,8 @@ def irradiance_above(lamp):
 
 @pytest.mark.parametrize("lamp", LAMPS_ABOVE)
 def test_meter_reads_the_known_irradiance(lamp):
-    """Rationale: what a sensor with area sees of a lamp directly has strategies of its own, (0,2), (1,1)
-    and (2,0), and `path` misses all light of delta emitters here.
-
-    Expected: the irradiance of a plate under the lamp, from each of these strategies that
-    `scene_parts` gives to the pair, and from all together. Statistic: Student's t-test against it.
-    """
+    """What a sensor with area sees of a lamp directly has strategies of its own, (0,2), (1,1) and (2,0), and
+    `path` misses all light of delta emitters here."""
     scene = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS), "lamp": LAMPS_ABOVE[lamp]()})
     method = bdpt(max_depth=1, layers="strategies")
     images = renders(scene, method, SAMPLES, 0)
@@ -429,12 +380,8 @@ def meters_under_a_point(width, **others):
 
 @pytest.mark.parametrize("width", [2, 4])
 def test_batch_of_meters_reads_the_known_irradiance(width):
-    """Rationale: light of a point light that falls on the meters of a batch directly has (1,1) alone;
-    without it each reads 0, without a word.
-
-    Expected: in each pixel the irradiance of its part of its plate, 3 h / r^3 integrated by midpoints.
-    Statistic: Student's t-test against it.
-    """
+    """Light of a point light that falls on the meters of a batch directly has (1,1) alone; without it each
+    reads 0. In each pixel the irradiance of its part of its plate, 3 h / r^3 integrated by midpoints."""
     scene = meters_under_a_point(width)
     values = renders(scene, bdpt(max_depth=1), SAMPLES, 0)[:, 0, :, :3] @ CHANNELS
     middle = (np.arange(40) + 0.5) / 20 - 1
@@ -448,11 +395,7 @@ def test_batch_of_meters_reads_the_known_irradiance(width):
 
 
 def test_strategies_of_a_batch_of_meters_agree():
-    """Rationale: meters side by side share the densities of one; a wrong one would show in the weights.
-
-    Expected: with a lamp that has area, between a mirror and a floor, all strategies and camera subpaths
-    alone have the same mean in each meter. Statistic: Welch's t-test.
-    """
+    """Meters side by side share the densities of one; a wrong one would show in the weights."""
     lamp = LAMPS_ABOVE["rectangle"]()
     mirror = {"type": "rectangle", "to_world": T().translate([0, 0, -1]), "bsdf": {"type": "conductor"}}
     flat = T().translate([0, -0.2, 0]) @ T().rotate([1, 0, 0], -90).scale(3)
@@ -464,11 +407,8 @@ def test_strategies_of_a_batch_of_meters_agree():
 
 
 def test_meter_of_another_scene():
-    """Rationale: the shape of a meter from elsewhere is not in the scene, so that no light subpath arrives at
-    it; weights that count with t = 0 lose its part.
-
-    Expected: the known irradiance under a lamp with area. Statistic: Student's t-test.
-    """
+    """The shape of a meter from elsewhere is not in the scene, so that no light subpath arrives at it;
+    weights that count with t = 0 lose its part."""
     scene = mi.load_dict({"type": "scene", "lamp": LAMPS_ABOVE["rectangle"]()})
     elsewhere = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS)})
     method, sensor = bdpt(max_depth=1), elsewhere.sensors()[0]
@@ -479,13 +419,9 @@ def test_meter_of_another_scene():
 
 
 def test_lens_sees_a_point():
-    """Rationale: a point light in front of an open lens is a disk on the film, which only (1,1) and (2,0)
-    make; `path` misses it.
-
-    Expected: the image's mean is the mean over the lens of I / d^2 times the density of directions,
-    1 / (A cos^3), A being the film's area at distance 1. Statistic: Student's t-test for each of the two
-    and for both together.
-    """
+    """A point light in front of an open lens is a disk on the film, which only (1,1) and (2,0) make; `path`
+    misses it. The mean over the lens of I / d^2 times the density of directions, 1 / (A cos^3), A being the
+    film's area at distance 1."""
     sensor = parts.thinlens(0.4, 3.0, origin=(0, 0, 0), target=(0, 0, 1), fov=50, size=8)
     lamp = {"type": "point", "position": [0.1, 0.05, 1.5], "intensity": 2.0}
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp})
@@ -514,44 +450,15 @@ PAGE = ROOT / "docs" / "user" / "coverage.md"
 
 
 def test_the_page_names_tests_that_exist():
-    """Expected: every link of docs/user/coverage.md to a test leads to a file of tests/ that has the test of
-    that name.
-    """
     links = re.findall(r"\]\(\.\./\.\./tests/([\w/]+\.py) \"(\w+)\"\)", PAGE.read_text())
     assert len(links) > 20
     for file, name in sorted(set(links)):
         assert f"\ndef {name}(" in (ROOT / "tests" / file).read_text(), f"{file} has no {name}"
 
 
-MEDIA_PLUGINS = """homogeneous heterogeneous null mask blendbsdf dielectric thindielectric roughdielectric
-    isotropic hg rayleigh tabphase blendphase sggx
-    perspective thinlens orthographic irradiancemeter batch""".split()
-
-
-def test_rows_of_media_link_tests_of_their_plugins():
-    """Rationale: a row named phase functions that its test never rendered. Expected: each of these plugins
-    stands in some row of the section on media, and in quotation marks in a file of tests that the row links,
-    or in the parts of their scenes.
-    """
-    section = PAGE.read_text().partition("\n## Participating media\n")[2].partition("\n## ")[0]
-    parts_of_scenes = "".join(
-        (ROOT / "tests" / "support" / f"{x}.py").read_text() for x in ("media_parts", "views")
-    )
-    seen = set()
-    for row in re.findall(r"^\| .* \|$", section, re.MULTILINE):
-        files = set(re.findall(r"\]\(\.\./\.\./tests/([\w/]+\.py) ", row))
-        texts = parts_of_scenes + "".join((ROOT / "tests" / file).read_text() for file in files)
-        words = set(re.findall(r"\w+", re.sub(r"\]\([^)]*\)", "", row)))
-        named = words.intersection(MEDIA_PLUGINS)
-        assert all(f'"{name}"' in texts for name in named), (row, named)
-        seen |= named
-    assert seen == set(MEDIA_PLUGINS), set(MEDIA_PLUGINS) - seen
-
-
 def test_the_page_says_who_takes_part():
-    """Expected: docs/user/coverage.md has a row for every kind of emitter and sensor, with a dash exactly
-    where the table of `scene_parts`, which the tests above rely on, says that it has no part.
-    """
+    """A dash exactly where the table of `scene_parts`, which the tests above rely on, says that it has no
+    part."""
     rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
     found = {name: [cell.startswith("–") for cell in cells.split(" | ")] for name, cells in rows}
     kinds = {name: part for name, part in parts.EMITTER_PARTS.items() if not name.startswith("own")}

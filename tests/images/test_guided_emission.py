@@ -8,17 +8,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
-import variants
-import welch as st
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.guided_emission import Cells, EmissionTables, learning, side_of
+from mitsuba_bdpt.guided_emission import Cells, EmissionTables, learning
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.planning import choice, pilot
 from mitsuba_bdpt.planning.configuration import CANDIDATES
 from mitsuba_bdpt.planning.moments import GROUPS, Moments
 from mitsuba_bdpt.run import rendering
-from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
+from test_same_mean import decided, random_tables, scene_of
 
 from stress_cases.capture import Capture
 from stress_cases.weights import Tally, weigh
@@ -28,145 +26,16 @@ T = mi.ScalarTransform4f
 CLASSES = learning.CLASSES
 
 
-def random_tables(scene, seed=1):
-    """Tables of a scene's emitters, of neighbours that differ by up to 50."""
-    emitters = Emitters(scene)
-    side = side_of(sum(emitters.tables))
-    densities = np.random.default_rng(seed).random((sum(emitters.tables), side, side)) ** 4 + 0.02
-    return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), 0.5)
-
-
-def decided(tables, light_paths=1.0, connections="all", kappa=1.0):
-    """The decision for all strategies, with ``tables``."""
-    way = {"light_paths": light_paths, "connections": connections, "emission": tables.record()}
-    more = {"coefficients": {"t<=1": kappa, "s=1": 1.0}, "cost": 1.0, "variance": 0.0, "mean": 0.0}
-    return json.dumps([way | more])
-
-
-def images(scene, spp, seeds, **parameters):
-    """(seeds, height, width) of the first colour, of paths of up to four edges."""
-    return rendered_images(scene, spp, seeds, **{"max_depth": 4} | parameters)
-
-
-LAMPS = {
-    "rectangle": ["rectangle"],
-    "upright rectangle": ["upright"],
-    "disk": ["disk"],
-    "sphere": ["sphere"],
-    "smooth mesh": ["smooth mesh"],
-    "textured": ["textured"],
-    "spot": ["spot"],
-    "point and rectangle": ["point", "rectangle"],
-    "constant": ["constant"],
-    "sun along an axis": ["down"],
-    "sun and sky": ["directional", "constant"],
-    "envmap": ["rotated envmap"],
-    "projector and sphere": ["projector", "sphere"],
-}
-
-OWN = {
-    "upright": lambda: (
-        parts.EMITTERS["rectangle"]()
-        | {"to_world": T().translate([1.5, 1, 0]).rotate([0, 1, 0], -90).scale(0.4)}
-    ),
-    "down": lambda: {"type": "directional", "direction": [0, -1, 0], "irradiance": 2.0},
-}
-
-
-def scene_of(lamps, sensor="perspective", **more):
-    parts.register_plugins()
-    made = {f"lamp {i}": (OWN.get(name) or parts.EMITTERS[name])() for i, name in enumerate(LAMPS[lamps])}
-    eye = parts.thinlens(aperture=0.6) if sensor == "thinlens" else parts.perspective()
-    return mi.load_dict(parts.open_scene(eye, **made, **more))
-
-
 # -- unbiased -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("lamps", LAMPS)
-def test_images_are_those_without_tables(lamps):
-    """Expected: the same tiles, by Welch's test, with all strategies."""
-    scene = scene_of(lamps)
-    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
-    b = images(scene, 256, 10, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize("lamps", ["rectangle", "sphere", "point and rectangle", "sun and sky"])
-def test_images_with_a_wide_lens(lamps):
-    """Rationale: t = 0 and (1,1) ask for densities too. Expected: the same tiles, by Welch's test."""
-    scene = scene_of(lamps, "thinlens")
-    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
-    b = images(scene, 256, 10, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize(
-    "parameters",
-    [
-        {"heuristic": "power"},
-        {"points": "independent"},
-        {"hide_emitters": True},
-        {"stored_vertices": 2},
-    ],
-    ids=lambda parameters: next(iter(parameters)) + "=" + str(next(iter(parameters.values()))),
-)
-def test_parameters(parameters):
-    """Expected: the same tiles as without tables, with four camera subpaths per light subpath and one drawn
-    connection.
-    """
-    scene = scene_of("point and rectangle")
-    decisions = decided(random_tables(scene), 0.25, "one", 0.5)
-    a = images(scene, 256, 10, decisions=decisions, **parameters)
-    keep = {"hide_emitters": True} if "hide_emitters" in parameters else {}
-    b = images(scene, 256, 10, first=100, skip="none", **keep)
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize("variant", [variants.of("spectral"), variants.of("mono")])
-def test_variants(variant):
-    """Expected: the same tiles as without tables."""
-    mi.set_variant(variant)
-    scene = scene_of("sun and sky")
-    a = images(scene, 64, 8, decisions=decided(random_tables(scene)))
-    b = images(scene, 64, 8, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-def fog():
-    medium = {"type": "homogeneous", "sigma_t": 0.8, "albedo": 0.7}
-    box = {"type": "cube", "to_world": T().translate([0, 1, 0]).scale(0.9), "bsdf": {"type": "null"}}
-    return {"fog": box | {"interior": medium}}
-
-
-def test_fog():
-    """Expected: the same tiles as without tables, in a box of fog."""
-    scene = scene_of("point and rectangle", **fog())
-    a = images(scene, 256, 10, decisions=decided(random_tables(scene)))
-    b = images(scene, 256, 10, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-def test_merging():
-    """Rationale: photons set out by the same tables, mixed with their own aim. Expected: the same tiles as
-    merging without tables (a glass ball under a lamp; blur is the same).
-    """
-    glass = {"type": "sphere", "center": [0.2, 0.9, 0.9], "radius": 0.3, "bsdf": {"type": "dielectric"}}
-    scene = scene_of("point and rectangle", glass=glass)
-    a = images(scene, 256, 10, decisions=decided(random_tables(scene)), merging=True)
-    b = images(scene, 256, 10, first=100, skip="none", merging=True)
-    st.assert_same_tiles(a, b)
 
 
 @pytest.mark.parametrize("heuristic", ["balance", "power"])
 @pytest.mark.parametrize("lamps", ["rectangle", "sphere", "spot", "constant", "sun along an axis"])
 def test_weights_are_those_of_explicit_densities(lamps, heuristic):
-    """Rationale: what partial sums say of a path has to be what all densities say, those of tables in closed
-    form. Expected: weights of real paths within 1e-3, and sums of 1 (but for the 2 % where rounding decides).
-    """
-    scene = scene_of(lamps, "thinlens" if lamps != "spot" else "perspective")
+    """Weights of real paths within 1e-3, and sums of 1 (but for the 2 % where rounding decides)."""
+    scene = scene_of(lamps, lens=lamps != "spot")
     tables = random_tables(scene)
-    more = {"max_depth": 4, "heuristic": heuristic, "decisions": decided(tables)}
+    more = {"max_depth": 4, "heuristic": heuristic} | decided(emission=tables.record())
     tally = Tally()
     weigh(tally, Capture(scene, internals.bdpt(**more), 4000, 3), heuristic)
     assert tally.bad == 0 and tally.paths > 3000
@@ -194,10 +63,9 @@ def statistics_of(squares, odds, seed=0, noise=0.0):
 
 
 def test_the_best_table_of_paths_that_emission_alone_makes():
-    """Expected: densities by the root of the second moments, as for any importance sampling, and what is left
-    is the square of the mean root over the mean (Cauchy and Schwarz). Tolerance: the least density and a
-    step of the tables; moments vary slowly, so that the blur is small.
-    """
+    """Densities by the root of the second moments; what is left is the square of the mean root over the mean
+    (Cauchy and Schwarz). Tolerance: the least density and a step of the tables; moments vary slowly, so that
+    the blur is small."""
     x, y = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 16))
     squares = np.exp(4 * x + 2 * y)
     learnt = learning.learn(statistics_of(squares, 4.0**4), 16, [1])
@@ -209,7 +77,7 @@ def test_the_best_table_of_paths_that_emission_alone_makes():
 
 
 def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
-    """Expected: no tables where emission has a 256th part in the densities, whatever the moments are."""
+    """No tables where emission has a 256th part in the densities, whatever the moments are."""
     squares = np.ones((16, 16))
     squares[3:5, 7:9] = 1e4
     assert learning.learn(statistics_of(squares, 4.0**-4), 16, [1]).whole > 0.95
@@ -218,9 +86,8 @@ def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
 
 
 def test_the_best_table_of_unequal_shares():
-    """Rationale: l has to count where it differs from cell to cell. Expected: what is left is within 2 % of
-    the least that a search finds, over densities that have two values (no blur: the two halves are large).
-    """
+    """l has to count where it differs from cell to cell. What is left is within 2 % of the least that a
+    search finds, over densities that have two values (no blur: the two halves are large)."""
     squares = np.ones((16, 16))
     squares[:, :8] = 3.0
     often, seldom = statistics_of(squares, 4.0**1), statistics_of(squares, 4.0**-3)
@@ -240,10 +107,9 @@ def test_the_best_table_of_unequal_shares():
 
 
 def test_what_a_pilot_accumulates():
-    """Rationale: of the second moments of light tracing and of camera subpaths each counts once per sample.
-    Expected: for the floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the
-    number of light subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves).
-    """
+    """Of the second moments of light tracing and of camera subpaths each counts once per sample: for the
+    floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the number of light
+    subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves)."""
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -270,9 +136,8 @@ def test_what_a_pilot_accumulates():
 
 @pytest.mark.parametrize("side", [24, 16])
 def test_noise_teaches_nothing(side):
-    """Rationale: a table of noise destroys what points achieve. Expected: none of moments that differ by
-    noise alone, in 20 of 20 pilots; one where the same noise lies over a real difference.
-    """
+    """A table of noise destroys what points achieve: none of moments that differ by noise alone, in 20 of 20
+    pilots; one where the same noise lies over a real difference."""
     even, odd = np.ones((side, side)), np.ones((side, side))
     odd[side // 4 : side // 2, side // 4 : side // 2] = 400
     for seed in range(20):
@@ -287,10 +152,8 @@ def hill(side, height):
 
 
 def test_detail_is_kept_where_it_pays():
-    """Rationale: half of a pilot likes smoother tables than the whole teaches best. Expected: where a table
-    that is blurred little pays, it is used, though one that is blurred more would pay too, and leave less of
-    the half that judges.
-    """
+    """Half of a pilot likes smoother tables than the whole teaches best. A table that is blurred little is
+    used where it pays, though one that is blurred more would leave less of the half that judges."""
     squares = hill(24, 50)
     statistics = statistics_of(squares, 16.0, seed=4, noise=1.2)
     narrow, wide = learning.BLURS[24]
@@ -300,9 +163,8 @@ def test_detail_is_kept_where_it_pays():
 
 
 def test_noise_is_blurred_where_it_would_not_pay():
-    """Expected: of moments that are noise over a wide hill 20 pilots learn twice as often by the wide blur as
-    by the narrow one, which is used where both pay.
-    """
+    """Of moments that are noise over a wide hill 20 pilots learn twice as often by the wide blur as by the
+    narrow one, which is used where both pay."""
     narrow, wide = learning.BLURS[24]
     pays = {narrow: 0, wide: 0}
     for seed in range(20):
@@ -316,14 +178,13 @@ def test_noise_is_blurred_where_it_would_not_pay():
 
 
 def test_outliers_alone_teach_nothing():
-    """Expected: no tables where all that is gained is in the cells with most, and the rest loses."""
+    """All that is gained is in the cells with most, and the rest loses."""
     squares = np.exp(np.random.default_rng(2).standard_normal((16, 16)))
     squares[2, 3] = 1e5
     assert learning.learn(statistics_of(squares, 64.0), 16, [1]).tables is None
 
 
 def test_emitters_without_a_part_are_left_alone():
-    """Expected: of two lamps the one that gains has a table, the other a uniform one."""
     squares = np.ones((2, 16, 16))
     squares[0, 4:8, 4:8] = 400
     squares[1] = 1e-3
@@ -332,16 +193,9 @@ def test_emitters_without_a_part_are_left_alone():
     assert densities[0].std() > 0.5 and (densities[1] == 1).all()
 
 
-@pytest.mark.parametrize("value", [0.0, np.inf, np.nan])
-def test_no_statistics(value):
-    """Expected: no tables of nothing, and none of what is no number."""
-    statistics = np.full((2, 256, learning.COLUMNS), value)
-    assert learning.learn(statistics, 16, [1]) == learning.Learnt(None)
-
-
 def test_tables_count_in_the_choice():
-    """Expected: what tables leave of the variance is in the predictions of light subpaths, less of it where
-    these are not connected, and they are traced by the tables; without tables nothing changes."""
+    """What tables leave of the variance is in the predictions of light subpaths, less of it where these are
+    not connected; without tables nothing changes."""
     rays = dict.fromkeys(("camera", "shadow_s1", "light", "shadow_t1", "evaluated"), 1.0)
     found = Moments(np.ones((2, GROUPS, len(CANDIDATES))), (0.0, 0.0), mean=1.0, rays=rays)
     tables = EmissionTables.of(np.ones((1, 4, 4)), 0.5)
@@ -390,10 +244,8 @@ def rendered(scene, seed=0, spp=64, **parameters):
 
 
 def test_it_gains_and_says_so():
-    """Expected: a lamp in a hood is aimed at its opening; `explain`, the decision and the log of skipped
-    classes say so, and the error over that without is what was predicted of light subpaths or better than
-    0.85. Trimmed, of means over five seeds; the reference has 4,096 samples.
-    """
+    """A lamp in a hood is aimed at its opening; the error over that without is below 0.85. Trimmed, of means
+    over five seeds; the reference has 4,096 samples."""
     scene = spotlit()
     reference = np.mean([rendered(scene, 50 + i, 512, guiding="photons")[0] for i in range(8)], axis=0)
     never = [rendered(scene, i, guiding="photons") for i in range(5)]
@@ -417,9 +269,8 @@ def room_on_the_ground():
 
 
 def test_light_that_path_tracing_would_find_alone(monkeypatch):
-    """Expected: in a room with a window light subpaths are chosen with tables of emission, and path tracing
-    alone without (their kernel counts three times as much as usual, to be above the noise of predictions).
-    """
+    """In a room with a window light subpaths are chosen with tables of emission, and path tracing alone
+    without (their kernel counts three times as much as usual, to be above the noise of predictions)."""
     scene = room_on_the_ground()
     monkeypatch.setitem(choice.FIXED, "light", 3 * choice.FIXED["light"])
     ways = {}
@@ -432,9 +283,8 @@ def test_light_that_path_tracing_would_find_alone(monkeypatch):
 
 
 def test_where_nothing_is_gained_nothing_changes():
-    """Expected: in a furnace the pilot teaches nothing, the image is that with guiding switched off to the
-    last bit of sums, and the reason is told.
-    """
+    """In a furnace the image is that with guiding switched off to the last bit of sums, and the reason is
+    told."""
     light = {"type": "point", "position": [0, 0, 0], "intensity": 1.0}
     ball = {"type": "sphere", "radius": 2.0, "flip_normals": True, "bsdf": parts.grey(0.7)}
     eye = parts.perspective(origin=[0, 0, 1], target=[0, 0, 0], fov=90) | {"film": parts.film(32)}
@@ -447,7 +297,6 @@ def test_where_nothing_is_gained_nothing_changes():
 
 
 def test_many_lamps_have_small_tables_or_none():
-    """Expected: 40 lamps have tables of 8 x 8, and 613 none, which is said."""
 
     def lamps(count):
         return {
@@ -463,7 +312,6 @@ def test_many_lamps_have_small_tables_or_none():
 
 
 def test_a_decision_is_done_again():
-    """Expected: with ``decisions`` the same image, and what they record again; without a pilot."""
     scene = spotlit()
     image, method = rendered(scene)
     decisions = method.statistics["decisions"]
@@ -476,9 +324,7 @@ def test_a_decision_is_done_again():
 
 
 def test_a_stopped_render_goes_on():
-    """Expected: one that is stopped after its first pass and goes on from the snapshot's bytes gives the
-    image of one that is not, tables included.
-    """
+    """Tables included."""
     scene = spotlit()
 
     def method():

@@ -7,13 +7,12 @@ import internals
 import mitsuba as mi
 import numpy as np
 import pytest
-import scene_parts as parts
-import variants
 import welch as st
 from mitsuba_bdpt.planning import planner
 from mitsuba_bdpt.transport import connections, proxy_vertices
 from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
+from test_same_mean import MATERIALS
 
 from instruments import recording
 
@@ -34,127 +33,7 @@ def images(scene, spp=256, seeds=10, **parameters):
     return rendered_images(scene, spp, seeds, **{"max_depth": 5} | parameters)
 
 
-def bumps():
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.random.default_rng(1).random((8, 8, 1), dtype=np.float32)),
-        "raw": True,
-    }
-
-
-MATERIALS = {
-    "diffuse": lambda: parts.grey(0.6),
-    "roughplastic": lambda: {"type": "roughplastic", "alpha": 0.2},
-    "roughconductor": lambda: {"type": "roughconductor", "alpha_u": 0.25, "alpha_v": 0.1},
-    "roughdielectric": lambda: {"type": "roughdielectric", "alpha": 0.3},
-    "principled": lambda: {"type": "principled", "roughness": 0.4, "metallic": 0.5, "spec_trans": 0.3},
-    "principledthin": lambda: {
-        "type": "principledthin",
-        "roughness": 0.4,
-        "diff_trans": 0.8,
-        "spec_trans": 0.3,
-    },
-    "bumpmap": lambda: {
-        "type": "bumpmap",
-        "arbitrary": bumps(),
-        "scale": 0.4,
-        "bsdf": {"type": "roughconductor", "alpha": 0.3},
-    },
-    "mask": lambda: {"type": "mask", "opacity": 0.6, "bsdf": {"type": "roughplastic", "alpha": 0.3}},
-    "blend": lambda: {
-        "type": "blendbsdf",
-        "weight": 0.5,
-        "a": parts.grey(0.7),
-        "b": {"type": "roughconductor", "alpha": 0.2},
-    },
-    "one side": lambda: {"type": "diffuse", "reflectance": 0.6},
-}
-
-
-def scene_of(material, lamp="sphere", sensor=None):
-    """Ball and box of a material in the open; other shapes are gray."""
-    parts.register_plugins()
-    made = parts.open_scene(sensor or parts.perspective(), lamp=parts.EMITTERS[lamp]())
-    for name in ("ball", "box"):
-        made[name]["bsdf"] = MATERIALS[material]()
-    return mi.load_dict(made)
-
-
 # -- unbiased -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("material", MATERIALS)
-def test_images_are_those_of_all_connections(material):
-    """Expected: the same tiles as with a light subpath for each camera subpath and all connections, by
-    Welch's test.
-    """
-    scene = scene_of(material)
-    a = images(scene, decisions=decided())
-    b = images(scene, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize(
-    "parameters",
-    [
-        {"heuristic": "power"},
-        {"points": "independent"},
-        {"max_depth": 3},
-        {"stored_vertices": 3},
-        {"hide_emitters": True},
-        {"rr_depth": 2},
-        {"decisions": decided(light_paths=1.0)},
-        {"decisions": decided(light_paths=1 / 4, mean=0.3, variance=1.0)},
-    ],
-    ids=lambda parameters: next(iter(parameters)) + "=" + str(next(iter(parameters.values())))[:24],
-)
-def test_parameters(parameters):
-    """Expected: the same tiles as by the balance heuristic with all connections."""
-    scene = scene_of("roughplastic", "rectangle")
-    a = images(scene, **{"decisions": decided(), **parameters})
-    keep = {k: v for k, v in parameters.items() if k in ("max_depth", "hide_emitters")}
-    b = images(scene, first=100, skip="none", **keep)
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize("lamp", ["point", "constant", "directional", "projector", "directionalarea"])
-def test_lamps(lamp):
-    """Expected: the same tiles as with all connections."""
-    scene = scene_of("roughconductor", lamp)
-    a = images(scene, decisions=decided())
-    b = images(scene, first=100, skip="none")
-    st.assert_same_tiles(a, b, at_least=8)
-
-
-@pytest.mark.parametrize("variant", [variants.of("spectral"), variants.of("mono")])
-def test_variants(variant):
-    """Expected: the same tiles as with all connections."""
-    mi.set_variant(variant)
-    scene = scene_of("roughplastic")
-    a = images(scene, decisions=decided())
-    b = images(scene, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-def test_a_wide_lens():
-    """Rationale: t = 0 and t = 1 count the light subpaths of a lane. Expected: the same tiles."""
-    scene = scene_of("roughplastic", "sphere", parts.thinlens(aperture=0.6))
-    a = images(scene, decisions=decided())
-    b = images(scene, first=100, skip="none")
-    st.assert_same_tiles(a, b)
-
-
-@pytest.mark.parametrize("size", [(17, 13), (9, 8)])
-def test_films_whose_pixels_do_not_divide(size):
-    """Rationale: the last lanes serve fewer camera subpaths, and there are more light subpaths for each.
-    Expected: the mean of the image is that with all connections, within five standard errors.
-    """
-    film = {"type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"}}
-    scene = scene_of("diffuse", "sphere", parts.perspective() | {"film": film})
-    a = images(scene, decisions=decided()).mean(axis=(1, 2))
-    b = images(scene, first=100, skip="none").mean(axis=(1, 2))
-    error = np.sqrt(a.var(ddof=1) / len(a) + b.var(ddof=1) / len(b))
-    assert abs(a.mean() - b.mean()) < 5 * error < 0.01 * b.mean()
 
 
 # -- the guess ------------------------------------------------------------------------------------------
@@ -167,10 +46,9 @@ FEW = {"t<=1": 1e-3, "s=1": 1.0}
 @pytest.mark.parametrize("threshold", [0.0, 5.0])
 @pytest.mark.parametrize("zeros", [0.5, 1.0])
 def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold):
-    """Rationale: a guess may be off by any factor, and 0 where something is added; roulette then needs a
-    number that the draw has not used. Expected: the same tiles with guesses that are 0 for half of the light
-    vertices, or all, where inner connections have most of the weight and many are drawn evenly.
-    """
+    """A guess may be off by any factor, and 0 where something is added; roulette then needs a number that the
+    draw has not used. Guesses are 0 for half of the light vertices, or all, where inner connections have most
+    of the weight and many are drawn evenly."""
     scene = cornell(16)
     true = proxy_vertices.guess
 
@@ -191,10 +69,9 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
     "material, factor", [("diffuse", 1.1), ("roughplastic", 1.25), ("roughconductor", 1.25)]
 )
 def test_guesses_are_about_right(material, factor, monkeypatch):
-    """Rationale: an estimate is as noisy as its guess is wrong. Expected: in a Cornell box with boxes of a
-    material, with the same light subpaths, the error is that of a draw by what connections add, among diffuse
-    surfaces within a tenth, among glossy ones within a quarter. (32 renders of the same seeds.)
-    """
+    """An estimate is as noisy as its guess is wrong: with the same light subpaths the error is that of a draw
+    by what connections add, among diffuse surfaces within a tenth, among glossy ones within a quarter. (32
+    renders of the same seeds.)"""
     boxes = mi.cornell_box()
     boxes = {name: boxes[name] | {"bsdf": MATERIALS[material]()} for name in ("small-box", "large-box")}
     scene = cornell(16, **boxes)
@@ -222,9 +99,8 @@ def rendered(scene, spp=64, seed=0, **parameters):
 
 
 def test_a_cornell_box_is_joined_and_less_noisy():
-    """Expected: the pilot's 1/16 with one connection becomes four at a time, as `explain` says; the error
-    falls to 0.8 or less (measured: 0.6), over eight seeds.
-    """
+    """The pilot's 1/16 with one connection becomes four at a time; the error falls to 0.8 or less (measured:
+    0.6), over eight seeds."""
     scene = cornell()
     _, method = rendered(scene)
     (decision,) = method.statistics["decisions"]
@@ -240,7 +116,6 @@ def test_a_cornell_box_is_joined_and_less_noisy():
 
 
 def test_short_renders_are_not_joined():
-    """Expected: one light subpath at a time below the least number of samples, and where given by hand."""
     scene = cornell()
     for spp, parameters in ((8, {}), (64, {"light_paths": 1 / 16, "connections": "one"})):
         _, method = rendered(scene, spp, **parameters)
@@ -263,9 +138,8 @@ def test_short_renders_are_not_joined():
     ids=str,
 )
 def test_what_is_joined(change, joined):
-    """Expected: four light subpaths are possible in a long render of many pixels, longer with many BSDFs
-    (40), each of which guesses ask, and where guesses know the BSDFs.
-    """
+    """In a long render of many pixels, longer with many BSDFs (40), each of which guesses evaluate, and where
+    guesses know the BSDFs."""
     given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "space": None, "many": False} | change
     asked = SimpleNamespace(
         prepared=SimpleNamespace(
@@ -283,14 +157,13 @@ def test_what_is_joined(change, joined):
 
 
 def test_what_is_counted():
-    """Expected: at most one pair is evaluated for each camera vertex, and not all are zero."""
+    """At most one pair is evaluated for each camera vertex."""
     _, method = rendered(cornell(), 64)
     counted, rays = method.statistics["connections"], method.statistics["rays"]
     assert 0 < counted["zero"] < counted["evaluated"] <= rays["camera"]
 
 
 def test_the_same_seed_gives_the_same_image():
-    """Expected: also from a snapshot, on which a stopped render goes on."""
     scene = cornell()
     whole, _ = rendered(scene, 64, 3, spp_per_pass=16)
     again, _ = rendered(scene, 64, 3, spp_per_pass=16)
@@ -303,9 +176,8 @@ def test_the_same_seed_gives_the_same_image():
 
 
 def test_single_samples_are_looked_at_one_light_subpath_at_a_time():
-    """Rationale: what replays a lane knows of one light subpath, and of no tables of emission. Expected: the
-    tool renders so by itself, and refuses decisions that say otherwise, and tables.
-    """
+    """What replays a lane knows of one light subpath, and of no tables of emission: the tool renders so by
+    itself, and refuses decisions that say otherwise, and tables."""
     scene = cornell()
     method = mi.load_dict({"type": "bdpt", "max_depth": 6})
     with pytest.raises(Exception, match="set guiding=photons"):

@@ -7,7 +7,6 @@ import pytest
 import variants
 from internals import bdpt
 from layered import JOINED, LAMPS, check_sum, layers, scene
-from media_parts import fog
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.light_groups import LightGroups
@@ -33,9 +32,9 @@ def integrator(**parameters):
     ids=["one", "all", "path tracing"],
 )
 def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
-    """Rationale: emitters are selected by their sampling weight, not their radiance, so that a render in
-    which the others are black traces the same paths with the same weights. Expected: each layer is that
-    image, of a crop window, with every strategy. Tolerance: order of atomic additions."""
+    """Emitters are selected by their sampling weight, not their radiance, so that a render in which the
+    others are black traces the same paths with the same weights. Of a crop window. Tolerance: order of atomic
+    additions."""
     window = {"crop_offset_x": 1, "crop_offset_y": 2, "crop_width": 6, "crop_height": 5}
     method = integrator(skip="none", merging=False, **parameters)
     image, groups = layers(method, scene(**window))
@@ -47,39 +46,9 @@ def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
         np.testing.assert_allclose(groups[name], expected, rtol=1e-4, atol=2e-5 * image.max())
 
 
-@pytest.mark.parametrize(
-    ("parameters", "of_scene"),
-    [
-        ({}, {"rfilter": "box"}),
-        ({"merging": True}, {}),
-        ({"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}, {}),
-        ({"max_depth": 3, "layers": "strategies"}, {}),
-        ({"guiding": "always"}, {}),
-        ({"connections": "all"}, {"medium": fog()}),
-    ],
-    ids=["pilot", "merging", "other layers", "strategies", "guiding", "fog"],
-)
-def test_layers_add_up_to_the_image(parameters, of_scene):
-    """Expected: with what else a render may do, the layers add up."""
-    check_sum(*layers(integrator(**parameters), scene(**of_scene)))
-
-
-def test_layers_of_bands_add_up_to_them():
-    """Expected: on a ``specfilm`` a group has a layer of each band, in the film and in aov_names()."""
-    mi.set_variant(variants.of("spectral"))
-    low, high = ({"type": "spectrum", "value": v} for v in ([(400, 1), (500, 1)], [(500, 1), (700, 1)]))
-    film = {"type": "specfilm", "width": 4, "height": 4, "low": low, "high": high}
-    box = mi.cornell_box() | {"bulb": {"type": "point", "position": [0, 0, 0.5]}}
-    box["sensor"]["film"] = film
-    method = integrator(light_groups="lamp: light")
-    image, groups = layers(method, mi.load_dict(box))
-    assert method.aov_names() == [f"groups.{g}.{b}" for g in ("lamp", "rest") for b in ("low", "high")]
-    check_sum(image, groups)
-
-
 def test_connections_to_several_light_subpaths_know_their_emitter():
-    """Rationale: a lane draws a connection to one of four light subpaths, of different emitters. The panel
-    alone is red. Expected: no red light in the layers of the others but the sky's, which is grey."""
+    """A lane draws a connection to one of four light subpaths, of different emitters. The panel alone is red:
+    no red light in the layers of the others but the sky's, which is grey."""
     method = integrator(decisions=JOINED)
     image, groups = layers(method, scene(rfilter="box"), spp=64)
     assert method.statistics["decisions"][-1]["joined"] == 4
@@ -90,9 +59,8 @@ def test_connections_to_several_light_subpaths_know_their_emitter():
 
 @pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
 def test_a_merge_knows_its_emitter(plate):
-    """Rationale: merges alone sample a point light seen through a plate; through one that is nearly smooth
-    they are those of merged paths. A red and a blue light. Expected: each layer has its light's colour alone.
-    """
+    """Merges alone sample a point light seen through a plate; through one that is nearly smooth they are
+    those of merged paths. Each layer has its light's colour alone."""
     glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
     glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
     red, blue = (
@@ -107,8 +75,7 @@ def test_a_merge_knows_its_emitter(plate):
 
 
 def test_mixed_light_is_that_of_other_lamps():
-    """Rationale: see `test_a_layer_is_the_image_of_its_emitters_alone`. Expected: the mix of a render is the
-    render of lamps with radiances times the weights. Tolerance: order of atomic additions."""
+    """The mix of a render is the render of lamps with radiances times the weights."""
     method, target = bdpt(max_depth=4, skip="none", light_groups="auto"), scene()
     method.render(target, spp=8, seed=3)
     weights = {"panel": 1.5, "globe": (0.2, 0.2, 0.3), "sky": 0}
@@ -118,27 +85,9 @@ def test_mixed_light_is_that_of_other_lamps():
     np.testing.assert_allclose(mixed, expected, rtol=1e-4, atol=2e-5 * expected.max())
 
 
-def test_a_resumed_and_a_joined_render_keep_the_layers():
-    """Expected: a render that goes on from a snapshot has the layers of one in one piece; two renders of
-    different seeds, joined, have layers that add up and are the mean of theirs. Tolerance: rounding."""
-    target, method = scene(rfilter="box"), integrator(skip="none", spp_per_pass=4)
-    _, groups = layers(method, target)
-    start = stopped(method, target, 1, spp=8, seed=3)
-    names, resumed = method.aov_names(), np.array(method.render(target, spp=8, seed=3, start=start))
-    assert names[-1] == "groups.rest.B"
-    known = method.statistics["light_groups"]
-    assert list(known) == list(groups)
-    assert sorted(ids[0] for lamps in known.values() for ids in lamps) == sorted(LAMPS)
-    np.testing.assert_allclose(resumed[..., -9:], np.concatenate(list(groups.values()), -1), **ROUNDING)
-    parts = [stopped(method, target, None, spp=8, seed=seed) for seed in (3, 4)]
-    joined = np.array(method.assemble(parts[0].joined(parts[1]), target), dtype=np.float64)
-    other = np.array(method.render(target, spp=8, seed=4))
-    np.testing.assert_allclose(joined, (resumed + other) / 2, **ROUNDING)
-
-
 def test_without_light_groups_nothing_is_recorded_for_them(monkeypatch):
-    """Rationale: a render without them is to record the same kernels. Expected: nothing of theirs is asked,
-    and samples of next-event estimation carry no index."""
+    """A render without them is to record the same kernels; samples of next-event estimation carry no
+    index."""
 
     def refuse(*_):
         raise AssertionError("recorded for light groups")
@@ -155,7 +104,7 @@ def test_without_light_groups_nothing_is_recorded_for_them(monkeypatch):
 
 @pytest.mark.skipif(variants.BACKEND != "llvm", reason="threads are those of a CPU")
 def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
-    """Expected: on few threads always; on many with many samples per pixel, and if the copies are small."""
+    """On few threads always; on many with many samples per pixel, and if the copies are small."""
     for threads, numbers, samples, mode in (
         (2, 1 << 20, 1, dr.ReduceMode.Expand),
         (16, 1 << 20, 8, dr.ReduceMode.Local),
@@ -170,8 +119,7 @@ def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
 
 
 def test_each_emitter_has_its_own_group():
-    """Expected: ``auto`` names groups by the ids of shapes or emitters; of more than eight emitters the
-    first eight by name, in the order of their numbers, have their own, the others are the rest."""
+    """Of more than eight emitters the first eight by name have their own, the others are the rest."""
     target = scene()
     made = LightGroups.of(target, "auto")
     assert sorted(made.names) == sorted(LAMPS)
@@ -185,7 +133,6 @@ def test_each_emitter_has_its_own_group():
 
 
 def test_emitters_without_id_go_by_their_plugin():
-    """Expected: an emitter without id, and on no shape with one, is found by its plugin's name."""
     shape = '<shape type="sphere"><emitter type="area"/></shape>'
     target = mi.load_string(f'<scene version="3.0.0">{shape}{shape}<emitter type="constant"/></scene>')
     made = LightGroups.of(target, "auto")
@@ -198,8 +145,8 @@ def test_emitters_without_id_go_by_their_plugin():
 
 
 def test_names_of_layers_are_names_of_emitters():
-    """Expected: a group may name an emitter as ``auto`` does: with signs that a layer cannot have as _, and
-    those without id by the numbers that ids leave."""
+    """A group may name an emitter as ``auto`` does: with signs that a layer cannot have as _, and those
+    without id by the numbers that ids leave."""
     lamp = '<shape type="sphere"{}><emitter type="area"/></shape>'
     lamps = "".join(lamp.format(f' id="{i}"' if i else "") for i in ("", "", "key.1", "area_2", "rest"))
     target = mi.load_string(f'<scene version="3.0.0">{lamps}</scene>')
@@ -224,9 +171,9 @@ def _ids_of(target, made, group):
 
 
 def test_an_id_wins_over_a_made_name():
-    """Rationale: ids may differ only in a character that becomes _. Expected: a text that is an id means
-    that emitter alone; in ``auto`` an id that is a layer's name is the name of its emitter, whichever ids
-    become it or a numbered one."""
+    """Ids may differ only in a character that becomes _. A text that is an id means that emitter alone; in
+    ``auto`` an id that is a layer's name is the name of its emitter, whichever ids become it or a numbered
+    one."""
     target = _points("Screen.A", "Screen_A", "Screen_A_2", "Screen A", "rest", "rest_2")
     for own in ("Screen.A", "Screen_A", "Screen_A_2", "Screen A"):
         assert _ids_of(target, LightGroups.of(target, f"x: {own}"), "x") == {own}
@@ -242,20 +189,8 @@ def test_an_id_wins_over_a_made_name():
     assert _ids_of(target, made, "rest_3") == {"rest"}
 
 
-def test_messages_list_each_emitter_once():
-    """Expected: an emitter is listed by its id, and by the name that it is given only without one; signs
-    that separate ids have a remedy where an id has them."""
-    target = _points("key.1", "fill light", "a,b")
-    with pytest.raises(ValueError, match=r"Emitters: a,b, fill light, key.1; for , and ; in an id write \?$"):
-        LightGroups.of(target, "x: zz")
-    assert _ids_of(target, LightGroups.of(target, "x: a?b"), "x") == {"a,b"}
-    with pytest.raises(ValueError, match=r"Emitters: bulb, globe, panel, sky$"):
-        LightGroups.of(scene(), "x: zz")
-
-
 def test_brackets_in_ids_are_themselves():
-    """Rationale: names of copies have numbers in brackets or after a point. Expected: only * and ? stand for
-    other characters; a text that is an id matches this one alone."""
+    """Names of copies have numbers in brackets or after a point. Only * and ? stand for other characters."""
     ids = ("lamp[1]", "lamp1", "lamp[!x]", "lamp*", "lamp?")
     target = mi.load_dict(
         {"type": "scene"} | {i: {"type": "point", "position": [n, 0, 0]} for n, i in enumerate(ids)}
@@ -277,9 +212,8 @@ def test_brackets_in_ids_are_themselves():
     ids=["pilot", "path tracing", "merging", "all"],
 )
 def test_a_pattern_may_match_no_emitter(parameters):
-    """Rationale: one command renders all shots. Expected: the group of a pattern that matches none is black,
-    with a warning; the other layers are those of a render without it; it goes on from a snapshot. Tolerance:
-    order of atomic additions."""
+    """One command renders all shots. The group is black, with a warning; the other layers are those of a
+    render without it; it goes on from a snapshot."""
     target, text = scene(rfilter="box"), "torch: torch*; low: globe, b*"
     method = bdpt(max_depth=4, light_groups=text, spp_per_pass=4, **parameters)
     with Warned() as warnings:
@@ -300,7 +234,7 @@ def test_a_pattern_may_match_no_emitter(parameters):
 
 
 def test_groups_without_any_emitter():
-    """Expected: where no pattern matches, all light is the rest; a group with another pattern says so."""
+    """All light is the rest; a group with another pattern says so."""
     made = LightGroups.of(scene(), "a: x*; b: y?")
     assert made.names == ("a", "b", "rest") and set(made.of_emitters) == {2}
     made = LightGroups.of(scene(), "a: x*, panel")
@@ -323,13 +257,12 @@ def test_groups_without_any_emitter():
     ],
 )
 def test_what_is_no_light_group(text, words):
-    """Expected: an error that names the parameter, the value and what to do."""
+    """The error names the parameter, the value and what to do."""
     with pytest.raises(ValueError, match=f"bdpt: light_groups=.*{words}"):
         LightGroups.of(scene(), text)
 
 
 def test_light_groups_of_a_dark_scene():
-    """Expected: an error; a scene without emitters has no light to divide."""
     with pytest.raises(ValueError, match="light_groups='auto': the scene has no emitters; leave"):
         LightGroups.of(mi.load_dict({"type": "scene", "s": {"type": "sphere"}}), "auto")
     with pytest.raises(RuntimeError, match="light_groups=3 must be a string"):

@@ -1,4 +1,5 @@
-"""Photon-guided BSDF sampling through near-specular lobes; scenes as in `test_near_specular_merging`."""
+"""Photon-guided BSDF sampling through near-specular lobes; images beside those without are in
+`test_same_mean`."""
 
 from pathlib import Path
 
@@ -6,8 +7,6 @@ import internals
 import mitsuba as mi
 import numpy as np
 import pytest
-import variants
-import views
 import welch as st
 from mitsuba_bdpt.planning import choice, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
@@ -16,104 +15,24 @@ from mitsuba_bdpt.transport import sds
 from mitsuba_bdpt.transport.photons import guided_hits
 from sds_scenes import (
     ASIDE,
-    NEAR_SPECULAR,
-    STRATEGIES,
-    assert_same_images,
     ball,
     guided,
     images,
-    near_specular_scene,
     rough,
-    steel,
     transform,
     under_glass,
-    without_photons,
 )
+
+import scenes
 
 SCENES = Path(__file__).parents[2] / "scenes"
-
-ALWAYS, NEVER = {"guiding": "always", "spp": 128}, {"guiding": "never", "spp": 256}
-
-
-@pytest.mark.parametrize("case", NEAR_SPECULAR)
-def test_images_are_those_without_guiding(case):
-    """Rationale: guiding changes which strategy finds a path, not how much light it carries: strategies are
-    left out where others sample the path, at any roughness (a ramp of alpha across the bound). Expected: the
-    same tiles by Welch's test.
-    """
-    found = st.tiles(images(near_specular_scene(case), 128, 8, decisions=guided(4)))
-    st.assert_agree(st.compare_images(found, without_photons(case)), at_least=12)
-
-
-@pytest.mark.parametrize(
-    "parameters",
-    [*STRATEGIES, {"skip": "none", "stored_vertices": 1}, {"rr_depth": 1}],
-    ids=str,
-)
-def test_any_choice_of_strategies_has_the_same_mean(parameters):
-    """Rationale: edges that no strategy in use connects make more paths SDS paths. Expected: the tiles
-    without guiding.
-    """
-    found = st.tiles(images(near_specular_scene("alpha .03"), 128, 8, guiding="always", **parameters))
-    st.assert_agree(st.compare_images(found, without_photons("alpha .03")), at_least=12)
-
-
-def test_a_wide_lens():
-    """Rationale: t = 0 samples SDS paths, and leaves them to s = 0. Expected: the tiles without guiding."""
-    described = under_glass(ball(), plate=rough(0.02), kind="thinlens")
-    described["sensor"] |= {"aperture_radius": 0.8}
-    assert_same_images(mi.load_dict(described), ALWAYS | {"spp": 256}, NEVER, 12, skip="none")
-
-
-def half_sky():
-    """An environment of two brightnesses, which photons of the brighter half guide to."""
-    pixels = np.full((8, 16, 3), 0.01, dtype=np.float32)
-    pixels[1:3, 2:5] = 50.0
-    to_world = transform().rotate([1, 0, 0], 90)
-    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": to_world}
-
-
-@pytest.mark.parametrize("lamps", ["point and ball", "sky"])
-def test_other_emitters(lamps):
-    """Rationale: nothing is left out of the light of emitters that rays cannot hit; the sky is hit at no
-    vertex. Expected: the tiles without guiding.
-    """
-    more = {"light": half_sky()}
-    if lamps != "sky":
-        position = [0.0, 0.5, 2.0]
-        more = {"light": ball(), "point": {"type": "point", "position": position, "intensity": 1.0}}
-    assert_same_images(mi.load_dict(under_glass(plate=rough(0.2), **more)), ALWAYS, NEVER, 12)
-
-
-@pytest.mark.parametrize("variant", ["spectral", "mono", "mono_polarized"])
-def test_variants(variant):
-    """Expected: in each kind of variant the tiles without guiding."""
-    mi.set_variant(variants.of(variant))
-    assert_same_images(mi.load_dict(under_glass(ball(), plate=rough(0.03))), ALWAYS, NEVER, 12)
-
-
-def nested():
-    """A plate of glass with a normal map, beside metal that is masked and has two sides."""
-    rng = np.random.default_rng(3)
-    normals = 0.5 + 0.5 * np.concatenate([0.05 * rng.uniform(-1, 1, (8, 8, 2)), np.ones((8, 8, 1))], axis=2)
-    texture = {"type": "bitmap", "bitmap": mi.Bitmap(normals.astype(np.float32)), "raw": True}
-    plate = {"type": "normalmap", "normalmap": texture, "bsdf": rough(0.02)}
-    wall = steel(0.03)
-    wall["bsdf"] = {"type": "mask", "opacity": 0.7, "bsdf": {"type": "twosided", "bsdf": wall["bsdf"]}}
-    return under_glass(ball(), plate=plate, mirror=wall)
-
-
-def test_nested_bsdfs():
-    """Expected: through maps, masks and two sides the tiles without guiding."""
-    assert_same_images(mi.load_dict(nested()), {"decisions": guided(4), "spp": 128}, NEVER, 12)
 
 
 @pytest.mark.parametrize("alpha", [0.001, 0.05])
 def test_small_lamps_without_fireflies(alpha):
-    """Rationale: through rough glass of little roughness s = 0 meets a small lamp as rarely as through ideal
-    glass, and connections do not find the lobes. Expected: the variance of pixels is less than a tenth of
-    that without (1/110 and 1/27 were measured).
-    """
+    """Through rough glass of little roughness s = 0 meets a small lamp as rarely as through ideal glass, and
+    connections do not find the lobes: the variance of pixels is less than a tenth of that without (1/110 and
+    1/27 were measured)."""
     described = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}, plate=rough(alpha)))
     a = images(described, 64, 8, decisions=guided(4))
     b = images(described, 64, 8, first=100, guiding="never")
@@ -146,15 +65,14 @@ def polished():
 
 
 def test_paths_of_near_specular_events_alone():
-    """Rationale: light that a jar of rough glass reflects within is found by subpaths that choose a rare
-    reflection several times, each of them a firefly, though no event is diffuse. Expected: guided at each
-    event, it has a tenth of the variance of pixels at most (1/27 was measured, and 1/3.5 without).
-    """
+    """Light that a jar of rough glass reflects within is found by subpaths that choose a rare reflection
+    several times, each of them a firefly, though no event is diffuse. Guided at each event it has a tenth of
+    the variance of pixels at most (1/27 was measured, and 1/3.5 without)."""
     glass = {"type": "roughdielectric", "alpha": 0.02}
     lamp = {"type": "sphere", "center": [0.4, 2.2, 0.6], "radius": 0.1}
     described = {
         "type": "scene",
-        "sensor": views.camera("perspective", origin=(0, 2, 4), target=(0, 0, 0), fov=22, size=24),
+        "sensor": scenes.camera("perspective", origin=(0, 2, 4), target=(0, 0, 0), fov=22, size=24),
         "outer": {"type": "sphere", "radius": 0.75, "bsdf": glass},
         "inner": {"type": "sphere", "radius": 0.65, "flip_normals": True, "bsdf": glass},
         "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
@@ -164,11 +82,10 @@ def test_paths_of_near_specular_events_alone():
 
 
 def test_an_unrelated_ball_changes_no_variance():
-    """Rationale: the static test is one of the scene: a polished ball out of view makes the floor's lobes
-    near-specular, and no other event of its paths is diffuse. They are SDS paths by their delta events alone,
-    and guided at the floor. Expected: the variance of pixels is that without the ball within a factor of 2
-    (1.2 was measured, and 12 where such paths are not guided), and both means agree.
-    """
+    """The static test is one of the scene: a polished ball out of view makes the floor's lobes near-specular,
+    and no other event of its paths is diffuse. They are SDS paths by their delta events alone, and guided at
+    the floor: the variance is that without the ball within a factor of 2 (1.2 was measured, and 12 where such
+    paths are not guided)."""
     a, b = (
         images(mi.load_dict(lit_metal(**more)), 64, 8, first=first, guiding="auto")
         for first, more in ((0, {"ball": polished()}), (100, {}))
@@ -178,8 +95,7 @@ def test_an_unrelated_ball_changes_no_variance():
 
 
 def test_an_unrelated_ball_changes_no_prediction():
-    """Expected: with the ball above photons predict the same light, and the same second moment of s = 0, to
-    25 % (a few of the photons are aimed at the ball)."""
+    """Photons predict the same light and second moment of s = 0, to 25 % (a few are aimed at the ball)."""
     found = []
     for more in ({}, {"ball": polished()}):
         scene = mi.load_dict(lit_metal(**more))
@@ -190,9 +106,7 @@ def test_an_unrelated_ball_changes_no_prediction():
 
 
 def test_guided_light_is_not_undersampled():
-    """Expected: of a small lamp's light through nearly smooth glass some is undersampled, and none if photons
-    guide to it.
-    """
+    """Of a small lamp's light through nearly smooth glass some is undersampled unless photons guide to it."""
     described = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}, plate=rough(0.001)))
     for guiding in ("always", "never"):
         settings = internals.bdpt(max_depth=6, guiding=guiding).settings
@@ -203,10 +117,8 @@ def test_guided_light_is_not_undersampled():
 
 @pytest.mark.parametrize("alpha, guides", [(0.005, True), (0.1, False)])
 def test_pilots_of_any_seed_decide_alike(alpha, guides, monkeypatch):
-    """Rationale: in `rough_glass_caustics` guiding gains 30 times (alpha .005) and nothing (.1: its error is
-    the same, and it takes 1.1 times as long). Expected: pilots of three seeds guide in the former, and not in
-    the latter, where they choose as one that does not look for guiding.
-    """
+    """In `rough_glass_caustics` guiding gains 30 times (alpha .005) and nothing (.1: its error is the same,
+    and it takes 1.1 times as long)."""
     scene = mi.load_file(str(SCENES / "rough_glass_caustics.xml"), resolution=64, alpha=alpha)
 
     def chosen(guiding):
@@ -221,8 +133,7 @@ def test_pilots_of_any_seed_decide_alike(alpha, guides, monkeypatch):
 
 
 def test_light_that_is_not_guided_is_in_a_second_pilot(monkeypatch):
-    """Expected: where guiding would cost too much, the variances are those of a pilot that does not look for
-    it."""
+    """Where guiding would cost too much, the variances are those of a pilot that does not look for it."""
     scene = mi.load_file(str(SCENES / "rough_glass_caustics.xml"), resolution=64, alpha=0.005)
     monkeypatch.setitem(choice.COSTS, "guided", 1e9)
     auto, never = (internals.bdpt(max_depth=8, guiding=guiding).settings for guiding in ("auto", "emission"))
@@ -231,7 +142,6 @@ def test_light_that_is_not_guided_is_in_a_second_pilot(monkeypatch):
 
 
 def test_scenes_without_near_specular_lobes_test_no_event(monkeypatch):
-    """Expected: with ideal glass no event is tested."""
 
     def never(*_):
         raise AssertionError

@@ -1,7 +1,7 @@
 """Merges through near-specular lobes, between what is a delta lobe and what is none.
 
-The scenes are those of `test_merging` with a rough plate. Large lamps are found by s = 0 and by connections
-too: all strategies must give one mean. Photons in discs of a quarter of a pixel, whose blur is below noise.
+The scenes are those of `test_merging` with a rough plate; images beside those without are in
+`test_same_mean`.
 """
 
 from types import SimpleNamespace
@@ -10,8 +10,6 @@ import internals
 import mitsuba as mi
 import numpy as np
 import pytest
-import variants
-import welch as st
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.planning import unsampled_light
@@ -19,21 +17,14 @@ from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport import light_path, mis, sds
 from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
-    NEAR_SPECULAR,
     SIZE,
-    STRATEGIES,
-    assert_same_images,
-    ball,
     images,
     matte,
-    near_specular_scene,
     point,
     rough,
     strategy_images,
-    sun,
     transform,
     under_glass,
-    without_photons,
 )
 from snapshots import ROUNDING
 
@@ -42,76 +33,6 @@ from stress_cases.warned import Warned
 import drjit as dr  # isort: skip
 
 MERGED = {"merging": True, "merging_radius": 0.25}
-
-# By default merges would have little of the weight beside a large lamp, which others find.
-PHOTONS = passes.SAMPLES_PER_PHOTON
-
-
-@pytest.fixture(autouse=True)
-def many_photons(monkeypatch):
-    """One photon subpath for each sample: merges have 0.4 to 0.65 of the images, 0.14 to 0.45 with B = 0."""
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
-
-
-def merged(case, seeds=8, spp=128, **parameters):
-    return st.tiles(images(near_specular_scene(case), spp, seeds, **MERGED, **parameters))
-
-
-@pytest.mark.parametrize("case", NEAR_SPECULAR)
-def test_images_are_those_without_merging(case):
-    """Rationale: the gate, the weights and the bounds change which strategy finds a path, not how much light
-    it carries; across the gate (a ramp of alpha) nothing may jump. Expected: the same tiles by Welch's test.
-    """
-    st.assert_agree(st.compare_images(merged(case), without_photons(case)), at_least=12)
-
-
-@pytest.mark.parametrize("parameters", [*STRATEGIES, {"skip": "none", "stored_vertices": 3}], ids=str)
-def test_any_choice_of_strategies_has_the_same_mean(parameters):
-    """Rationale: S is the sum of the strategies in use, so that with another choice other paths are merged;
-    beyond the stored vertices of light subpaths none are. Expected: the same tiles by Welch's test.
-    """
-    found = merged("alpha .03", merges="stored_vertices" not in parameters, **parameters)
-    st.assert_agree(st.compare_images(found, without_photons("alpha .03")), at_least=12)
-
-
-LIGHTS = {
-    "point": point(),
-    "spot": {
-        "type": "spot",
-        "intensity": 10.0,
-        "cutoff_angle": 40.0,
-        "to_world": transform().look_at(origin=[0.5, 0, 4.5], target=[0, 0, 0], up=[0, 1, 0]),
-    },
-    "sun": sun(),
-    "ball": ball(),
-}
-
-
-@pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
-def test_all_vertices_merged(light, kind, monkeypatch):
-    """Rationale: with B = 0 every path is merged, also by diffuse surfaces alone, and no bound leaves out a
-    photon: every strategy shares every path with merges, from each kind of emitter (but an even sky, which
-    emits none) and to both kinds of sensors. Expected: the tiles without merging, of a floor under
-    rough glass of which connections find all.
-    """
-    described = under_glass(LIGHTS[light], plate=rough(0.35), kind=kind)
-    if kind == "thinlens":
-        described["sensor"] |= {"aperture_radius": 0.8}
-    described = mi.load_dict(described)
-    parameters = {"max_depth": 5, "skip": "none", "guiding": "never"}
-    b = images(described, 64, 8, first=100, **parameters)
-    monkeypatch.setattr(mis, "MERGE_DOMINATED", 0.0)
-    a = images(described, 64, 8, **MERGED, **parameters)
-    st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
-
-
-@pytest.mark.parametrize("variant", ["spectral", "mono", "mono_polarized"])
-def test_variants(variant):
-    """Expected: in each kind of variant the tiles without merging."""
-    mi.set_variant(variants.of(variant))
-    described = mi.load_dict(under_glass(ball(), plate=rough(0.03)))
-    assert_same_images(described, MERGED | {"spp": 128}, {"guiding": "never", "spp": 256}, 12)
 
 
 def small_lamp(half, height, **more):
@@ -139,15 +60,11 @@ def through_a_lens():
     [(near_pane, 0.2, True), (near_pane, 0.2, False), (through_a_lens, 0.05, True)],
 )
 def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
-    """Rationale: what bounds leave out still has its weight, so that it would be missing: a quarter of the
-    merged light remained (15 % of the image was missing) under a pane so close to the camera that discs at
-    the floor are 36 times larger. A small ``slack`` leaves out many. Of the roulettes that of photon subpaths
-    acts first; if they are not ``ended``, that of photons acts, and through a lens that of camera vertices.
-
-    Expected: without bounds, with the same seeds, the same merged light within 8 % (a few standard errors of
-    the roulette).
-    """
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", PHOTONS)
+    """What bounds leave out still has its weight, so that it would be missing: 15 % of the image was missing
+    under a pane so close to the camera that discs at the floor are 36 times larger. A small ``slack`` leaves
+    out many. Of the roulettes that of photon subpaths acts first; if they are not ``ended``, that of photons
+    acts, and through a lens that of camera vertices. Expected: the merged light without bounds, with the same
+    seeds, within 8 % (a few standard errors of the roulette)."""
     if not ended:
         never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
         monkeypatch.setattr(merging.Merging, "survival", never)
@@ -161,11 +78,9 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
 
 
 def test_few_photons_far_from_what_is_sharp(monkeypatch):
-    """Rationale: scenes with one thing of rough glass somewhere must not pay for it. Expected: where it lies
-    behind a room of matte walls, and no light reaches it, 1 % of photon subpaths leave a photon (corners,
-    where connections are few), and no vertex is merged.
-    """
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", PHOTONS)
+    """Scenes with one thing of rough glass somewhere must not pay for it: where it lies behind a room of
+    matte walls, 1 % of photon subpaths leave a photon (corners, where connections are few), and no vertex is
+    merged."""
     described = mi.cornell_box() | {
         "far": {"type": "sphere", "center": [0, 0, -8], "radius": 0.2, "bsdf": rough(0.01)}
     }
@@ -181,7 +96,6 @@ def test_few_photons_far_from_what_is_sharp(monkeypatch):
 
 
 def test_undersampled_lamps_that_are_not_finite_are_named():
-    """Expected: through rough glass a lamp beyond single precision is named by one warning, without share."""
     described = mi.load_dict(under_glass(point() | {"intensity": 1e38}, plate=rough(0.01)))
     render = Render(described, described.sensors()[0], internals.bdpt(light_paths=0).settings, 0, 64)
     given = render.prepared, render.plan, render.settings
@@ -241,11 +155,8 @@ def test_stored_vertices_keep_their_merges():
     ids=["rough", "ideal", "ideal, no light subpaths"],
 )
 def test_passes_are_short_where_many_paths_are_merged(plate, parameters, expected, monkeypatch):
-    """Rationale: merges grow with the product of a pass's photons and queries: at 256 samples per pixel a
-    prism took 19 times as long with merging as without, and `glass_caustics` at 64 without light subpaths
-    9.5 times. Expected: passes of 16 samples per pixel (here of any number of samples) with near-specular
-    lobes, or without light subpaths; else of 32.
-    """
+    """Merges grow with the product of a pass's photons and queries: passes of 16 samples per pixel (here of
+    any number of samples) with near-specular lobes, or without light subpaths; else of 32."""
     monkeypatch.setattr(passes, "_LEAST_SAMPLES", 1)
     integrator = internals.bdpt(max_depth=5, **parameters, **MERGED)
     mi.render(mi.load_dict(under_glass(point(), plate=plate)), integrator=integrator, spp=48)

@@ -11,8 +11,9 @@ from functools import cache
 import numpy as np
 import pytest
 import sds_scenes
-import views
 from sds_scenes import glass, matte, principled, rough, transform
+
+import scenes
 
 SIZE, SEEDS = 48, 4
 # Pixels around the highlight.
@@ -28,7 +29,7 @@ def images(bsdf, reflectance=0.5, seeds=SEEDS):
     to_world = transform().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])
     scene = {
         "type": "scene",
-        "sensor": views.camera(origin=(0, -1.5, 5), target=(0, 0, 0), fov=25, size=SIZE),
+        "sensor": scenes.camera(origin=(0, -1.5, 5), target=(0, 0, 0), fov=25, size=SIZE),
         "floor": {"type": "rectangle", "to_world": transform().scale(1.5), "bsdf": matte(reflectance)},
         "pane": {"type": "cube", "to_world": to_world, "bsdf": bsdf},
         "lamp": {"type": "point", "position": [0, 0, 2], "intensity": 10.0},
@@ -44,12 +45,10 @@ def under_ideal_glass():
 
 @pytest.mark.parametrize("pane", PANES)
 def test_floor_has_the_light_that_it_has_under_ideal_glass(pane):
-    """Rationale: lobes of alpha 1e-3 are no deltas, and yet connections through them hardly ever succeed:
-    98 % of the light was missing, and some pixels had 17,000 times their share.
-
-    Expected: the mean is that under `dielectric`, within 3 % (both have a standard error of 0.7 %), and no
-    pixel is above 100 times the median of its eight neighbours in all images.
-    """
+    """Lobes of alpha 1e-3 are no deltas, and yet connections through them hardly ever succeed: 98 % of the
+    light was missing, and some pixels had 17,000 times their share. Expected: the mean under `dielectric`
+    within 3 % (both have a standard error of 0.7 %), no pixel above 100 times the median of its eight
+    neighbours in all images."""
     found, highlight = images(PANES[pane]), images(PANES[pane], 0.0, 1)
     light = found[:, BESIDE].mean() - highlight[:, BESIDE].mean()
     assert light == pytest.approx(under_ideal_glass(), rel=0.03)

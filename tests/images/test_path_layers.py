@@ -11,7 +11,7 @@ import pytest
 import variants
 import welch
 from internals import bdpt
-from layered import JOINED, check_sum, layers, scene
+from layered import JOINED, LAMPS, check_sum, layers, scene
 from media_parts import fog
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.transport import path_layers
@@ -52,9 +52,9 @@ def divided(method, target, **more):
         ({"merging": True}, {}),
         ({"merging": True}, SURFACES["near-specular"]),
         ({"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}, SURFACES["null"]),
-        ({"max_depth": 3, "layers": "strategies", "light_groups": "auto"}, {}),
+        ({"max_depth": 3, "layers": "strategies"}, {}),
         ({"guiding": "always"}, {}),
-        ({"decisions": JOINED, "light_groups": "auto"}, SURFACES["near-specular"]),
+        ({"decisions": JOINED}, SURFACES["near-specular"]),
         ({"connections": "all"}, {"medium": fog()} | SURFACES["near-specular"]),
     ],
     ids=[
@@ -71,19 +71,18 @@ def divided(method, target, **more):
     + ["guiding", "joined", "fog"],
 )
 def test_layers_add_up_to_the_image(parameters, of_scene):
-    """Expected: with what else a render may do, the layers add up, and so do light groups beside them."""
-    method, target = integrator(**parameters), scene(**of_scene)
+    """With what else a render may do, and so do light groups beside them."""
+    method, target = integrator(light_groups="auto", **parameters), scene(**of_scene)
     image, found = divided(method, target)
     assert tuple(found) == NAMES
     check_sum(image, found)
-    if "light_groups" in parameters:
-        check_sum(*layers(method, target))
+    check_sum(*layers(method, target))
 
 
 @pytest.mark.parametrize("parameters", [{"skip": "none"}, {"light_paths": 0}], ids=["all", "path tracing"])
 def test_layers_change_nothing_else(parameters):
-    """Expected: the image, and the layers of light groups, are those of a render without path layers.
-    Tolerance: order of atomic additions."""
+    """The image, and the layers of light groups, are those of a render without. Tolerance: order of atomic
+    additions."""
     target, parameters = scene(**SURFACES["near-specular"]), parameters | {"light_groups": "auto"}
     image, _ = divided(integrator(**parameters), target)
     _, groups = layers(integrator(**parameters), target)
@@ -94,17 +93,18 @@ def test_layers_change_nothing_else(parameters):
 
 
 def test_layers_of_bands_and_of_stokes_vectors():
-    """Expected: on a ``specfilm`` a layer has each band; in polarized variants layers add up to the intensity
-    of an image with Stokes vectors."""
+    """On a ``specfilm`` a layer has each band; in polarized variants layers add up to the intensity."""
     mi.set_variant(variants.of("spectral"))
     low, high = ({"type": "spectrum", "value": v} for v in ([(400, 1), (500, 1)], [(500, 1), (700, 1)]))
     film = {"type": "specfilm", "width": 4, "height": 4, "low": low, "high": high}
-    box = mi.cornell_box()
+    box = mi.cornell_box() | {"bulb": {"type": "point", "position": [0, 0, 0.5]}}
     box["sensor"]["film"] = film
     method = integrator(light_groups="lamp: light")
     image, found = divided(method, mi.load_dict(box))
-    assert method.aov_names()[2:] == [f"path.{name}.{band}" for name in NAMES for band in ("low", "high")]
+    names = *(f"groups.{name}" for name in ("lamp", "rest")), *(f"path.{name}" for name in NAMES)
+    assert method.aov_names() == [f"{name}.{band}" for name in names for band in ("low", "high")]
     check_sum(image, found)
+    check_sum(*layers(method, mi.load_dict(box)))
     mi.set_variant(variants.of("mono_polarized"))
     box["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
     image, found = divided(integrator(layers="stokes", light_groups="auto"), mi.load_dict(box))
@@ -113,13 +113,11 @@ def test_layers_of_bands_and_of_stokes_vectors():
 
 @pytest.mark.parametrize("light_paths", [0, 1])
 def test_light_of_a_mirror_beside_a_floor(light_paths):
-    """Rationale: under an even sky a point of a floor at distance c from an upright mirror of height a and
-    width 2 b sees the sky in it with the form factor F of a rectangle perpendicular to the point's plane
-    (1 / pi)(atan(b / c) - (c / r) atan(b / r)), r^2 = a^2 + c^2. No light meets the floor twice.
-
-    Expected: ``caustic`` is albedo F, ``direct`` albedo (1 - F), the others 0. Tolerance: five standard
-    errors of 2^18 samples of a variance below 1/4, and the pixels' extent, 1e-4 of c.
-    """
+    """Under an even sky a point of a floor at distance c from an upright mirror of height a and width 2 b
+    sees the sky in it with the form factor F of a rectangle perpendicular to the point's plane (1 /
+    pi)(atan(b / c) - (c / r) atan(b / r)), r^2 = a^2 + c^2. No light meets the floor twice. Expected:
+    ``caustic`` is albedo F, ``direct`` albedo (1 - F), the others 0. Tolerance: five standard errors of 2^18
+    samples of a variance below 1/4, and the pixels' extent, 1e-4 of c."""
     a, b, c, albedo = 1.0, 2.0, 0.5, 0.5
     mirror = mi.ScalarTransform4f().translate([-c, 0, 0]).rotate([0, 1, 0], 90)
     eye = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
@@ -211,9 +209,8 @@ LABELS = [f"{name} {colour}" for name in NAMES for colour in "RGB"]
     ids=["glass", "guiding", "all", "drawn", "joined", "path tracing", "null", "null by path tracing"],
 )
 def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
-    """Rationale: `by_sampling` counts rough events of paths that it samples from the camera, without any
-    connection. Expected: each layer's mean is the same whichever strategies are in use, by Welch's t-test of
-    the means of 12 renders; that of the image within 1 %."""
+    """`by_sampling` counts rough events of paths that it samples from the camera, without any connection:
+    each layer's mean, by Welch's t-test of the means of 12 renders; that of the image within 1 %."""
     target = scene(lit=("panel", "globe", "sky"), rfilter="box", **SURFACES[surfaces])
     expected, found = expected_layers(surfaces), means(target, 32, **parameters)
     welch.assert_agree(welch.welch(found, expected, labels=LABELS), at_least=8)
@@ -222,9 +219,8 @@ def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
 
 @pytest.mark.parametrize("kind", ["roughconductor", "roughdielectric"])
 def test_roughness_of_near_specular_lobes(kind):
-    """Expected: at normal incidence the alpha that the manual names divides events with a density of
-    `NARROW` from both sides from others. Tolerance: the two digits of the manual, and the 4 % of light that
-    glass reflects."""
+    """At normal incidence the alpha that the manual names divides events with a density of `NARROW` from both
+    sides from others. Tolerance: the two digits of the manual, and the 4 % of light that glass reflects."""
     page = Path(__file__).parents[2] / "docs/user/light_groups.md"
     manual = float(re.search(rf"`{kind}`[^;]*?below (0\.\d+)", page.read_text())[1])
     side = -1 if kind == "roughdielectric" else 1
@@ -240,9 +236,8 @@ def test_roughness_of_near_specular_lobes(kind):
 
 
 def test_other_objects_do_not_change_layers():
-    """Rationale: whether metal of alpha .07 could be near-specular depended on what else was in the scene.
-    Expected: a floor seen at grazing angles has the same layers, two of them, beside an unseen polished ball
-    and without. Tolerance: order of additions."""
+    """Whether metal of alpha .07 could be near-specular depended on what else was in the scene. A floor seen
+    at grazing angles has the same layers, two of them, beside an unseen polished ball and without."""
     eye = mi.ScalarTransform4f().look_at([-3, 0, 0.4], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
     metal = {"type": "roughconductor", "alpha": 0.07}
@@ -259,8 +254,8 @@ def test_other_objects_do_not_change_layers():
 
 
 def test_layers_in_fog():
-    """Expected: with near-specular surfaces in fog, layers by all strategies have the means of those by path
-    tracing, by Welch's t-test of the means of 12 renders; ``indirect`` within 5 %."""
+    """By all strategies and by path tracing, by Welch's t-test of the means of 12 renders; ``indirect``
+    within 5 %."""
     target = scene(lit=("panel", "globe", "sky"), medium=fog(), rfilter="box", **SURFACES["near-specular"])
     found = means(target, 32, skip="none", connections="all")
     expected = means(target, 64, light_paths=0)
@@ -270,10 +265,9 @@ def test_layers_in_fog():
 
 @pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
 def test_merged_light_is_caustic(plate):
-    """Rationale: light of a point lamp that the camera sees on a floor under a plate has passed the plate
-    twice, which six edges allow once; smooth or nearly so, merges alone sample it. Expected: all of it is in
-    ``caustic``; with the rough plate, which also shows the lamp itself (``emission``) and whose lobes have
-    tails, less than a tenth is elsewhere."""
+    """Light of a point lamp that the camera sees on a floor under a plate has passed the plate twice, which
+    six edges allow once; smooth or nearly so, merges alone sample it. With the rough plate, which also shows
+    the lamp itself (``emission``) and whose lobes have tails, less than a tenth is elsewhere."""
     glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
     glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
     target = mi.load_dict(under_glass(point(), plate=glass))
@@ -287,11 +281,13 @@ def test_merged_light_is_caustic(plate):
 
 
 def test_a_resumed_and_a_joined_render_keep_the_layers():
-    """Expected: a render that goes on from a snapshot has the layers of one in one piece; two renders of
-    different seeds, joined, have the mean of theirs. Tolerance: rounding."""
+    """And those of light groups; two renders of different seeds, joined, have the mean of theirs. Tolerance:
+    rounding."""
     target = scene(rfilter="box")
     method = integrator(skip="none", spp_per_pass=4, light_groups="auto")
     whole = np.array(method.render(target, spp=8, seed=3))
+    known = method.statistics["light_groups"]
+    assert sorted(ids[0] for lamps in known.values() for ids in lamps) == sorted(LAMPS)
     start = stopped(method, target, 1, spp=8, seed=3)
     resumed = np.array(method.render(target, spp=8, seed=3, start=start))
     np.testing.assert_allclose(resumed, whole, **ROUNDING)
@@ -302,8 +298,7 @@ def test_a_resumed_and_a_joined_render_keep_the_layers():
 
 
 def test_without_path_layers_nothing_is_recorded_for_them(monkeypatch):
-    """Rationale: a render without them is to record the same kernels. Expected: no number of events is
-    computed."""
+    """A render without them is to record the same kernels."""
 
     def refuse(layer=0, *_, **__):
         assert layer is None, "recorded for path layers"

@@ -1,7 +1,7 @@
 """Polarized light: optics that is known, Mitsuba's ``stokes`` around ``path``, each strategy by itself.
 
-Statistics and scenes as in ``test_strategies.py``; scenes are made inside of tests, since objects of one
-variant are of no use in another.
+Statistics as in `test_strategies`; scenes are made inside of tests, since objects of one variant are of no
+use in another.
 """
 
 from dataclasses import replace
@@ -12,7 +12,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
-import views
 import welch as st
 from mitsuba_bdpt.geometry import polarization
 from mitsuba_bdpt.image import sink
@@ -21,24 +20,20 @@ from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
 
+from scenes import area, camera, load, matte, square, transform
+
 RUNS, TILES = 16, 4
 METAL = {"eta": 0.5, "k": 2.0}
+MIRROR = {"type": "conductor", **METAL}
 ROUGH = {"type": "roughconductor", "alpha": 0.3, **METAL}
 PLASTIC = {"type": "pplastic", "alpha": 0.3, "diffuse_reflectance": 0.5}
+GLASS = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
 FIRST = slice(0, None, 3)  # of the layers of a monochromatic variant, where R, G and B are the same
 
 
 @pytest.fixture(autouse=True)
 def _polarized():
     mi.set_variant(variants.of("mono_polarized"))
-
-
-def at(*steps):
-    """A transform by names of its steps and their values."""
-    transform = mi.ScalarTransform4f()
-    for name, *values in steps:
-        transform = getattr(transform, name)(*values)
-    return transform
 
 
 def bdpt(**parameters):
@@ -54,14 +49,6 @@ def layers(scene, integrator, spp, seed=0):
 # -- optics that is known ---------------------------------------------------------------------
 
 
-def filters(*bsdfs):
-    """Rectangles across the z axis, the first one first met by light that travels along it towards +z."""
-    return {
-        f"filter {i}": {"type": "rectangle", "to_world": at(("translate", [0, 0, 0.1 * i])), "bsdf": bsdf}
-        for i, bsdf in enumerate(bsdfs)
-    }
-
-
 def polarizer(theta):
     return {"type": "polarizer", "theta": float(theta)}
 
@@ -70,46 +57,38 @@ def retarder(theta, delta):
     return {"type": "retarder", "theta": float(theta), "delta": float(delta)}
 
 
+def filters(*bsdfs):
+    """Squares across the z axis, the first one first met by light that travels along it towards +z."""
+    return {f"filter {i}": square((0, 0, 0.1 * i), bsdf=bsdf) for i, bsdf in enumerate(bsdfs)}
+
+
 def seen_through(*bsdfs):
     """S0 to S3 of a lamp of radiance 1 that a camera sees through filters: the camera's subpaths."""
-    lamp = {
-        "type": "rectangle",
-        "to_world": at(("translate", [0, 0, -1])),
-        "emitter": {"type": "area", "radiance": 1.0},
-    }
-    camera = views.camera(origin=(0, 0, 3), target=(0, 0, 0), fov=2, size=4)
-    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, **filters(*bsdfs)})
+    eye = camera(origin=(0, 0, 3), target=(0, 0, 0), fov=2, size=4)
+    scene = load(sensor=eye, lamp=square((0, 0, -1), emitter=area(1.0)), **filters(*bsdfs))
     return layers(scene, bdpt(max_depth=8, skip="none"), 4).mean((0, 1))
 
 
 def thrown_through(*bsdfs):
     """The share of a spot's light that filters let pass to a matte wall: the light's subpaths."""
-
-    def radiance(objects):
-        spot = {
-            "type": "spot",
-            "to_world": at(("look_at", [0, 0, -1], [0, 0, 1], [0, 1, 0])),
-            "cutoff_angle": 4.0,
-            "intensity": 1.0,
-        }
-        wall = {
-            "type": "rectangle",
-            "to_world": at(("translate", [0, 0, 1]), ("rotate", [0, 1, 0], 180)),
-            "bsdf": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": 0.5}},
-        }
-        camera = views.camera(origin=(1.5, 0, 0.4), target=(0, 0, 1), fov=2, size=4)
-        scene = mi.load_dict({"type": "scene", "sensor": camera, "spot": spot, "wall": wall, **objects})
-        return layers(scene, bdpt(max_depth=8, skip="none"), 4096)[..., 0].mean()
-
-    return radiance(filters(*bsdfs)) / radiance({})
+    along = transform().look_at([0, 0, -1], [0, 0, 1], [0, 1, 0])
+    scene = {
+        "spot": {"type": "spot", "to_world": along, "cutoff_angle": 4.0, "intensity": 1.0},
+        "wall": square((0, 0, 1), ([0, 1, 0], 180), bsdf={"type": "twosided", "nested": matte(0.5)}),
+        "sensor": camera(origin=(1.5, 0, 0.4), target=(0, 0, 1), fov=2, size=4),
+    }
+    method = bdpt(max_depth=8, skip="none")
+    with_, without = (
+        layers(load(**scene, **more), method, 4096)[..., 0].mean() for more in (filters(*bsdfs), {})
+    )
+    return with_ / without
 
 
 @pytest.mark.parametrize("angle", [0, 30, 90])
 def test_two_polarizers(angle):
-    """Malus' law. Expected: of unpolarized light half of cos^2 of the angle between them passes, from either
-    side, and what passes is polarized (S1^2 + S2^2 = S0^2). To 2e-3 on the camera's side, where directions
-    are within a degree of the axis; the light's side has noise of 1 % and directions within four.
-    """
+    """Malus' law: half of cos^2 of the angle passes, from either side, polarized. To 2e-3 on the camera's
+    side, where directions are within a degree of the axis; the light's side has noise of 1 % and directions
+    within four."""
     expected = 0.5 * np.cos(np.radians(angle)) ** 2
     seen = seen_through(polarizer(20), polarizer(20 + angle))
     assert seen[0] == pytest.approx(expected, abs=2e-3)
@@ -118,7 +97,7 @@ def test_two_polarizers(angle):
 
 
 def test_angles_of_polarization_are_the_polarizers():
-    """Expected: turning the polarizer by 30 degrees turns (S1, S2) by 60."""
+    """Turning the polarizer by 30 degrees turns (S1, S2) by 60."""
     one, other = seen_through(polarizer(10)), seen_through(polarizer(40))
     turned = np.degrees(np.arctan2(other[2], other[1]) - np.arctan2(one[2], one[1]))
     assert abs((turned + 180) % 360 - 180) == pytest.approx(60, abs=0.3)
@@ -126,8 +105,7 @@ def test_angles_of_polarization_are_the_polarizers():
 
 @pytest.mark.parametrize("delta", [90, 180, 250])
 def test_retarder_between_crossed_polarizers(delta):
-    """Expected: at 45 degrees sin^2(delta / 2) of the light that the first polarizer passes, from either
-    side."""
+    """At 45 degrees sin^2(delta / 2) of the light that the first polarizer passes, from either side."""
     between = polarizer(0), retarder(45, delta), polarizer(90)
     expected = 0.5 * np.sin(np.radians(delta) / 2) ** 2
     assert seen_through(*between)[0] == pytest.approx(expected, abs=2e-3)
@@ -136,39 +114,32 @@ def test_retarder_between_crossed_polarizers(delta):
 
 @pytest.mark.parametrize("left", [False, True])
 def test_circular_polarizer(left):
-    """Expected: half of the light passes, circular: S3 = S0 of the right-handed one, -S0 of the other."""
+    """S3 = S0 of the right-handed one, -S0 of the other."""
     s0, s1, s2, s3 = seen_through({"type": "circular", "left_handed": left})
     assert s0 == pytest.approx(0.5, abs=1e-4) and max(abs(s1), abs(s2)) < 1e-3
     assert s3 == pytest.approx(-0.5 if left else 0.5, abs=1e-3)
 
 
 def mirrored(bsdf, degrees, *more):
-    """S0 to S3 of a lamp of radiance 1 seen mirrored in a horizontal surface, ``degrees`` from its normal."""
-    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees))
-    up = -1 if more else 1  # from the inside
-    lamp = {
-        "type": "rectangle",
-        "to_world": at(("look_at", [-5 * sine, up * 5 * cosine, 0], [0, 0, 0], [0, 0, 1]), ("scale", 2.0)),
-        "emitter": {"type": "area", "radiance": 1.0},
-    }
-    across = at(("look_at", [-2 * sine, up * 2 * cosine, 0], [0, 0, 0], [0, 1, 0]))
-    objects = {
-        f"filter {i}": {"type": "rectangle", "to_world": across, "bsdf": one} for i, one in enumerate(more)
-    }
-    surface = {"type": "rectangle", "to_world": at(("rotate", [1, 0, 0], -90)), "bsdf": bsdf}
-    camera = views.camera(origin=(3 * sine, up * 3 * cosine, 0), target=(0, 0, 0), fov=0.2, size=4)
-    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, "surface": surface, **objects})
+    """S0 to S3 of a lamp of radiance 1 seen mirrored in a horizontal surface, ``degrees`` from its normal;
+    from the inside if there are filters on the way."""
+    sine, cosine = np.sin(np.radians(degrees)), np.cos(np.radians(degrees)) * (-1 if more else 1)
+    facing = transform().look_at([-5 * sine, 5 * cosine, 0], [0, 0, 0], [0, 0, 1]).scale(2.0)
+    across = transform().look_at([-2 * sine, 2 * cosine, 0], [0, 0, 0], [0, 1, 0])
+    scene = load(
+        sensor=camera(origin=(3 * sine, 3 * cosine, 0), target=(0, 0, 0), fov=0.2, size=4),
+        lamp=square(emitter=area(1.0)) | {"to_world": facing},
+        surface=square(turn=([1, 0, 0], -90), bsdf=bsdf),
+        **{f"filter {i}": square(bsdf=one) | {"to_world": across} for i, one in enumerate(more)},
+    )
     return layers(scene, bdpt(max_depth=8, skip="none"), 256).mean((0, 1))
 
 
 def test_brewster():
-    """Expected: at Brewster's angle glass reflects light that is polarized along the surface alone, S1 = S0,
-    and of the unpolarized half ((n^2 - 1) / (n^2 + 1))^2. (Noise of choosing reflection: 3 %.)
-    """
+    """At Brewster's angle glass reflects light that is polarized along the surface alone, of the unpolarized
+    half ((n^2 - 1) / (n^2 + 1))^2. (Noise of choosing reflection: 3 %.)"""
     index = 1.5
-    s0, s1, s2, s3 = mirrored(
-        {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}, np.degrees(np.arctan(index))
-    )
+    s0, s1, s2, s3 = mirrored(GLASS, np.degrees(np.arctan(index)))
     assert s1 == pytest.approx(s0, rel=1e-4) and max(abs(s2), abs(s3)) < 1e-3 * s0
     assert s0 == pytest.approx(0.5 * ((index**2 - 1) / (index**2 + 1)) ** 2, rel=0.05)
 
@@ -183,43 +154,33 @@ def reflectances(degrees):
 
 
 def test_one_mirror_and_two():
-    """Expected: of unpolarized light one mirror reflects (Rs + Rp) / 2, with S1 = (Rs - Rp) / 2; a second one
-    whose plane of incidence is turned by 90 degrees undoes that: S0 = Rs Rp, unpolarized.
-    """
+    """Of unpolarized light one mirror reflects (Rs + Rp) / 2, with S1 = (Rs - Rp) / 2; a second one whose
+    plane of incidence is turned by 90 degrees undoes that: S0 = Rs Rp, unpolarized."""
     across, along = reflectances(45)
-    s0, s1, s2, s3 = mirrored({"type": "conductor", **METAL}, 45)
+    s0, s1, s2, s3 = mirrored(MIRROR, 45)
     assert s0 == pytest.approx((across + along) / 2, rel=1e-3)
     assert s1 == pytest.approx((across - along) / 2, rel=5e-3) and max(abs(s2), abs(s3)) < 1e-3
-    lamp = {
-        "type": "rectangle",
-        "to_world": at(("look_at", [-3, 0, 0], [0, 0, 0], [0, 0, 1]), ("scale", 2.0)),
-    }
-    lamp["emitter"] = {"type": "area", "radiance": 1.0}
-    mirrors = {
-        f"mirror {i}": {
-            "type": "rectangle",
-            "to_world": at(
-                ("look_at", place, [p + n for p, n in zip(place, normal, strict=True)], [0.3, 0.5, 0.4])
-            ),
-            "bsdf": {"type": "conductor", **METAL},
-        }
-        for i, (place, normal) in enumerate((([0, 0, 0], [-1, 1, 0]), ([0, 3, 0], [0, -1, 1])))
-    }
-    camera = views.camera(origin=(0, 3, 3), target=(0, 3, 0), fov=0.2, size=4)
-    scene = mi.load_dict({"type": "scene", "sensor": camera, "lamp": lamp, **mirrors})
+
+    def facing(place, target, up, size=1.0):
+        return {"to_world": transform().look_at(place, target, up).scale(size)}
+
+    scene = load(
+        sensor=camera(origin=(0, 3, 3), target=(0, 3, 0), fov=0.2, size=4),
+        lamp=square(emitter=area(1.0)) | facing([-3, 0, 0], [0, 0, 0], [0, 0, 1], 2.0),
+        one=square(bsdf=MIRROR) | facing([0, 0, 0], [-1, 1, 0], [0.3, 0.5, 0.4]),
+        other=square(bsdf=MIRROR) | facing([0, 3, 0], [0, 2, 1], [0.3, 0.5, 0.4]),
+    )
     s0, *others = layers(scene, bdpt(max_depth=4, skip="none"), 16).mean((0, 1))
     assert s0 == pytest.approx(across * along, rel=1e-3) and np.abs(others).max() < 2e-3 * s0
 
 
 def test_total_internal_reflection():
-    """Expected: light polarized at 45 degrees to the plane of incidence leaves elliptic, by the phase delta
-    with tan(delta / 2) = cos t sqrt(sin^2 t - 1 / n^2) / sin^2 t.
-    """
+    """Light polarized at 45 degrees to the plane of incidence leaves elliptic, by the phase delta with
+    tan(delta / 2) = cos t sqrt(sin^2 t - 1 / n^2) / sin^2 t."""
     index, angle = 1.5, 54.0
     sine, cosine = np.sin(np.radians(angle)), np.cos(np.radians(angle))
     delta = 2 * np.arctan(cosine * np.sqrt(sine**2 - index**-2) / sine**2)
-    glass = {"type": "dielectric", "int_ior": index, "ext_ior": 1.0}
-    s0, s1, s2, s3 = mirrored(glass, angle, polarizer(45))
+    s0, s1, s2, s3 = mirrored(GLASS, angle, polarizer(45))
     assert s0 == pytest.approx(0.5, rel=1e-3)
     assert abs(s3) == pytest.approx(0.5 * np.sin(delta), rel=5e-3)
     assert abs(s2) == pytest.approx(0.5 * abs(np.cos(delta)), rel=5e-3) and abs(s1) < 2e-3
@@ -228,34 +189,25 @@ def test_total_internal_reflection():
 # -- Mitsuba's `stokes` as the judge ----------------------------------------------------------
 
 
+def wall(reflectance):
+    return {"type": "sphere", "radius": 3.0, "flip_normals": True, "bsdf": matte(reflectance)}
+
+
 def room(*objects, **more):
-    """A matte sphere from within with a floor, a lamp behind a polarizer, and objects."""
-    wall = {
-        "type": "sphere",
-        "radius": 3.0,
-        "flip_normals": True,
-        "bsdf": {"type": "diffuse", "reflectance": 0.6},
+    """A matte sphere from within with a lamp behind a polarizer, and objects."""
+    eye = camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0), up=(0.2, 1, 0))
+    tilted = [1, 0, 0], 80
+    scene = {
+        "sensor": eye,
+        "wall": wall(0.6),
+        "lamp": square((0.3, 1.4, 0.3), tilted, 0.8, emitter=area(3.0)),
+        "sheet": square((0.28, 1.33, 0.3), tilted, 0.9, polarizer(40)),
     }
-    lamp = {
-        "type": "rectangle",
-        "to_world": at(("translate", [0.3, 1.4, 0.3]), ("rotate", [1, 0, 0], 80), ("scale", 0.8)),
-        "emitter": {"type": "area", "radiance": 3.0},
-    }
-    sheet = {
-        "type": "rectangle",
-        "to_world": at(("translate", [0.28, 1.33, 0.3]), ("rotate", [1, 0, 0], 80), ("scale", 0.9)),
-        "bsdf": polarizer(40),
-    }
-    camera = views.camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0))
-    camera["to_world"] = at(("look_at", [0, -0.2, 2.6], [0, 0.1, 0], [0.2, 1, 0]))
-    parts = {"sensor": camera, "wall": wall, "lamp": lamp, "sheet": sheet}
-    parts |= {f"object {i}": one for i, one in enumerate(objects)}
-    return mi.load_dict({"type": "scene", **parts, **more})
+    return load(**scene | {f"object {i}": one for i, one in enumerate(objects)} | more)
 
 
-def floor(bsdf):
-    to_world = at(("translate", [0, -0.8, 0]), ("rotate", [1, 0, 0], -80), ("scale", 1.5))
-    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+def floor(bsdf, lift=0.0):
+    return square((0, -0.8 + lift, 0), ([1, 0, 0], -80), 1.5, bsdf)
 
 
 def ball(bsdf):
@@ -263,18 +215,15 @@ def ball(bsdf):
 
 
 def sheet(bsdf, z):
-    to_world = at(("translate", [0.1, 0, z]), ("rotate", [0, 1, 0], 15), ("scale", 0.5))
-    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+    return square((0.1, 0, z), ([0, 1, 0], 15), 0.5, bsdf)
 
 
 SCENES = {
     "rough metal and plastic": lambda: (floor(ROUGH), ball(PLASTIC)),
-    "glass": lambda: (floor(PLASTIC), ball({"type": "dielectric"})),
+    "glass": lambda: (floor(PLASTIC), ball(GLASS)),
     "mirror and filters": lambda: (
-        floor(ROUGH),
-        ball({"type": "conductor", **METAL}),
-        sheet(retarder(20, 70), 1.2),
-        sheet(polarizer(30), 0.9),
+        *(floor(ROUGH), ball(MIRROR)),
+        *(sheet(retarder(20, 70), 1.2), sheet(polarizer(30), 0.9)),
     ),
     "two sides, mask": lambda: (
         floor({"type": "twosided", "nested": ROUGH}),
@@ -307,10 +256,7 @@ def ours(scene, first_seed, **parameters):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_stokes_vectors_are_mitsubas(name):
-    """Rationale: frames, orders of matrices and their adjoints. Expected: with all strategies, with the drawn
-    connection and by default S0 to S3 of every tile are those of ``stokes`` around ``path``. Statistic:
-    Welch.
-    """
+    """Frames, orders of matrices and their adjoints. S0 to S3 of every tile."""
     scene = room(*SCENES[name]())
     theirs = judged(scene, max_depth=5)
     ways = {"skip": "none"}, {"light_paths": 1, "connections": "one"}, {}
@@ -323,10 +269,10 @@ def test_stokes_vectors_are_mitsubas(name):
 
 
 def test_spectra_of_stokes_vectors_are_mitsubas():
-    """As above, in four wavelengths per sample, with a metal of coloured reflection."""
+    """In four wavelengths per sample, with a metal of coloured reflection."""
     mi.set_variant(variants.of("spectral_polarized"))
     gold = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
-    scene = room(floor(gold), ball({"type": "dielectric"}))
+    scene = room(floor(gold), ball(GLASS))
     method = mi.load_dict({"type": "stokes", "nested": {"type": "path", "rr_depth": 100, "max_depth": 4}})
 
     def render(integrator, spp):
@@ -357,25 +303,20 @@ class StokesOfStrategies(sink.Image):
 
 
 def test_strategies_agree_in_every_component(monkeypatch):
-    """Each strategy alone makes the same S1, S2 and S3 of the paths of one length.
-
-    Rationale: a strategy of small weight could be wrong and not be seen in the sum. Expected: for k = 1 ... 4
-    the unweighted image of (s, t) has the mean of the next one's. Statistic: Welch per tile, seeds apart.
-    """
+    """A strategy of small weight could be wrong and not be seen in the sum: the unweighted image of (s, t)
+    has the mean of the next one's."""
     depth = 4
     monkeypatch.setattr(rendering, "Image", StokesOfStrategies)
-    wall = {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "nested": PLASTIC}}
+    around = {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "nested": PLASTIC}}
     lamp = {
         "type": "sphere",
         "center": [0.25, 0.3, -0.2],
         "radius": 0.2,
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": 5.0},
+        "bsdf": matte(0),
+        "emitter": area(5.0),
     }
     other = {"type": "sphere", "center": [-0.3, -0.3, -0.3], "radius": 0.25, "bsdf": ROUGH | {"alpha": 0.5}}
-    scene = mi.load_dict(
-        {"type": "scene", "sensor": views.camera(), "wall": wall, "lamp": lamp, "other": other}
-    )
+    scene = load(sensor=camera(), wall=around, lamp=lamp, other=other)
     method = bdpt(skip="none", rr_depth=100, max_depth=depth, layers="stokes,strategies")
 
     def unweighted(first_seed):
@@ -400,9 +341,8 @@ def test_strategies_agree_in_every_component(monkeypatch):
 
 
 def test_what_polarizes_nothing_is_as_in_other_variants():
-    """Expected: the same image of the same seed in ``mono`` and ``mono_polarized``, to rounding in all but a
-    hundredth of the pixels (a drawn connection may be another one), and no polarization.
-    """
+    """The same image of the same seed, to rounding in all but a hundredth of the pixels (a drawn connection
+    may be another one)."""
     found = []
     for variant in ("mono", "mono_polarized"):
         mi.set_variant(variants.of(variant))
@@ -419,13 +359,10 @@ def test_what_polarizes_nothing_is_as_in_other_variants():
 
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_the_first_layer_is_the_image(rfilter):
-    """Expected: S0 is the image to rounding with any filter, splats included; the layers have the names of
-    Mitsuba's, and come first.
-    """
-    camera = views.camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0))
-    camera["film"]["rfilter"] = {"type": rfilter}
+    """With any filter, splats included; the layers have the names of Mitsuba's, and come first."""
+    eye = camera(origin=(0, -0.2, 2.6), target=(0, 0.1, 0), rfilter=rfilter)
     method = bdpt(max_depth=4, skip="none", aovs="dd:depth", layers="stokes,variance")
-    scene = room(floor(ROUGH), ball({"type": "dielectric"}), sensor=camera)
+    scene = room(floor(ROUGH), ball(GLASS), sensor=eye)
     image = np.array(method.render(scene, spp=8, seed=0))
     assert method.aov_names()[:13] == [*STOKES_NAMES, "dd.T"]
     assert mi.load_dict({"type": "stokes", "nested": {"type": "path"}}).aov_names() == list(STOKES_NAMES)
@@ -437,7 +374,6 @@ def test_the_first_layer_is_the_image(rfilter):
 
 
 def test_a_stopped_render_goes_on():
-    """Expected: the layers of a whole render, from a snapshot in the middle."""
     scene = room(floor(ROUGH))
     whole = np.array(bdpt(max_depth=4, spp_per_pass=8).render(scene, spp=32, seed=1))
     other = bdpt(max_depth=4, spp_per_pass=8)
@@ -447,10 +383,8 @@ def test_a_stopped_render_goes_on():
 
 
 def test_fog_is_as_in_volpath():
-    """Rationale: Mitsuba's phase functions leave Stokes vectors as they are. Expected: as ``stokes`` around
-    ``volpath`` in a room with fog in a ball. Statistic: Welch.
-    """
-    fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.7, "phase": {"type": "hg", "g": 0.3}}
+    """Mitsuba's phase functions leave Stokes vectors as they are."""
+    fog = parts.fog(2.0, 0.7)
     no_sheet = {"type": "sphere", "center": [0, 5, 0], "radius": 0.01}
     scene = room(floor(ROUGH), ball({"type": "null"}) | {"interior": fog}, sheet=no_sheet)
     theirs = judged(scene, "volpath", max_depth=5)
@@ -459,44 +393,29 @@ def test_fog_is_as_in_volpath():
 
 def seen_through_glass(radius):
     """Rough metal under a polarizing foil, lit by a lamp in glass, seen through a pane: isolated paths."""
-    lamp = {
-        "type": "sphere",
-        "center": [-0.5, -0.3, 0.3],
-        "radius": radius,
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-        "emitter": {"type": "area", "radiance": 0.6 / radius**2},
-    }
-    to_world = at(("translate", [0, -0.2, 2]), ("scale", [0.8, 0.8, 0.03]))
-    pane = {"type": "cube", "to_world": to_world, "bsdf": {"type": "dielectric"}}
-    glass = ball({"type": "dielectric"})
-    black = {
-        "type": "sphere",
-        "radius": 3.0,
-        "flip_normals": True,
-        "bsdf": {"type": "diffuse", "reflectance": 0.0},
-    }
-    ground = floor(ROUGH | {"alpha": 0.5})
-    foil = floor(polarizer(40)) | {"to_world": at(("translate", [0, 0.03, 0])) @ ground["to_world"]}
-    return mi.load_dict(
-        {"type": "scene", "sensor": views.camera(origin=(0, -0.2, 2.6), target=(0, -0.3, 0)), "wall": black}
-        | {"floor": ground, "foil": foil, "glass": glass, "lamp": lamp, "pane": pane}
+    lamp = {"type": "sphere", "center": [-0.5, -0.3, 0.3], "radius": radius, "bsdf": matte(0)}
+    to_world = transform().translate([0, -0.2, 2]).scale([0.8, 0.8, 0.03])
+    return load(
+        sensor=camera(origin=(0, -0.2, 2.6), target=(0, -0.3, 0)),
+        wall=wall(0.0),
+        floor=floor(ROUGH | {"alpha": 0.5}),
+        foil=floor(polarizer(40), 0.03),
+        glass=ball(GLASS),
+        lamp=lamp | {"emitter": area(0.6 / radius**2)},
+        pane={"type": "cube", "to_world": to_world, "bsdf": GLASS},
     )
 
 
 def test_guided_paths_are_polarized():
-    """Rationale: s = 0 may be guided. Expected: S0 to S3 of every tile are those of ``stokes`` around
-    ``path``, which finds the lamp if it is large.
-    """
+    """s = 0 may be guided; `path` finds the lamp if it is large."""
     large = seen_through_glass(0.25)
     guided = ours(large, 0, max_depth=8, guiding="always")
     st.assert_agree(st.compare_images(guided, judged(large, max_depth=8)), at_least=30)
 
 
 def test_isolated_paths_are_polarized():
-    """Rationale: photons that are merged carry Stokes vectors. Expected: merged, which blurs, S0 to S3 are
-    those of guided s = 0 in the mean of the image, within 4 standard errors. A twelfth of that image, most of
-    which is the lamp itself, is merged, and it is polarized.
-    """
+    """Merged, which blurs, S0 to S3 are those of guided s = 0 in the mean of the image, within 4 standard
+    errors. A twelfth of that image, most of which is the lamp itself, is merged, and it is polarized."""
     small = seen_through_glass(0.1)
     method = bdpt(max_depth=8, rr_depth=100, guiding="always")
     theirs = np.stack([layers(small, method, 512, 100 + i).mean((0, 1)) for i in range(RUNS)])
@@ -556,33 +475,27 @@ def register_sky():
 
 
 def test_a_sky_of_the_users_may_be_polarized():
-    """Expected: S0 to S3 as of ``stokes`` around ``path`` for a plugin whose emission is polarized, seen
-    directly, mirrored in rough metal and through glass. Statistic: Welch per tile.
-    """
+    """As of ``stokes`` around ``path``, seen directly, mirrored in rough metal and through glass."""
     register_sky()
-    camera = views.camera(origin=(0, 0.5, 3), target=(0, -0.1, 0))
-    scene = mi.load_dict(
-        {"type": "scene", "sensor": camera, "sky": {"type": "rayleigh_sky"}, "floor": floor(ROUGH)}
-        | {"ball": ball({"type": "dielectric"}), "other": ball(PLASTIC) | {"center": [0.5, -0.3, 0.3]}}
-    )
+    other = ball(PLASTIC) | {"center": [0.5, -0.3, 0.3]}
+    eye, sky = camera(origin=(0, 0.5, 3), target=(0, -0.1, 0)), {"type": "rayleigh_sky"}
+    scene = load(sensor=eye, sky=sky, floor=floor(ROUGH), ball=ball(GLASS), other=other)
     theirs = judged(scene, max_depth=4)
     assert np.abs(theirs.reshape(RUNS, -1, 4)[..., 1:].mean(0)).max() > 0.3
     st.assert_agree(st.compare_images(ours(scene, 0, max_depth=4, skip="none"), theirs), at_least=40)
 
 
 def test_frames_do_not_flip():
-    """Rationale: Mitsuba's frames flip where the world's z of a direction changes its sign, by rounding where
-    a camera looks across that axis; S1 and S2 of such images are too small. Expected: hardly another image
-    from a camera that looks down by a little.
-    """
+    """Mitsuba's frames flip where the world's z of a direction changes its sign, by rounding where a camera
+    looks across that axis; S1 and S2 of such images are too small."""
 
     def seen(height):
-        camera = views.camera("orthographic", size=8)
-        camera["to_world"] = at(("look_at", [2, 1.3, height], [0, 0, 0], [0, 0, 1]), ("scale", 0.8))
-        del camera["fov"]
+        eye = camera("orthographic", size=8)
+        eye["to_world"] = transform().look_at([2, 1.3, height], [0, 0, 0], [0, 0, 1]).scale(0.8)
+        del eye["fov"]
         sphere = {"type": "sphere", "radius": 0.9, "bsdf": ROUGH | {"alpha": 0.5}}
         sun = {"type": "directional", "direction": [-0.2, -1, -0.6], "irradiance": 3.0}
-        scene = mi.load_dict({"type": "scene", "sensor": camera, "ball": sphere, "sun": sun})
+        scene = load(sensor=eye, ball=sphere, sun=sun)
         return layers(scene, bdpt(max_depth=2), 256).mean((0, 1))
 
     level, down = seen(0.0), seen(0.005)
@@ -591,14 +504,12 @@ def test_frames_do_not_flip():
 
 
 def test_spectra_of_sensors_and_fog():
-    """Rationale: spectra that polarize nothing are no matrices. Expected: in ``spectral_polarized`` a
-    radiance meter measures its sky, and a camera in fog has the image of ``spectral``, of the same seed.
-    """
+    """Spectra that polarize nothing are no matrices: a radiance meter measures its sky, and a camera in fog
+    has the image of ``spectral``, of the same seed."""
     mi.set_variant(variants.of("spectral_polarized"))
-    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    film = camera(size=1)["film"]
     meter = {"type": "radiancemeter", "origin": [0, 0, 0], "direction": [0, 0, 1], "film": film}
-    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1, 0.6, 0.3]}}
-    scene = mi.load_dict({"type": "scene", "sensor": meter, "sky": sky})
+    scene = load(sensor=meter, sky={"type": "constant", "radiance": parts.rgb(1, 0.6, 0.3)})
     found = np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=4096)).ravel()[:3]
     np.testing.assert_allclose(found, [1, 0.6, 0.3], rtol=0.02)
 
@@ -614,7 +525,7 @@ def test_spectra_of_sensors_and_fog():
 
 
 def test_what_cannot_be_done_is_said():
-    """Expected: words for layers that a variant or film has not, and for filters that edges would pass."""
+    """Layers that a variant or film has not, and filters that edges would pass."""
     fog = {"type": "homogeneous", "sigma_t": 2.0, "albedo": 0.7}
     scene = room(ball({"type": "null"}) | {"interior": fog})
     with pytest.raises(NotImplementedError, match="class LinearPolarizer polarizes what it lets pass"):
@@ -630,13 +541,9 @@ def test_what_cannot_be_done_is_said():
     with pytest.raises((ValueError, RuntimeError), match="layers=stokes needs a polarized variant"):
         bdpt()
     mi.set_variant(variants.of("spectral_polarized"))
-    film = {
-        "type": "specfilm",
-        "width": 8,
-        "height": 8,
-        "band": {"type": "spectrum", "value": [(400.0, 1.0), (700.0, 1.0)]},
-    }
-    scene = room(floor(ROUGH), sensor=views.camera() | {"film": film})
+    band = {"type": "spectrum", "value": [(400.0, 1.0), (700.0, 1.0)]}
+    film = {"type": "specfilm", "width": 8, "height": 8, "band": band}
+    scene = room(floor(ROUGH), sensor=camera() | {"film": film})
     with pytest.raises(NotImplementedError, match="layers=stokes is not possible with film"):
         bdpt().render(scene, spp=1)
     assert np.isfinite(np.array(mi.load_dict({"type": "bdpt"}).render(scene, spp=1))).all()

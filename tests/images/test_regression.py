@@ -112,20 +112,14 @@ def cases(scenes, colours=COLOURS):
 @needs(DATA)
 @pytest.mark.parametrize("name, colour, skip", cases(SCENES, [*COLOURS, POLARIZED]))
 def test_image_is_mitsubas(name, colour, skip):
-    """Our image equals the reference that Mitsuba ships for the colour mode.
+    """Images made by others, on scenes with textures, masks, rough glass, meshes.
 
-    Rationale: images made by others, on scenes with textures, masks, rough glass, meshes. Expected:
-    at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma (plus 5e-4 for the
-    references' colour conversion). Statistic:
-    Z = |mean - ref| / sqrt(v / seeds + var / 32000 + 1e-4 / spp) with v our variance over 16 seeds
-    and var the reference's, Student's t with 15 degrees, Sidak at 0.01 over the pixels: Mitsuba's
-    rule, but with our variance, for `path` has next to none where a bidirectional image has some.
-    2e6 samples in total; with 5e5 the rare splats of (1,1) from the sky, 6 % of a pixel each, are too
-    few for Student's t. The textured projector differs from its references by -0.045 % in `path` of the
-    installed Mitsuba too (monochromatic: -0.047 +- 0.002, ours -0.0455 +- 0.0002, the reference's standard
-    error 0.0055). The constant one does so in X and Z only (-0.03 to -0.04 %, `path` too), by the conversion
-    of colours: in the monochromatic variant both are at +0.005 +- 0.003 %. The floor of 1e-4 hides biases
-    below 1 % in dark pixels; the mean does not.
+    Expected: at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma (plus 5e-4 for the
+    references' colour conversion). Statistic: Z = |mean - ref| / sqrt(v / seeds + var / 32000 + 1e-4 / spp),
+    v our variance over 16 seeds and var the reference's, Student's t with 15 degrees, Šidák at 0.01 over the
+    pixels: Mitsuba's rule, but with our variance, for `path` has next to none where a bidirectional image has
+    some. With 5e5 samples the rare splats of (1,1) from the sky, 6 % of a pixel each, are too few for
+    Student's t. The floor of 1e-4 hides biases below 1 % in dark pixels; the mean does not.
     """
     compare(DATA / "tests" / "scenes" / f"{name}.xml", colour, skip)
 
@@ -133,10 +127,8 @@ def test_image_is_mitsubas(name, colour, skip):
 @needs(MEDIA_DATA)
 @pytest.mark.parametrize("name, colour, skip", cases(MEDIA_SCENES))
 def test_image_with_media_is_mitsubas(name, colour, skip):
-    """Rationale, expected and statistic as of `test_image_is_mitsubas`: homogeneous fog in a null boundary, a
-    chromatic medium, a grid around a matte ball, under an environment map; the references are by ``volpath``
-    (``volpathmis``).
-    """
+    """Homogeneous fog in a null boundary, a chromatic medium, a grid around a matte ball, under an
+    environment map; the references are by ``volpath`` (``volpathmis``)."""
     compare(MEDIA_DATA / "tests" / "scenes" / f"{name}.xml", colour, skip)
 
 

@@ -9,14 +9,15 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-import views
 from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.sampling import sobol
 from mitsuba_bdpt.transport.photons import photon_guide
 from mitsuba_bdpt.transport.photons.photon import Photon
-from sds_scenes import assert_same_images, ball, images, matte, point, transform, under_glass
+from sds_scenes import ball, images, matte, point, transform, under_glass
 from snapshots import ROUNDING
+
+import scenes
 
 import drjit as dr  # isort: skip
 
@@ -31,7 +32,7 @@ def by_a_mirror(lamp):
     to_world = transform().translate([-1.5, 0, 0.2]).rotate([0, 1, 0], 90).scale([0.2, 1, 1])
     mirror = {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
     scene = under_glass(lamp, mirror=mirror)
-    scene["sensor"] = views.camera(origin=(0, 0, 0.3), target=(-1.5, 0, 0.3), fov=16, size=16)
+    scene["sensor"] = scenes.camera(origin=(0, 0, 0.3), target=(-1.5, 0, 0.3), fov=16, size=16)
     return scene
 
 
@@ -42,10 +43,9 @@ def by_a_mirror(lamp):
     "described, edges", [(through_the_plate, 6), (by_a_mirror, 5)], ids=["plate", "mirror"]
 )
 def test_no_path_is_longer_than_max_depth(described, edges, lamp, way):
-    """Rationale: the edges of a merged path are those of a photon and of a camera vertex, those of a guided
-    path those of two subpaths. Expected: with ``max_depth`` one less than the shortest SDS path the image of
-    the same seed without merging and guiding, to the rounding of sums; another one from there on.
-    """
+    """The edges of a merged path are those of a photon and of a camera vertex, those of a guided path those
+    of two subpaths. With ``max_depth`` one less than the shortest SDS path the image of the same seed without
+    merging and guiding, to the rounding of sums; another one from there on."""
     scene = mi.load_dict(described(lamp))
     for depth in (edges - 1, edges):
         settings = {"max_depth": depth, "skip": "impossible"}
@@ -67,11 +67,9 @@ def random_photons(count, seed=1):
 
 
 def test_all_photons_of_a_disc_are_found():
-    """Rationale: photons lie in grids whose cells double in size with the radius, and a disc meets photons of
-    several grids where the radius grows quickly. Expected: with the steepest radius the total flux in each of
-    4,096 discs about random points is that of a search among all photons, up to the paths' length; the
-    radii of the photons of a hundred discs at least are of two grids.
-    """
+    """Photons lie in grids whose cells double in size with the radius, and a disc meets photons of several
+    grids where the radius grows quickly. The total flux in each of 4,096 discs is that of a search among all
+    photons, up to the paths' length; the photons of a hundred discs at least are of two grids."""
     n, most = 4096, 5
     radius = Footprints((0.0, 0.0, 0.3), 0.0, 0.1, 0.2).radius(4.0)
     found = random_photons(n)
@@ -116,17 +114,16 @@ def lit_by_a_wall():
         "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
         "floor": square([1, 0, 0], [0, 0, 1], 0, 1, matte(0.9)),
         "above the floor": square([2, 0, 0.1], [0, 0, 1], 0, 2.8, clear),
-        "sensor": views.camera("thinlens", origin=(1, 0, 1.2), target=(1, 0, 0), **lens),
+        "sensor": scenes.camera("thinlens", origin=(1, 0, 1.2), target=(1, 0, 0), **lens),
     }
     return mi.load_dict({"type": "scene", **parts})
 
 
 def test_light_subpaths_with_two_diffuse_vertices(monkeypatch):
-    """Rationale: guided s = 0 makes a path at the last vertex from the camera whose event is not delta, so of
-    the diffuse vertices of a light subpath t = 0 has to count it at the first alone. The guide makes
-    directions at the floor alone, where none of them leads to the lamp, and t = 0 has a third of the weight.
-    Expected: the image of the same seed without guiding, to the rounding of sums.
-    """
+    """Guided s = 0 makes a path at the last vertex from the camera whose event is not delta, so of the
+    diffuse vertices of a light subpath t = 0 has to count it at the first alone. The guide makes directions
+    at the floor alone, where none of them leads to the lamp, and t = 0 has a third of the weight: the image
+    of the same seed without guiding, to the rounding of sums."""
 
     def draw(guide, p, found, u1, u2):
         return mi.warp.square_to_uniform_sphere(u2), p.x > -0.5
@@ -142,16 +139,3 @@ def test_light_subpaths_with_two_diffuse_vertices(monkeypatch):
     found = images(scene, 256, 1, guiding="always", **settings)
     np.testing.assert_allclose(found, expected, **ROUNDING)
     assert (expected > 0).sum() > 8
-
-
-def test_a_sun_with_hide_emitters():
-    """Rationale: what is hidden is the sky that a camera ray meets first, not what guided subpaths find. An
-    `envmap` that is black but for a sun of 11 degrees, which the plate does not mirror into the camera.
-    Expected: the same tiles with guiding and without.
-    """
-    pixels = np.zeros((33, 64, 3), dtype=np.float32)
-    pixels[10:12, 8:10] = 200.0
-    sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels), "to_world": transform().rotate([1, 0, 0], 90)}
-    scene = mi.load_dict(under_glass(sky))
-    given, other = {"guiding": "always"}, {"guiding": "emission"}
-    assert_same_images(scene, given, other, spp=32, seeds=6, hide_emitters=True)

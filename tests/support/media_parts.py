@@ -5,33 +5,24 @@ Objects of one variant are of no use in another: everything is made on demand.
 
 from __future__ import annotations
 
+import drjit as dr
 import internals
 import mitsuba as mi
 import numpy as np
-import views
 import welch as st
+
+from scenes import camera, matte, rgb, transform
+from scenes import thinlens as lens
 
 SIZE, TILES = 16, 4
 
 
-def transform():
-    return mi.ScalarTransform4f()
-
-
-def rgb(*value):
-    return {"type": "rgb", "value": list(value)}
-
-
-def matte(*value):
-    return {"type": "diffuse", "reflectance": rgb(*value)}
-
-
 def sensor(near=0.1, **more):
-    return views.camera(near=near, **more)
+    return camera(near=near, **more)
 
 
 def thinlens(near=0.1, **more):
-    return views.thinlens(near=near, **more)
+    return lens(near=near, **more)
 
 
 def fog(sigma_t=0.5, albedo=0.8, g=0.3, **more):
@@ -155,3 +146,66 @@ def images(scene, method, spp, first_seed, seeds):
 def tile_means(scene, method, spp, first_seed, seeds):
     """Tile means of renders, (seeds, tiles, channels)."""
     return np.stack([st.tile_means(image, TILES) for image in images(scene, method, spp, first_seed, seeds)])
+
+
+def open_air(light, **more):
+    """A matte ball in the open, under a sky or a sun."""
+    light = {"sky": sky, "sun": sun}[light]()
+    eye = sensor(origin=(0, 0.3, 2.5), target=(0, 0, 0), fov=30, size=8)
+    return {
+        "type": "scene",
+        "sensor": eye,
+        "matte": ball(matte(0.7, 0.5, 0.3), 0.4, (0, 0, 0)),
+        "light": light,
+    } | more
+
+
+_registered = set()
+
+
+def register_plugins():
+    """Register ``own_phase`` and ``own_fog`` for the current variant."""
+    if mi.variant() in _registered:
+        return
+    _registered.add(mi.variant())
+
+    class OwnPhase(mi.PhaseFunction):
+        """(1 + a cos) / 4 pi, cos of the angle that light is turned by."""
+
+        def __init__(self, props):
+            super().__init__(props)
+            self.a = mi.Float(props.get("a", 0.8))
+            self.m_flags = mi.PhaseFunctionFlags.Anisotropic
+
+        def eval_pdf(self, ctx, mei, wo, active=True):
+            density = (1 - self.a * dr.dot(mei.wi, wo)) / (4 * dr.pi)
+            return mi.Spectrum(density), density
+
+        def sample(self, ctx, mei, sample1, sample2, active=True):
+            cos = (dr.sqrt(dr.square(1 - self.a) + 4 * self.a * sample2.x) - 1) / self.a
+            sin, phi = dr.safe_sqrt(1 - cos * cos), 2 * dr.pi * sample2.y
+            d = mi.Vector3f(sin * dr.cos(phi), sin * dr.sin(phi), cos)
+            wo = mi.Frame3f(-mei.wi).to_world(d)
+            return wo, mi.Spectrum(1), (1 + self.a * cos) / (4 * dr.pi)
+
+    class OwnFog(mi.Medium):
+        """Gray and homogeneous, by the calls that ``volpath`` makes."""
+
+        def __init__(self, props):
+            super().__init__(props)
+            self.extinction, self.albedo = (mi.Float(props.get(name)) for name in ("extinction", "albedo"))
+            self.m_is_homogeneous, self.m_has_spectral_extinction = True, False
+            self.m_sample_emitters = True
+
+        def intersect_aabb(self, ray):
+            return mi.Bool(True), mi.Float(0), mi.Float(dr.inf)
+
+        def get_majorant(self, mei, active=True):
+            return mi.Spectrum(self.extinction)
+
+        def get_scattering_coefficients(self, mei, active=True):
+            sigma_t = mi.Spectrum(self.extinction)
+            return sigma_t * self.albedo, mi.Spectrum(0), sigma_t
+
+    mi.register_phase("own_phase", OwnPhase)
+    mi.register_medium("own_fog", OwnFog)

@@ -6,8 +6,9 @@ from functools import cache
 import internals
 import mitsuba as mi
 import numpy as np
-import views
 import welch as st
+
+from scenes import camera, transform
 
 LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 
@@ -15,10 +16,6 @@ LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 ASIDE = [5.0, 0.0, 4.5]
 
 IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
-
-
-def transform():
-    return mi.ScalarTransform4f()
 
 
 def matte(value=ALBEDO):
@@ -55,7 +52,7 @@ def glass():
 def under_glass(light, floor=None, plate=None, kind="perspective", **more):
     """The scene; ``more`` of its entries."""
     lens = {"aperture_radius": 0.3, "focus_distance": 3.0} if kind == "thinlens" else {}
-    eye = views.camera(kind, origin=CAMERA, target=(0, 0, 0), fov=FOV, size=SIZE, **lens)
+    eye = camera(kind, origin=CAMERA, target=(0, 0, 0), fov=FOV, size=SIZE, **lens)
     to_world = transform().translate([0, 0, 0.5]).scale([4, 4, THICKNESS / 2])
     return {
         "type": "scene",
