@@ -114,8 +114,8 @@ GLASS = {"type": "dielectric", "int_ior": 1.5}
 PLASTIC = {"type": "plastic", "diffuse_reflectance": 0.6}
 
 # In the open, longer paths come in lumps too rare for tile means to be normal; beside delta surfaces none is
-# compared. On the glowing wall `path` is 0.25 % too bright: it samples a sphere's inside by an area density, and
-# takes back another.
+# compared. On the glowing wall `path` is 0.25 % too bright: it samples a sphere's inside by an area density,
+# and takes back another.
 SURFACES = {
     "quad and disk lamps": Scene(squares),
     "glowing wall": Scene(lambda: {"sensor": camera(), "wall": fogs.wall(emitter=area(0.5))}, judge=""),
@@ -190,8 +190,8 @@ def in_fog(parts, alone=0, judge="volpath"):
     return Scene(parts, alone, judge, depth=4, seeds=12)  # which see all planted bugs
 
 
-# Balls and boxes with a boundary of plugin null are lit by a point: `volpath` is .6 % too dark behind them under
-# a lamp of some area, see `test_known_answers.test_fog_lit_by_a_lamp`. Of microflakes Mitsuba samples another
+# Balls and boxes with a boundary of plugin null are lit by a point: `volpath` is .6 % too dark behind them
+# under a lamp of some area, see `test_known_answers.test_fog_lit_by_a_lamp`. Of microflakes Mitsuba samples another
 # distribution than their density, see `test_media.test_our_frames_make_microflakes_sample_their_density`.
 MEDIA = {
     "fog": in_fog(fogs.foggy, 4),
