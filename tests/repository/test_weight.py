@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 41458}
-MOST_WORDS = 29076
+OUTSIDE = {"scripts": 2931, "tests": 38945}
+MOST_WORDS = 29068
 
 
 def _lines(files):

@@ -9,12 +9,11 @@ import drjit as dr
 import internals
 import mitsuba as mi
 import numpy as np
-import welch as st
 
 from scenes import camera, matte, rgb, transform
 from scenes import thinlens as lens
 
-SIZE, TILES = 16, 4
+SIZE = 16
 
 
 def sensor(near=0.1, **more):
@@ -141,11 +140,6 @@ def images(scene, method, spp, first_seed, seeds):
             for i in range(seeds)
         ]
     )
-
-
-def tile_means(scene, method, spp, first_seed, seeds):
-    """Tile means of renders, (seeds, tiles, channels)."""
-    return np.stack([st.tile_means(image, TILES) for image in images(scene, method, spp, first_seed, seeds)])
 
 
 def open_air(light, **more):

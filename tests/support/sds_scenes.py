@@ -1,7 +1,6 @@
 """Scenes of SDS paths: a floor under a plate of glass, lamp and camera above."""
 
 import json
-from functools import cache
 
 import internals
 import mitsuba as mi
@@ -79,12 +78,6 @@ def images(scene, spp, seeds=8, first=0, merges=True, **parameters):
     scene = mi.load_dict(scene) if isinstance(scene, dict) else scene
     method = internals.bdpt(**{"max_depth": 6, "rr_depth": 100, **parameters})
     return rendered(method, scene, spp, seeds, first, merges)[..., 0]
-
-
-def assert_same_images(scene, given, other, at_least=16, size=4, **both):
-    """Expects the same tiles of ``size`` pixels, by Welch's test, with these parameters of `images`."""
-    a, b = images(scene, **both, **given), images(scene, first=100, **both, **other)
-    st.assert_agree(st.compare_images(st.tiles(a, size), st.tiles(b, size)), at_least=at_least)
 
 
 def guided(samples):
@@ -176,9 +169,6 @@ def steel(alpha):
     return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
 
 
-# Choices of strategies and weights that change no expectation.
-STRATEGIES = ({"skip": "none"}, {"light_paths": 0}, {"connections": "none"}, {"heuristic": "power"})
-
 # Near-specular lobes, between what is a delta lobe and what is none.
 NEAR_SPECULAR = {
     "alpha .005": {"plate": rough(0.005)},
@@ -192,14 +182,3 @@ NEAR_SPECULAR = {
     "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
     "lens": {"plate": rough(0.02), "kind": "thinlens"},
 }
-
-
-@cache
-def near_specular_scene(case):
-    return mi.load_dict(under_glass(ball(), **NEAR_SPECULAR[case]))
-
-
-@cache
-def without_photons(case):
-    """Tiles of `near_specular_scene` without photons."""
-    return st.tiles(images(near_specular_scene(case), 256, 8, first=100, guiding="never"))
