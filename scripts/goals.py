@@ -23,10 +23,9 @@ from mitsuba_bdpt.measure.analysis import (
     efficiency,
     summary,
 )
-from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL
-from mitsuba_bdpt.measure.record import Error
-from mitsuba_bdpt.measure.report import KINDS, pilot_percent
-from mitsuba_bdpt.measure.tables import met_text, ranged, ratio, table
+from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL, KINDS, Error
+from mitsuba_bdpt.measure.report import pilot_percent
+from mitsuba_bdpt.measure.tables import met_text, ratio, table
 from scipy import stats
 
 
@@ -40,7 +39,7 @@ class Measured:
 
 def _measured(
     figures: Mapping[str, Callable[[], Summary]],
-    show: Callable[[Summary], str] = ranged,
+    show: Callable[[Summary], str] = str,
     value: Callable[[Summary], float] = attrgetter("median"),
     join: str = ", ",
 ) -> Measured:
@@ -64,7 +63,7 @@ def over_path(results: Results, scene: str, error: Error = "rel_mse_trimmed") ->
     lacks = results.path_lacks(scene)
     rival = results.tracer(scene)
     found = results.against_path(scene, error)
-    return Measured(ranged(found) + (f"; `{rival}`: {lacks}" if lacks else ""), [found.median])
+    return Measured(f"{found}" + (f"; `{rival}`: {lacks}" if lacks else ""), [found.median])
 
 
 # Pairs required near 1, until the interval of their median is this narrow.
@@ -102,7 +101,7 @@ def worst(results: Results) -> Measured:
 
 def against_none(results: Results) -> Measured:
     """Geometric means over all scenes, by which it is judged, and over those without media."""
-    plain = [scene for scene in results.scenes if not any(results.of(scene, name) for name in MEDIA_RIVALS)]
+    plain = [scene for scene in results.scenes if not results.present(scene, MEDIA_RIVALS)]
     every = _mean_over_none(results, results.scenes)
     if not 0 < len(plain) < len(results.scenes):
         return every
@@ -151,14 +150,14 @@ def costs(results: Results, scene: str) -> Measured:
     """Times of a sample over `path`'s."""
     path, *sides = (results.of(scene, way, results.deciding) for way in (RIVALS[0], NONE, IMPOSSIBLE))
     found = [cost(side, path) for side in sides]
-    return Measured(" / ".join(map(ranged, found)), [one.median for one in found])
+    return Measured(" / ".join(map(str, found)), [one.median for one in found])
 
 
 def pilot(results: Results, scene: str) -> Measured:
     """The pilot's share of renders, judged by the longest."""
     shares: dict[int, float] = {}
     for budget in (results.deciding, 4 * results.deciding):
-        if rows := results.of(scene, results.methods[0], budget):
+        if len(rows := results.of(scene, results.methods[0], budget)):
             shares[budget] = pilot_percent(rows)
     if not shares:
         raise Unavailable(f"no render of {scene}")
@@ -169,7 +168,7 @@ def pilot(results: Results, scene: str) -> Measured:
 def floor(results: Results) -> Measured:
     """Kernel time over that of its rays alone."""
     found = {name: summary(v) for name, v in results.probed("floor").items()}
-    text = ", ".join(f"{ranged(one)} `{name}`" for name, one in found.items())
+    text = ", ".join(f"{one} `{name}`" for name, one in found.items())
     return Measured(text, [one.median for one in found.values()])
 
 
@@ -178,7 +177,7 @@ def coldstart(results: Results) -> Measured:
     values = results.probed("coldstart")
     ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
     seconds = float(np.median(values["bdpt"]))
-    return Measured(f"{seconds:.2f} s, {ranged(ratios)} `path`'s", [seconds, ratios.median])
+    return Measured(f"{seconds:.2f} s, {ratios} `path`'s", [seconds, ratios.median])
 
 
 def memory(results: Results) -> Measured:

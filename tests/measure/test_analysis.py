@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import goals
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet
+import pandas as pd
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
@@ -20,6 +19,7 @@ from mitsuba_bdpt.measure.analysis import Results, Unavailable
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import Reference
+from mitsuba_bdpt.measure.report import Report
 from mitsuba_bdpt.measure.results import load
 from mitsuba_bdpt.measure.scenes import digest
 
@@ -63,6 +63,12 @@ def runs(method, count, **values):
     return [row(method, seed, **values) for seed in range(1, count + 1)]
 
 
+def results_of(rows, references=None, probes=None, **more):
+    return Results(
+        pd.DataFrame(rows), {"box": KNOWN} if references is None else references, probes or {}, **more
+    )
+
+
 def noisy(method, count, factor=1.0, **values):
     """Rows whose tile means are 2 * factor with a standard deviation of 1 %."""
     rng = np.random.default_rng(len(method))
@@ -83,39 +89,39 @@ def test_efficiency_pairs_the_seeds():
     0.1: 5. Seed 3 has no partner. Median 4, extremes 3 and 5.
     """
     theirs = [row("path", 1, seconds=2.0, rel_mse=0.03), row("path", 2, rel_mse=0.1)]
-    found = analysis.efficiency(runs("bdpt", 3), theirs, "rel_mse")
+    found = results_of(runs("bdpt", 3) + theirs).efficiency("box", "path", "rel_mse")
     assert (found.median, found.smallest, found.largest, found.count) == pytest.approx((4, 3, 5, 2))
 
 
 def test_efficiency_is_refused_where_it_means_nothing():
     """An exact render, a single one."""
-    with pytest.raises(Unavailable, match="path is exact here"):
-        analysis.efficiency(runs("bdpt", 2), runs("path", 2, rel_mse=0.0), "rel_mse")
-    with pytest.raises(Unavailable, match="fewer than two renders"):
-        analysis.efficiency(runs("bdpt", 2), runs("path", 1), "rel_mse")
+    for theirs, why in (
+        (runs("path", 2, rel_mse=0.0), "path is exact here"),
+        (runs("path", 1), "two renders"),
+    ):
+        with pytest.raises(Unavailable, match=why):
+            results_of(runs("bdpt", 2) + theirs).efficiency("box", "path", "rel_mse")
 
 
 def test_the_references_own_error_is_subtracted():
     """Errors of 0.02 and 0.05 of which the reference carries 0.01: 0.04 / 0.01."""
-    ours, theirs = (
-        runs(method, 2, reference_rel_mse=0.01, rel_mse=error)
-        for method, error in (("bdpt", 0.02), ("path", 0.05))
-    )
-    assert analysis.efficiency(ours, theirs, "rel_mse").median == pytest.approx(4)
-    assert analysis.efficiency(ours, theirs, "rel_mse_trimmed").median == pytest.approx(1)
+    own = {"reference_rel_mse": 0.01}
+    found = results_of(runs("bdpt", 2, **own, rel_mse=0.02) + runs("path", 2, **own, rel_mse=0.05))
+    assert found.efficiency("box", "path", "rel_mse").median == pytest.approx(4)
+    assert found.efficiency("box", "path").median == pytest.approx(1)
 
 
 def test_the_gap_is_what_the_worst_values_carry():
     """Raw over trimmed errors of 2, 4 and 9: median 4. What the reference carries is no part of it."""
     rows = [row(seed=seed, rel_mse=0.02 * times) for seed, times in enumerate((2, 9, 4))]
-    found = analysis.gap(rows)
+    found = results_of(rows).gap("box", "bdpt")
     assert (found.median, found.smallest, found.largest, found.count) == pytest.approx((4, 2, 9, 3))
     noisy = [r | {"reference_rel_mse": 0.005, "rel_mse": r["rel_mse"] + 0.005} for r in rows]
-    assert analysis.gap(noisy).median == pytest.approx(4)
-    with pytest.raises(Unavailable, match="bdpt is exact here"):
-        analysis.gap([r | {"rel_mse": 0.0, "rel_mse_trimmed": 0.0} for r in rows])
-    with pytest.raises(Unavailable, match="fewer than two renders"):
-        analysis.gap(rows[:1])
+    assert results_of(noisy).gap("box", "bdpt").median == pytest.approx(4)
+    exact = [r | {"rel_mse": 0.0, "rel_mse_trimmed": 0.0} for r in rows]
+    for few, why in ((exact, "bdpt is exact here"), (rows[:1], "fewer than two renders")):
+        with pytest.raises(Unavailable, match=why):
+            results_of(few).gap("box", "bdpt")
 
 
 def test_scenes_with_the_largest_gap_come_first():
@@ -124,10 +130,9 @@ def test_scenes_with_the_largest_gap_come_first():
     rows += [r | {"scene": "alone"} for r in runs("bdpt", 1)]
     spots = runs("bdpt", 2, rel_mse=0.16) + runs("path", 2, rel_mse=0.04)
     rows += [r | {"scene": "spots"} for r in spots]
-    found = Results(rows, {}, {})
+    found = results_of(rows, {})
     assert found.by_gap("bdpt") == ["spots", "even", "alone"]
     text = report.gaps_table(found)
-    assert [line.split("`")[1] for line in text.splitlines()[2:]] == ["spots", "even", "alone"]
     assert cells(text, "`spots`") == ["8x (8–8; n = 2)", "2x (2–2; n = 2)"]
     assert cells(text, "`alone`") == ["fewer than two renders: seeds = 2 or more"] * 2
 
@@ -136,14 +141,14 @@ def test_widths_are_those_of_the_interval_of_the_median():
     """Ratios 1, 1, 1 have an interval of width 0; of 1, 2, 3 the bootstrap's goes from 1 to 3."""
     rows = runs("bdpt", 3) + runs("path", 3)
     rows += [row("other", seed, rel_mse_trimmed=0.02 * seed) for seed in (1, 2, 3)]
-    found = analysis.widths(rows, ("bdpt", "path", "other"))
+    found = analysis.widths(pd.DataFrame(rows), ("bdpt", "path", "other"))
     assert found == pytest.approx({"path": 0.0, "other": 2.0})
 
 
 def test_cost_is_per_sample():
     """1 s for 64 samples against 2 s for 256: 2x."""
-    found = analysis.cost(runs("bdpt", 2), runs("path", 2, seconds=2.0, spp=256))
-    assert found.median == pytest.approx(2)
+    sides = runs("bdpt", 2), runs("path", 2, seconds=2.0, spp=256)
+    assert analysis.cost(*map(pd.DataFrame, sides)).median == pytest.approx(2)
 
 
 def test_convergence_without_the_references_error():
@@ -151,22 +156,22 @@ def test_convergence_without_the_references_error():
     rows = []
     for spp, error in ((4, 0.08), (16, 0.02), (64, 0.005)):
         rows += runs("bdpt", 5, budget=spp, spp=spp, rel_mse=error + 1.9e-4, reference_rel_mse=1.9e-4)
-    found = analysis.convergence(rows)
+    found = results_of(rows).convergence("box", "bdpt")
     assert (found.value, found.low, found.high) == pytest.approx((-1, -1, -1))
-    few = tables.said(analysis.convergence, [r for r in rows if r["seed"] < 5])
-    assert few == "-1.00 (too few renders for an interval)"
+    few = results_of([r for r in rows if r["seed"] < 5]).convergence("box", "bdpt")
+    assert f"{few}" == "-1.00 (too few renders for an interval)"
     with pytest.raises(Unavailable, match="fewer than two budgets"):
-        analysis.convergence([r for r in rows if r["budget"] == 4])
+        results_of([r for r in rows if r["budget"] == 4]).convergence("box", "bdpt")
 
 
 def test_bias_takes_the_budget_with_most_samples():
     """Of 9 renders of 4 samples, 8 of 16 and 5 of 64 those of 16: only they are 5 % dark."""
-    rows = noisy("a", 9, spp=4, budget=4) + noisy("b", 8, 0.95, spp=16, budget=16) + noisy("c", 5)
-    found = analysis.bias(rows, KNOWN)
+    rows = noisy("path", 9, spp=4, budget=4) + noisy("path", 8, 0.95, spp=16, budget=16) + noisy("path", 5)
+    found = results_of(rows).bias("box", "path")
     assert not found.passed and found.missing.value == pytest.approx(0.05, abs=0.005)
-    assert analysis.bias(rows[:9], KNOWN).passed
+    assert results_of(rows[:9]).bias("box", "path").passed
     with pytest.raises(Unavailable, match="fewer than 8 renders"):
-        analysis.bias(rows[-5:], KNOWN)
+        results_of(rows[-5:]).bias("box", "path")
 
 
 @pytest.fixture
@@ -184,7 +189,7 @@ def results():
     kept = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
     probes = {"coldstart": {"versions": kept, "values": values}}
     probes["floor"] = {"versions": kept, "values": {"box": [1.4, 1.2, 1.3]}}
-    return Results(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes, ASIDE)
+    return results_of(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes, aside=ASIDE)
 
 
 ASIDE = "bdpt skip=none", "ptracer", "bdpt skip=impossible", "bdpt guiding=photons", "bdpt merging"
@@ -201,7 +206,7 @@ def test_the_stronger_path_decides(results):
     assert results.against_path("dark").bound == "≥" and "is missing" in results.path_lacks("dark")
     with pytest.raises(Unavailable, match="not rendered"):
         results.bias("pool", "path")
-    few = Results(runs("bdpt", 3) + runs("path", 3, rel_mse=0.1), {"box": KNOWN}, {})
+    few = results_of(runs("bdpt", 3) + runs("path", 3, rel_mse=0.1))
     assert few.efficiency("box", "path", "rel_mse").median == pytest.approx(5)
 
 
@@ -217,7 +222,7 @@ def test_the_report_says_which_source_measured_what():
         keys = ("scene", "machine", "source")
         rows = [dict(zip(keys, row, strict=True)) for row in rows]
         rows = [row | {"versions": json.dumps({"mitsuba": "1", "source": row["source"]})} for row in rows]
-        return report.machine(SimpleNamespace(rows=rows))
+        return report.machine(pd.DataFrame(rows))
 
     assert said(("a", "m", "x"), ("b", "m", "x")) == "m; mitsuba 1, source x"
     anew = said(("a", "m", "x"), ("b", "m", "x"), ("c", "m", "y"))
@@ -228,10 +233,10 @@ def test_the_report_says_which_source_measured_what():
         said(("a", "m", "x"), ("b", "other", "x"))
 
 
-def cells(text, first):
-    """The cells of the row of a Markdown table that begins so."""
-    (line,) = [line for line in text.splitlines() if line.startswith(f"| {first} |")]
-    return [cell.strip() for cell in line.split("|")[2:-1]]
+def cells(text, first, place=0):
+    """The cells of the row of a Markdown table that begins so, of several tables of the ``place``-th."""
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    return [line[1:] for line in lines if line[:1] == [first]][place]
 
 
 def test_scenes_with_media_have_a_table_of_their_own(results):
@@ -242,11 +247,15 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
         + runs("volpath", 3, rel_mse_trimmed=0.1)
         + runs("volpathmis", 3, rel_mse_trimmed=0.06)
     )
-    rows = results.rows + [r | {"scene": "fog"} for r in fog]
+    rows = pd.concat([results.rows, pd.DataFrame(fog).assign(scene="fog")])
     both = replace(results, rows=rows, references=results.references | {"fog": KNOWN})
     text = report.efficiency_table(both)
     assert text.startswith(report.efficiency_table(results).rstrip("\n"))
-    assert "| scene | over volpath, trimmed | over volpath, raw | over volpathmis, trimmed |" in text
+    assert cells(text, "scene", 1)[:3] == [
+        "over volpath, trimmed",
+        "over volpath, raw",
+        "over volpathmis, trimmed",
+    ]
     assert cells(text, "`fog`")[:3:2] == ["5x (5–5; n = 3)", "3x (3–3; n = 3)"]
     assert both.against_path("fog").median == pytest.approx(3)
     assert both.against_path("box").median == pytest.approx(0.8)
@@ -307,7 +316,7 @@ def test_goals_stand_beside_what_is_measured(results):
 def test_slopes_need_an_explanation():
     """Errors that fall as samples^-2: marked where slopes are explained in notes, unless this one is."""
     rows = runs("bdpt", 5, budget=4, spp=4) + runs("bdpt", 5, rel_mse=0.02 / 256)
-    results = Results(rows, {"box": KNOWN}, {})
+    results = results_of(rows)
     for notes, expected in (({"pool": "x"}, ", **unexplained**"), ({"box": "points"}, ""), ({}, "")):
         assert (
             cells(report.checks_table(results, MADE, notes), "`box`")[1]
@@ -318,7 +327,7 @@ def test_slopes_need_an_explanation():
 def test_slopes_between_decisions():
     """Rationale: budgets at which something else is skipped are not one method. Expected: said so."""
     rows = runs("bdpt", 5, budget=4, spp=4, decisions="[]") + runs("bdpt", 5, rel_mse=0.02 / 256)
-    text = report.checks_table(Results(rows, {"box": KNOWN}, {}), MADE, {})
+    text = report.checks_table(results_of(rows), MADE, {})
     assert cells(text, "`box`")[1].endswith("(-2.00 to -2.00), between decisions")
     assert "ptracer" not in text and "skip=none" not in text  # not rendered
 
@@ -332,21 +341,22 @@ def test_choices_and_the_cost_of_the_pilot():
         "statistics": json.dumps({"skipped": [reason]}),
     }
     rows = [row(seed=seed, seconds_pilot=0.25, **more) for seed, more in ((1, alone), (2, {}), (3, {}))]
-    results = Results(rows, {"box": KNOWN}, {})
+    results = results_of(rows)
     found = cells(report.choices_table(results), "`box`")
     assert found[0] == "light_paths=1/4, connections=one (2); light_paths=0, connections=none (1)"
     assert found[1] == "t<=1" and found[2] == "20.0 %"
     assert found[3] == "0.16 + 0.16; 0.16 + 0.16 + 0.16" and len(found) == 4
     assert goals.pilot(results, "box") == goals.Measured("20.0 % at 64 spp", [20.0])
     with pytest.raises(Unavailable, match="cached no pilots"):
-        goals.pilot(Results([row(seed=1)], {"box": KNOWN}, {}), "box")
+        goals.pilot(results_of([row(seed=1)]), "box")
 
 
 def test_a_bar_in_a_name_ends_no_cell():
     """Expected: escaped, as GitHub's Markdown has it, in code too; a line stays a line."""
-    assert (
-        tables.table(["a|b", "c"], [["`d|e`", "f\ng"]]) == "| a\\|b | c |\n| --- | --- |\n| `d\\|e` | f g |\n"
-    )
+    head, _, line = tables.table(["a|b", "c"], [["`d|e`", "f\ng"]]).splitlines()
+    assert [cell.strip() for cell in re.split(r"(?<!\\)\|", head + line)] == [
+        *("", "a\\|b", "c", "", "`d\\|e`", "f g", ""),
+    ]
 
 
 def test_integrators_are_in_the_order_of_the_preset():
@@ -354,17 +364,17 @@ def test_integrators_are_in_the_order_of_the_preset():
     scene with media the order of its rows, those of the preset."""
     plain = [row for name in ("bdpt", "path", "merging", "all") for row in runs(name, 3)]
     fog = [row | {"scene": "fog"} for name in ("bdpt", "volpath", "all") for row in runs(name, 3)]
-    found = Results(plain + fog, {"box": KNOWN, "fog": KNOWN}, {})
+    found = results_of(plain + fog, {"box": KNOWN, "fog": KNOWN}, {})
     assert found.methods == ["bdpt", "path", "merging", "volpath", "all"]
-    lines = [line.split(" | ") for line in report.errors_table(found).splitlines()]
-    assert [line[1] for line in lines if line[0] == "| `fog`"] == ["bdpt", "volpath", "all"]
+    text = report.errors_table(found)
+    assert [cells(text, "`fog`", i)[0] for i in range(3)] == ["bdpt", "volpath", "all"]
 
 
 def test_what_a_biased_integrator_lacks_is_said():
     """Too dark, too bright, and right as a whole but wrong in a tile."""
 
     def lacks(rows):
-        return Results(rows, {"box": KNOWN}, {}).lacks("box", "path")
+        return results_of(rows).lacks("box", "path")
 
     assert lacks(noisy("path", 12, 0.95)).startswith("4.9 % of the energy is missing")
     assert lacks(noisy("path", 12, 1.1)).startswith("10 % too much energy")
@@ -399,11 +409,11 @@ def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
     assert every.rivals[:2] == ["path", "path multijitter"]
     assert set(every.rivals) == {*every.methods[1:]} and "ptracer" in every.rivals
     text = report.efficiency_table(every)
-    assert "| over bdpt merging, trimmed |" in text and text.count("over bdpt skip=none, trimmed |") == 1
+    assert "| over bdpt merging, trimmed " in text and text.count("over bdpt skip=none, trimmed") == 1
     assert "efficiency over ptracer" not in report.checks_table(every, MADE, {})
     assert "efficiency over ptracer" in report.checks_table(results, MADE, {})
     for text in (report.checks_table(every, MADE, {}), report.checks_table(results, MADE, {})):
-        assert "| bdpt skip=none over path |" in text
+        assert "| bdpt skip=none over path " in text
 
 
 def test_a_sweep_that_was_cut_has_figures():
@@ -411,13 +421,13 @@ def test_a_sweep_that_was_cut_has_figures():
     renders" in every cell. Expected: figures are of the largest budget of two renders of each integrator,
     also where one integrator has a single render at any budget; of all where there are no pairs."""
     small, large = ([*runs("bdpt", 2, budget=n), *runs("path", 2, budget=n)] for n in (16, 64))
-    assert Results([*small, *large[:3]], {}, {}).deciding == 16
-    assert Results([*small, *large], {}, {}).deciding == 64
-    assert Results([*small, *large, row("bdpt skip=none", 1, budget=16)], {}, {}).deciding == 64
-    assert Results([*large[:1], *large[2:3], row(budget=4)], {}, {}).deciding == 64
-    assert Results([*small, *large], {}, {}, compared=16).deciding == 16
+    assert results_of([*small, *large[:3]], {}).deciding == 16
+    assert results_of([*small, *large], {}).deciding == 64
+    assert results_of([*small, *large, row("bdpt skip=none", 1, budget=16)], {}).deciding == 64
+    assert results_of([*large[:1], *large[2:3], row(budget=4)], {}).deciding == 64
+    assert results_of([*small, *large], {}, compared=16).deciding == 16
     with pytest.raises(CommandError, match="spp=32 must be one of 16, 64"):
-        _ = Results([*small, *large], {}, {}, compared=32).deciding
+        _ = results_of([*small, *large], {}, compared=32).deciding
 
 
 def test_cells_are_numbers_where_nothing_is_wrong():
@@ -425,15 +435,15 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % / sqrt(3);
     no verdict of so few, or by a reference of few renders, or of a single render."""
     rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), variance=0.02) for i in (1, 2, 3)]
-    found = Results(rows, {"box": KNOWN}, {})
+    found = results_of(rows)
     energy = found.surplus("box", "bdpt")
     assert (energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
     checks = report.checks_table(found, MADE, {})
     assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
     with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
-        Results(rows, {}, {}).surplus("box", "bdpt")
+        results_of(rows, {}, {}).surplus("box", "bdpt")
     with pytest.raises(Unavailable, match="fewer than two renders"):
-        Results(rows[:1], {"box": KNOWN}, {}).surplus("box", "bdpt")
+        results_of(rows[:1]).surplus("box", "bdpt")
 
 
 def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
@@ -444,7 +454,7 @@ def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
     file = reference.reference_path(Project(tmp_path), "box", 8, 3)
     reference.write(file, kept)
     table = [r | {"reference_sha256": digest(file)} for r in runs("bdpt", 2)]
-    pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
+    pd.DataFrame(table).to_parquet(tmp_path / "rows.parquet")
     found, made = load(Project(tmp_path), tmp_path)
     assert found.scenes == ["box"] == list(made) and not found.references
     with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
@@ -469,22 +479,21 @@ def test_other_programs_are_noticed(wall, processor, is_busy):
         row("path", i, seconds=w, cpu_seconds=c) for i, (w, c) in enumerate(zip(wall, processor, strict=True))
     ]
     rows = runs("bdpt", len(wall), cpu_seconds=1.0) + rows
-    found = Results(rows, {"box": KNOWN}, {})
-    text = report.busy_text(found)
+    found = results_of(rows)
+    text = "; ".join(report.disturbed(found))
     assert bool(text) == is_busy
     if is_busy:
-        assert "`box`: path 1.6–4.6 s (processor 3.2–3.4 s). " in text
-        assert 'clock = "processor"' in text and "bdpt" not in text
-        assert not report.busy_text(replace(found, aside=("path",)))
-        page = report.page(found, {"box": image_of_two()}, {}, "Box")
-        assert page.index(text) < page.index("Efficiency is")
+        assert text == "`box`: path 1.6–4.6 s (processor 3.2–3.4 s)"
+        assert not report.disturbed(replace(found, aside=("path",)))
+        page = Report(found, {"box": image_of_two()}, {}, "Box", {}).text()
+        assert page.index(text) < page.index('clock = "processor"') < page.index("Efficiency is")
 
 
 def test_a_report_of_one_integrator_compares_none(capsys):
     """Expected: a sentence in place of a table without columns; the sweep says so too."""
-    found = Results(runs("bdpt", 2), {"box": KNOWN}, {})
+    found = results_of(runs("bdpt", 2))
     assert "no integrator to compare bdpt with" in report.efficiency_table(found)
-    table = [one | {"parameters": "{}"} for one in found.rows]
+    table = found.rows.assign(parameters="{}")
     sweep._tell(SimpleNamespace(cut={}, scenes=[], failed=[], output="results"), table)  # pyright: ignore
     assert "bdpt is the only integrator" in capsys.readouterr().out
 
@@ -499,7 +508,7 @@ def test_a_path_tracer_is_known_by_its_type():
         for name, kind in ways.items()
         for seed in (1, 2)
     ]
-    results = Results(found, {"box": KNOWN}, {})
+    results = results_of(found)
     assert results.standard == ["path", "my tracer"] and results.tracer("box") == "path"
     assert results.against_path("box").median == pytest.approx(1.5)
     assert report.stronger(results) == "the strongest of path, my tracer"
@@ -513,13 +522,12 @@ def image_of_two():
 def test_a_report_is_written(results, tmp_path):
     """Expected: from the data of a folder the page, the plots, and the project's README's parts; a page of
     the user's own is not overwritten, one that a report has written is."""
-    only = [r for r in results.rows if r["scene"] == "box"]
     provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096, "scene_sha256": "the scene"}
     kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
     file = reference.reference_path(Project(tmp_path), "box", 8, 3)
     reference.write(file, kept)
-    table = [r | {"reference_sha256": digest(file)} for r in only]
-    pyarrow.parquet.write_table(pa.Table.from_pylist(table), tmp_path / "rows.parquet")
+    table = results.rows[results.rows["scene"] == "box"].assign(reference_sha256=digest(file))
+    table.to_parquet(tmp_path / "rows.parquet")
     (tmp_path / "probes.json").write_text(json.dumps(results.probes))
     (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
@@ -535,20 +543,18 @@ def test_a_report_is_written(results, tmp_path):
     assert [report.run(options), report.run(options)] == [0, 0]
     page = (tmp_path / "README.md").read_text()
     assert "* `box`: why" in page
-    assert "| `box` | 3 | `path` | 4096 | 0.0e+00 | 0.04 |" in page
+    assert cells(page.partition("## References")[2], "`box`") == ["3", "`path`", "4096", "0.0e+00", "0.04"]
     assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
+    found = Report.of(Project(tmp_path), tmp_path)
     for text, message in (
-        (
-            "<!-- report: nothing -->\n<!-- end -->\n",
-            "there is no part 'nothing'; there are efficiency",
-        ),
+        ("<!-- report: nothing -->\n<!-- end -->\n", "there is no part 'nothing'; there are efficiency"),
         ("# Mine\n", "TOP.md has no `<!-- report: NAME -->`"),
     ):
         readme.write_text(text)
         with pytest.raises(CommandError, match=message):
-            report.run(options)
+            report._filled(readme, found)
     readme.write_text("<!-- report: errors -->\n<!-- end -->\n<!-- report: first images -->\n<!-- end -->\n")
-    assert report.run(options) == 0 and "| squared bias |" in readme.read_text()
+    assert " squared bias " in report._filled(readme, found)
     for name in ("efficiency", "seconds", "samples", "rays"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
         assert f"({name}.png)" in page
@@ -558,6 +564,7 @@ def test_a_report_is_written(results, tmp_path):
         ValueError, match="in box were taken against another reference; run mitsuba-bdpt sweep"
     ):
         report.run(options)
+    reference.write(file, kept)
     (tmp_path / "notes.toml").write_text('nowhere = "why"\n')
     with pytest.raises(ValueError, match="'nowhere' is not among the scenes"):
-        report.page(results, {}, {"nowhere": "why"}, "mine")
+        report.run(options)

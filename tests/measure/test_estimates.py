@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
+import pandas as pd
 import pytest
-from mitsuba_bdpt.measure import analysis, estimates, metrics, tables
+from mitsuba_bdpt.measure import analysis, estimates, metrics
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
@@ -29,7 +30,7 @@ def halves(sigma, truth=TRUTH):
 def rows_of(images, reference, method="bdpt"):
     """What a sweep stores of the images of one budget."""
     spread = metrics.spread(images, reference.image) if len(images) > 1 else [None]
-    return [
+    rows = [
         {
             "scene": "box",
             "method": method,
@@ -44,6 +45,11 @@ def rows_of(images, reference, method="bdpt"):
         }
         for seed, image in enumerate(images, 1)
     ]
+    return pd.DataFrame(rows)
+
+
+def results_of(reference, *rows):
+    return Results(pd.concat(rows, ignore_index=True), {"box": reference.means}, {})
 
 
 def known(deviation, reference):
@@ -53,8 +59,7 @@ def known(deviation, reference):
 
 
 def cell(images, reference, error="rel_mse", method="bdpt"):
-    rows = rows_of(images, reference, method)
-    return Results(rows, {"box": reference.means}, {}).error("box", method, error)
+    return results_of(reference, rows_of(images, reference, method)).error("box", method, error)
 
 
 @pytest.mark.parametrize("own", [0.01, 0.05, 0.07])
@@ -98,7 +103,7 @@ def test_variance_and_bias_apart(own, count):
     assert found.total.value == pytest.approx(found.variance.value + found.squared_bias.value)
     assert found.squared_bias.low < found.squared_bias.value < found.squared_bias.high
     assert cell(images, reference, "rel_mse_trimmed").bound == "≥"
-    results = Results(rows_of(images, reference), {"box": reference.means}, {})
+    results = results_of(reference, rows_of(images, reference))
     assert ("% of the energy is missing" in results.lacks("box", "bdpt")) == (count == 12)
 
 
@@ -153,11 +158,10 @@ def test_rare_light_that_was_not_met_is_a_lower_bound():
     dark[:32, :32] *= 0.8
     ours = [TRUTH + noise(seed, 0.02) for seed in range(5)]
     theirs = [dark + noise(100 + seed) for seed in range(5)]
-    rows = rows_of(ours, reference) + rows_of(theirs, reference, "path")
-    results = Results(rows, {"box": reference.means}, {})
+    results = results_of(reference, rows_of(ours, reference), rows_of(theirs, reference, "path"))
     found = results.efficiency("box", "path", "rel_mse")
     assert found.bound == "≥" and found.median == pytest.approx(25 * 2, rel=0.05)
-    assert tables.ranged(found).startswith("≥ ")
+    assert f"{found}".startswith("≥ ")
     alone = analysis.efficiency(results.of("box", "bdpt"), results.of("box", "path"), "rel_mse")
     assert alone.bound == "" and alone.median == pytest.approx(25, rel=0.05)
 
@@ -179,9 +183,9 @@ def test_what_both_lack_is_no_difference():
     """Two integrators without a tenth of the light, of 10 % and 20 % noise. Expected: raw, the ratio of the
     variances, 4, without a bound; by the errors to the truth it would be (4 + 1) / (1 + 1)."""
     reference = halves(0.01)
-    rows = rows_of([0.9 * TRUTH + noise(seed) for seed in range(8)], reference)
-    rows += rows_of([0.9 * TRUTH + noise(50 + seed, 0.2) for seed in range(8)], reference, "path")
-    results = Results(rows, {"box": reference.means}, {})
+    ours = rows_of([0.9 * TRUTH + noise(seed) for seed in range(8)], reference)
+    theirs = rows_of([0.9 * TRUTH + noise(50 + seed, 0.2) for seed in range(8)], reference, "path")
+    results = results_of(reference, ours, theirs)
     found = results.efficiency("box", "path", "rel_mse")
     assert found.bound == "" and found.median == pytest.approx(4, rel=0.05)
     assert results.efficiency("box", "path").bound == "~"
@@ -197,9 +201,9 @@ def test_each_seed_has_its_own_fireflies():
     rows = rows_of(images, reference)
     values, bound = estimates.seed_errors(rows, "rel_mse", False)
     expected = known(0.1 * TRUTH, reference)
-    assert bound == "" and np.mean(values) == pytest.approx(np.mean([row["variance"] for row in rows]))
+    assert bound == "" and np.mean(values) == pytest.approx(rows["variance"].mean())
     assert np.delete(values, 2) == pytest.approx(expected, rel=0.06)
-    assert values[2] > 100 * expected and rows[0]["variance"] > 2 * expected
+    assert values[2] > 100 * expected and rows["variance"][0] > 2 * expected
 
 
 def test_a_reference_noisier_than_the_renders():
@@ -220,13 +224,12 @@ def test_one_and_two_renders():
     one = cell(images[:1], reference)
     assert one.total.value == pytest.approx(known(0.1 * TRUTH, reference), rel=0.05)
     assert (one.total.low, one.total.high, one.variance) == (0, math.inf, None)
-    assert tables.relative(one).endswith("(one render)")
+    assert f"{one}".endswith("(one render)")
     two = cell(images, reference)
     assert two.variance.value == pytest.approx(known(0.1 * TRUTH, reference), rel=0.05)
     assert two.total.low < two.total.value < two.total.high < math.inf
     assert two.total.value == pytest.approx(two.variance.value + two.squared_bias.value)
-    assert tables.positive(two.variance, 2).endswith("(too few renders for an interval)")
-    assert tables.squared(two.squared_bias, 2).endswith("(too few renders for an interval)")
+    assert all(part.endswith("(too few renders for an interval)") for part in two.parts)
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -240,12 +243,12 @@ def test_an_untested_error_has_the_bias(count):
     expected = 2 * known(0.1 * TRUTH, reference)
     found = cell(images, reference)
     assert found.bound == "" and found.total.value == pytest.approx(expected, rel=0.05)
-    rows = rows_of([TRUTH + noise(50 + seed) for seed in range(count)], reference)
-    rows += rows_of(images, reference, "path")
-    values, _ = estimates.seed_errors(rows[count:], "rel_mse", False)
-    assert values == pytest.approx([expected] * count, rel=0.05)
+    theirs = rows_of(images, reference, "path")
+    values, _ = estimates.seed_errors(theirs, "rel_mse", False)
+    assert list(values) == pytest.approx([expected] * count, rel=0.05)
     if count == 2:
-        ratio = Results(rows, {"box": reference.means}, {}).efficiency("box", "path", "rel_mse")
+        ours = rows_of([TRUTH + noise(50 + seed) for seed in range(count)], reference)
+        ratio = results_of(reference, ours, theirs).efficiency("box", "path", "rel_mse")
         assert ratio.bound == "" and ratio.median == pytest.approx(2, rel=0.08)
 
 
@@ -261,7 +264,7 @@ def test_two_renders_and_a_noisier_reference():
 def spreads(values):
     """The column `variance` of renders (n, pixels)."""
     n = len(values)
-    return [{"variance": x} for x in n / (n - 1) * ((values - values.mean(0)) ** 2).mean(1)]
+    return pd.DataFrame({"variance": n / (n - 1) * ((values - values.mean(0)) ** 2).mean(1)})
 
 
 @pytest.mark.parametrize(

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import pandas as pd
 import pytest
 from mitsuba_bdpt import measure
 from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import FailureError, UsageTypeError
-from mitsuba_bdpt.measure import estimates, options, sweep, tables
+from mitsuba_bdpt.measure import estimates, options, sweep
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.reference import read_reference
 from mitsuba_bdpt.measure.results import relative_errors
@@ -126,12 +127,13 @@ def test_measurements_take_dictionaries(here):
     table = measure.compare_integrators(
         [room(), named], "bdpt", {"type": "path", "sampler": "stratified"}, spp=4, pairs=1, **common
     )
-    assert "| `mine` | 4 |" in table and "| `scene_" in table
+    assert table.count("\n| `mine` ") == 1 and "\n| `scene_" in table
     path, bdpt = measure.compare_at_equal_time(named, spp=4, **common)
     assert (path.name, bdpt.name, bdpt.spp) == ("path", "bdpt", 4) and bdpt.image.shape == (4, 8, 3)
     kept = read_reference(Path("project/references/mine_8_3.exr"))
-    error = estimates.relative_error([relative_errors(bdpt.image, kept)], "rel_mse_trimmed", False)
-    assert bdpt.error == error and f"relMSE {tables.brief(error)} (trimmed)" in bdpt.caption
+    row = pd.DataFrame([relative_errors(bdpt.image, kept)])
+    error = estimates.relative_error(row, "rel_mse_trimmed", False)
+    assert bdpt.error == error and f"relMSE {error.brief} (trimmed)" in bdpt.caption
     images = measure.render_pyramid(named, spp=1, max_depth=2, **common)
     assert images["weighted"].keys() == images["unweighted"].keys() >= {(2, 1, 2)}
     assert {"equal_time_mine.png", "pyramid_mine.exr"} <= {p.name for p in Path("project/renders").iterdir()}
@@ -142,11 +144,11 @@ def test_a_sweep_takes_dictionaries(here):
     Path("mine.toml").write_text(PRESET)
     dictionaries = [measure.SceneDict("room", room())]
     rows = measure.run_sweep("mine.toml", dictionaries, reference_seconds=0, output=Path("rows"))
-    assert [row["seed"] for row in rows] == [1, 2] and all(row["rel_mse"] > 0 for row in rows)
-    assert json.loads(rows[0]["parameters"]) == {"type": "bdpt"}
+    assert rows["seed"].tolist() == [1, 2] and (rows["rel_mse"] > 0).all()
+    assert json.loads(rows["parameters"][0]) == {"type": "bdpt"}
     content = {"resolution": 8, "spp": [4], "seeds": 2, "max_depth": 3, "integrator": [{"type": "bdpt"}]}
     again = measure.run_sweep(content, dictionaries, reference_seconds=0, output=Path("rows"))
-    assert [row["key"] for row in again] == [row["key"] for row in rows]  # nothing is rendered anew
+    assert again["key"].tolist() == rows["key"].tolist()  # nothing is rendered anew
     with pytest.raises(ValueError, match="scheduler=x:1 with scene='room', a dictionary"):
         measure.run_sweep("mine.toml", dictionaries, scheduler="x:1")
 

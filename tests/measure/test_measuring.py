@@ -12,6 +12,7 @@ from pathlib import Path
 import fireflies
 import mitsuba as mi
 import numpy as np
+import pandas as pd
 import pyarrow.parquet
 import pytest
 from mitsuba_bdpt.cli import measuring
@@ -561,8 +562,8 @@ def test_samples_of_a_render_that_stops_are_its_own(here):
     own = '[[integrator]]\ntype = "bdpt"\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
-    (row,) = pyarrow.parquet.read_table(here / "out" / "rows.parquet").to_pylist()
-    assert (row["budget"], row["spp"]) == (256, 32) and sweep.short_of_target([row]) == []
+    rows = pd.read_parquet(here / "out" / "rows.parquet")
+    assert (rows["budget"][0], rows["spp"][0]) == (256, 32) and sweep.short_of_target(rows) == []
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own.replace("100.0", "1e-9"))
     said = command("sweep", "mine", "--project", "project", "-o", "out")
     assert "room, 256 spp, bdpt: 1 of 1 renders did not reach target_error=1e-09\n" in said

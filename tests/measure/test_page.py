@@ -88,15 +88,12 @@ def fake_scene(name, **images):
 
 
 def written(tmp_path, rows, scenes):
-    data = json.dumps({"columns": list(page.COLUMNS), "rows": rows, "scenes": scenes}).replace("</", "<\\/")
-    text = page.FRAME.read_text()
-    for name in ("TITLE", "ANSWERS", "REPORT"):
-        text = text.replace(f"@{name}@", f"<b>{name.lower()}</b>" if name != "TITLE" else "A sweep")
-    text = (
-        text.replace("@DATA@", data).replace("<head>", f"<head>{WATCH}").replace("</body>", f"{PROBE}</body>")
-    )
+    data = {"columns": list(page.COLUMNS), "rows": rows, "scenes": scenes}
+    text = page.filled(title="A sweep", answers={"box": "<1x>"}, report="", data=data)
     file = tmp_path / "page.html"
-    file.write_text(text)
+    file.write_text(
+        text.replace("<head>", f"<head>{WATCH}").replace("</body>", f"{PROBE}</body>"), encoding="utf-8"
+    )
     return file
 
 
@@ -150,7 +147,7 @@ def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):
     (tmp_path / "page.html").write_text("<title>mine</title>")
     assert main(["page", str(tmp_path)]) == 2
     assert "page.html' exists and was made by something else; move it away, or" in capsys.readouterr().err
-    assert "<title>@TITLE@</title>" in page.FRAME.read_text()
+    assert "<title>{{ title }}</title>" in page.FRAME.read_text()
 
 
 def test_images_are_half_precision():

@@ -15,6 +15,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import OpenEXR
+import pandas as pd
 import pyarrow
 import pyarrow.parquet
 import pytest
@@ -40,7 +41,7 @@ from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.models import PresetFile
 from mitsuba_bdpt.measure.preset import Cells, preset_of, read_preset
 from mitsuba_bdpt.measure.project import Project
-from mitsuba_bdpt.measure.results import errors, keep_missing, load, lost, write_tables
+from mitsuba_bdpt.measure.results import errors, keep_missing, load, lost, missing_of, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
 
@@ -856,8 +857,8 @@ def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
     seconds = {row["method"]: row["seconds_first_image"] for row in found}
     assert seconds == {"ours": 3.0, "path": 1.5} and len(asked) == 6
     assert {(one["spp"], one["resolution"], one["max_depth"]) for one in asked} == {(2, 8, 3)}
-    text = report.first_images_table(analysis.Results(found, {}, {}))
-    assert "| `cornell_box` | 3 s | 1.5 s, 2x |" in text
+    text = report.first_images_table(analysis.Results(pd.DataFrame(found), {}, {}))
+    assert [cell.strip() for cell in text.splitlines()[-2].split("|")[2:4]] == ["3 s", "1.5 s, 2x"]
     text = PRESET.replace("seeds = 2", 'seeds = 2\nfirst_image = 3\nclock = "processor"')
     assert swept(preset_file(folder, text), "-o", folder / "out") == 0
     found = pyarrow.parquet.read_table(folder / "out" / "rows.parquet").to_pylist()
@@ -919,7 +920,7 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
             clock[0] += spent
 
         monkeypatch.setattr(sweep.Sweep, "prepare", prepared)
-        monkeypatch.setattr(sweep.Sweep, "rows", lambda self: [])
+        monkeypatch.setattr(sweep.Sweep, "rows", lambda self: pd.DataFrame())
         asked = build_parser().parse_args(["sweep", "x", "--seconds", "100", "-o", str(tmp_path / "out")])
         sweep.swept(REPOSITORY, str(preset_file(tmp_path, text)), asked)
         assert limits[-1] == left
@@ -955,7 +956,7 @@ def test_the_table_is_tidy(tmp_path):
     mine = tmp_path / "images" / "mine.exr"
     mine.touch()
     for seed in (3, 1):
-        write_tables([row | {"seed": seed}, row | {"seed": 2, "key": "gone"}], tmp_path)
+        write_tables(pd.DataFrame([row | {"seed": seed}, row | {"seed": 2, "key": "gone"}]), tmp_path)
     first, second = csv.DictReader((tmp_path / "rows.csv").read_text().splitlines())
     assert not [cell for cell in first.values() if set(cell) & set("{}[]")]
     assert first["sampler"] == "multijitter"
@@ -991,7 +992,7 @@ def test_samplers_of_rows_are_those_of_the_table(folder, job, swept, more, point
     before = table.set_column(place, "sampler", pyarrow.array(["independent"] * 4))
     pyarrow.parquet.write_table(before, output / "rows.parquet")
     found, _ = load(Project(folder), output)
-    assert {row["method"]: row["sampler"] for row in found.rows} == expected
+    assert dict(zip(found.rows["method"], found.rows["sampler"], strict=True)) == expected
     assert lost(found.rows, output) == []
     assert swept(path, "-o", output) == 0
     agree()
@@ -1121,16 +1122,14 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, s
     words = path, "-o", output
     assert swept(*words, "--seconds", "1e-9") == 0
     assert "cut for lack of time: cornell_box, 4 of 8 renders: 4 at 4 spp" in capsys.readouterr().out
-    text = report.missing_text(output)
-    assert text.startswith(
-        "**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders: 4 at 4 spp"
-    )
-    assert re.search(
-        f"by `mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds [1-9][0-9]*`", text
-    )
+    text = report.Report.of(Project(folder), output).text()
+    assert "**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders: 4 at 4 spp." in text
+    command = f"mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds [1-9][0-9]*"
+    assert re.search(f" Render them by `{command}`.\n\n", text)
+    missing = missing_of(output)
     keep_missing(output, ["another"], {}, "")
-    assert report.missing_text(output) == text
-    assert swept(*words) == 0 and report.missing_text(output) == ""
+    assert missing_of(output) == missing != {}
+    assert swept(*words) == 0 and missing_of(output) == {}
     assert "warning" not in capsys.readouterr().out
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "ptracer"'))
     assert swept(path, "-o", output) == 0

@@ -5,6 +5,7 @@ import runpy
 import shlex
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
 import floor
@@ -12,6 +13,7 @@ import matplotlib.image
 import mitsuba as mi
 import mutants
 import numpy as np
+import pandas as pd
 import pytest
 import versus
 from mitsuba_bdpt.cli import mistakes
@@ -166,13 +168,11 @@ def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, 
 
 
 def test_a_comparison_with_what_has_no_error_is_refused():
-    """Rationale: 0 / 0 and 1 / 0 stood in the table. Expected: words instead of figures, in a whole line."""
-
-    image = np.ones((8, 8, 3))
-    exact = Reference(image, 0 * image, None, {})
-    line = compare.line("furnace_white", [lambda spp, seed: Timed(image, 1.0, 1.0)] * 2, exact, 4, 2)
-    assert len(line) == len(compare.HEADS) and line[:2] == ["`furnace_white`", "4"]
-    assert "exactly that of the reference" in line[2]
+    """Rationale: 0 / 0 and 1 / 0 stood in the table. Expected: words instead of figures."""
+    exact = pd.DataFrame({"rel_mse_trimmed": [0.0, 0.0]})
+    assert list(compare.line(exact, exact).values()) == [
+        "every value (trimmed) is exactly that of the reference"
+    ]
 
 
 @pytest.mark.parametrize(("second", "ratio", "bounds"), [(0.1, 4.0, ("", "")), (0.02, None, ("≥", "≤"))])
@@ -190,12 +190,13 @@ def test_a_comparison_is_of_the_errors_of_reports(second, ratio, bounds):
     a, b = noisy(0.1 * 2**0.5), noisy(0.1 * 2**0.5)
     kept = Reference((a + b) / 2, (a - b) / 2, None, {})
     sides = [lambda spp, seed, sigma=sigma: Timed(noisy(sigma), 1.0, 1.0) for sigma in (0.2, second)]
-    cells = dict(zip(compare.HEADS, compare.line("box", sides, kept, 4, 3), strict=True))
-    for kind, bound in (("error", bounds[0]), ("raw error", bounds[0])):
-        *mark, value = cells[kind].split()
-        assert "".join(mark) == bound and (ratio is None or float(value) == pytest.approx(ratio, rel=0.1))
-    assert cells["raw efficiency"].split()[:-1] == [bounds[1]] * bool(bounds[1])
-    assert ratio is None or float(cells["raw efficiency"]) == pytest.approx(1 / ratio, rel=0.1)
+    cells = compare.line(*compare.measured([partial(side, 4) for side in sides], kept, 3))
+    for kind in ("trimmed", "raw"):
+        *mark, value = cells[f"{kind} error"].split()
+        assert "".join(mark) == bounds[0] and (ratio is None or float(value) == pytest.approx(ratio, rel=0.1))
+        *mark, value, _ = cells[f"{kind} efficiency (quartiles)"].split()
+        assert "".join(mark) == bounds[1]
+        assert ratio is None or float(value) == pytest.approx(1 / ratio, rel=0.1)
 
 
 def test_the_floor_is_recorded_in_a_variant(monkeypatch):

@@ -17,7 +17,10 @@ from ..measure import options
 from . import mistakes
 from .values import property_
 
-NEEDED = ("colour", "flip_evaluator", "markdown_it", "matplotlib", "pyarrow", "pydantic", "scipy")
+NEEDED = (
+    *("colour", "flip_evaluator", "jinja2", "markdown_it", "matplotlib", "pandas", "pyarrow", "pydantic"),
+    *("scipy", "tabulate"),
+)
 """What the extra ``[measure]`` installs, as modules."""
 
 

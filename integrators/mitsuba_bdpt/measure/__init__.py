@@ -22,8 +22,8 @@ Needs the extra ``[measure]``. Within the package nothing but the commands impor
 * Renders: `timing` (a render, and several sides in turns), `probes` (renders in new processes).
 * Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
   made).
-* Sweeps: `models` (contents of TOML files), `preset` (which renders), `sweep`, `results` (the record of a
-  render, and the files of them).
+* Sweeps: `models` (contents of TOML files), `preset` (which renders), `sweep`, `results` (their files and
+  tables).
 * Reports: `analysis` (figures, or why there are none), `tables`, `figures` (plots), `crops` (images side by
   side), `paper` (widths and formats for print), `report` (Markdown), `page` (HTML).
 * A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.

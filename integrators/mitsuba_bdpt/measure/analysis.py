@@ -1,37 +1,41 @@
 """Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
-Pure functions; a row is a dictionary. Efficiency = 1 / (seconds * error), with the errors of `estimates`.
-Comparisons pair renders of equal seed, which ran consecutively. Raises `Unavailable`, with the reason,
-for figures that cannot be computed.
+Rows are a frame with the columns of rows.parquet. Efficiency = 1 / (seconds * error), with the errors of
+`estimates`. Comparisons pair renders of equal seed, which ran consecutively. Raises `Unavailable`, with the
+reason, for figures that cannot be computed.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
 
 from ..errors import CommandError
 from .agreement import FEWEST_RUNS, BiasCheck, Means, compare_means, missing_energy
 from .estimates import (
+    FEWEST_TESTED,
     FEWEST_WITH_INTERVAL,
     Bound,
+    Error,
     RelativeError,
     bootstrap,
     bound_of_ratio,
+    compared,
     mean_differs,
+    means_of,
     relative_error,
     seed_errors,
-    unlike,
 )
-from .metrics import Estimate, values_of
-from .record import Error, Row
+from .metrics import Estimate
+from .tables import ratio
 
 # Names of the integrators that reports compare with, as in presets/benchmark.toml.
 RIVALS = ("path", "path multijitter")
@@ -52,26 +56,20 @@ class Unavailable(CommandError):
     """A figure that cannot be computed from the data; the text has the reason."""
 
 
-def slope(samples: Iterable[float], errors: Iterable[Iterable[float]]) -> Estimate:
+def slope(samples: Iterable[float], errors: Iterable[ArrayLike]) -> Estimate:
     """Exponent of error ~ samples^slope; -1 for squared errors of Monte Carlo.
 
-    ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs; of a dict
-    {spp: errors}, ``slope(runs.keys(), runs.values())``. Least squares of log(error) over log(samples), a
-    point per run: sum (x - mean x) y / sum (x - mean x)^2.
+    ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs. Least
+    squares of log(error) over log(samples), a point per run: sum (x - mean x) y / sum (x - mean x)^2.
 
     The 95 % interval is the `bootstrap`'s, of runs drawn with replacement within each count. Deviations from
     a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs: resampling k values has only
     (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993,
     sections 9 and 13.
     """
-    x = np.log(values_of("samples", samples, 2, 0))
-    y = [np.log(values_of(f"errors[{i}]", row, 2, 0)) for i, row in enumerate(errors)]
-    if len(y) != len(x):
-        raise CommandError(f"errors has {len(y)} rows for {len(x)} samples; give one row for each.")
+    x, y = np.log([*samples]), [np.log(row) for row in errors]
     runs = np.array([len(row) for row in y])
     offset = x - np.average(x, weights=runs)
-    if np.ptp(x) == 0:
-        raise CommandError("samples are all the same; a slope needs at least two different counts.")
     weight = runs * offset / np.sum(runs * offset**2)
     wide = [row.mean() + (row - row.mean()) * math.sqrt(len(row) / (len(row) - 1)) for row in y]
 
@@ -79,15 +77,6 @@ def slope(samples: Iterable[float], errors: Iterable[Iterable[float]]) -> Estima
         return sum(w * row.mean(axis) for w, row in zip(weight, rows, strict=True))
 
     return bootstrap(wide, fitted)
-
-
-def bootstrap_median(values: Iterable[float]) -> Estimate:
-    """Return the median of a few values and its 95 % bootstrap interval.
-
-    It lies within the range of the n values, which contains the median with probability 1 - 2^(1 - n): 94 %
-    for 5, 99.8 % for 10. Source: as `slope`, section 13.
-    """
-    return bootstrap([values_of("values", values, 2)], np.median)
 
 
 @dataclass(frozen=True)
@@ -105,153 +94,92 @@ class Summary:
     count: int
     bound: Bound = ""
 
-
-def summary(values: Sequence[float]) -> Summary:
-    """Return the `Summary` of at least two values."""
-    middle = bootstrap_median(values)
-    return Summary(middle.value, middle.low, middle.high, min(values), max(values), len(values))
-
-
-def select(rows: Iterable[Row], **wanted: object) -> list[Row]:
-    return [row for row in rows if wanted.items() <= row.items()]
+    def __str__(self) -> str:
+        few = f"; n = {self.count}" if self.count < FEWEST_WITH_INTERVAL else ""
+        ends = f"{ratio(self.smallest)[:-1]}–{ratio(self.largest)[:-1]}{few}"
+        return f"{self.bound} {ratio(self.median)} ({ends})".lstrip()
 
 
-def paired(ours: Sequence[Row], theirs: Sequence[Row]) -> list[tuple[Row, Row]]:
-    """Return pairs of renders with equal seeds; raises `Unavailable` for less than two."""
-    by_seed = {row["seed"]: row for row in theirs}
-    pairs = [(row, by_seed[row["seed"]]) for row in ours if row["seed"] in by_seed]
-    if len(pairs) < 2:
+def summary(values: Sequence[float] | pd.Series) -> Summary:
+    """Return the `Summary` of at least two values; the interval is the `bootstrap`'s.
+
+    It lies within the range of the n values, which contains the median with probability 1 - 2^(1 - n): 94 %
+    for 5, 99.8 % for 10. Source: as `slope`, section 13.
+    """
+    middle = bootstrap([np.asarray(values)], np.median)
+    ends = float(min(values)), float(max(values))
+    return Summary(middle.value, middle.low, middle.high, *ends, len(values))
+
+
+def _ratios(over: pd.Series, under: pd.Series) -> pd.Series:
+    """Return the ratios of values by seed, of seeds that both have; at least two."""
+    found = (over.reindex(under.index) / under).dropna()
+    if len(found) < 2:
         raise Unavailable("fewer than two pairs of seeds")
-    return pairs
-
-
-def _ratios(
-    ours: Sequence[Row], theirs: Sequence[Row], error: Error, differ: tuple[bool, bool]
-) -> tuple[list[float], Bound]:
-    """Return the ratio of efficiencies 1 / (seconds * error) of each pair, ours over theirs, and its bound.
-
-    Also the ratio of errors at equal time, and of times at equal error, if errors fall as 1 / time, which
-    `slope` tests. Raises `Unavailable` for errors of 0.
-    """
-    by_seed: list[dict[int, float]] = []
-    bounds: list[Bound] = []
-    for rows, differs in zip((ours, theirs), differ, strict=True):
-        errors, bound = seed_errors(rows, error, differs)
-        if min(errors) == 0:
-            raise Unavailable(f"{rows[0]['method']} is exact here")
-        by_seed.append({row["seed"]: x * row["seconds"] for row, x in zip(rows, errors, strict=True)})
-        bounds.append(bound)
-    ratios = [by_seed[1][b["seed"]] / by_seed[0][a["seed"]] for a, b in paired(ours, theirs)]
-    return ratios, bound_of_ratio(bounds[1], bounds[0])
-
-
-def efficiency(
-    ours: Sequence[Row],
-    theirs: Sequence[Row],
-    error: Error = "rel_mse_trimmed",
-    differ: tuple[bool, bool] = (False, False),
-) -> Summary:
-    """Return the summary of the ratios of efficiencies, ours over theirs, of pairs of seeds.
-
-    ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises `Unavailable` for
-    fewer than two pairs, and for errors of 0.
-    """
-    if len(ours) < 2 or len(theirs) < 2:
-        raise Unavailable(ALONE_HERE)
-    ratios, bound = _ratios(ours, theirs, error, differ)
-    return replace(summary(ratios), bound=bound)
-
-
-def gap(rows: Sequence[Row], differs: bool = False) -> Summary:
-    """Return the summary of raw over trimmed relMSE: large where few values carry most of the error."""
-    if len(rows) < 2:
-        raise Unavailable(ALONE_HERE)
-    (raw, _), (trimmed, _) = (seed_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
-    if min(*raw, *trimmed) == 0:
-        raise Unavailable(f"{rows[0]['method']} is exact here")
-    return summary([a / b for a, b in zip(raw, trimmed, strict=True)])
-
-
-def widths(rows: Sequence[Row], methods: Sequence[str]) -> dict[str, float]:
-    """Return the interval widths of median efficiency ratios (trimmed), by rival.
-
-    Ratios of the first method over each other one.
-    """
-    ours = select(rows, method=methods[0])
-    found: dict[str, float] = {}
-    for name in methods[1:]:
-        ratios, _ = _ratios(ours, select(rows, method=name), "rel_mse_trimmed", (False, False))
-        middle = bootstrap_median(ratios)
-        found[name] = middle.high - middle.low
     return found
 
 
-def cost(ours: Sequence[Row], theirs: Sequence[Row]) -> Summary:
+def _errors(
+    rows: pd.DataFrame, kind: Error = "rel_mse_trimmed", differs: bool = False
+) -> tuple[pd.Series, Bound]:
+    """Return the errors of at least two renders by seed, above 0, and their bound."""
+    if len(rows) < 2:
+        raise Unavailable(ALONE_HERE)
+    errors, bound = seed_errors(rows, kind, differs)
+    if errors.min() == 0:
+        raise Unavailable(f"{rows['method'].iloc[0]} is exact here")
+    return errors.set_axis(rows["seed"]), bound
+
+
+def efficiency(
+    ours: pd.DataFrame,
+    theirs: pd.DataFrame,
+    error: Error = "rel_mse_trimmed",
+    differ: tuple[bool, bool] = (False, False),
+) -> Summary:
+    """Return the ratios of efficiencies 1 / (seconds * error), ours over theirs, of pairs of seeds.
+
+    Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time, which
+    `slope` tests. ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises
+    `Unavailable` for fewer than two pairs, and for errors of 0.
+    """
+    sides = [_errors(rows, error, differs) for rows, differs in zip((ours, theirs), differ, strict=True)]
+    (own, under), (other, over) = sides
+    first, second = (rows.set_index("seed")["seconds"] for rows in (ours, theirs))
+    return replace(summary(_ratios(other * second, own * first)), bound=bound_of_ratio(over, under))
+
+
+def widths(rows: pd.DataFrame, methods: Sequence[str]) -> dict[str, float]:
+    """Return the interval widths of median efficiency ratios (trimmed) of the first method, by rival."""
+    ours, *others = (rows[rows["method"] == name] for name in methods)
+    found = [efficiency(ours, theirs) for theirs in others]
+    return {name: one.high - one.low for name, one in zip(methods[1:], found, strict=True)}
+
+
+def cost(ours: pd.DataFrame, theirs: pd.DataFrame) -> Summary:
     """Return the summary of the ratio of seconds per sample, over pairs of seeds."""
-    return summary([a["seconds"] / a["spp"] / (b["seconds"] / b["spp"]) for a, b in paired(ours, theirs)])
+    sides = ((rows["seconds"] / rows["spp"]).set_axis(rows["seed"]) for rows in (ours, theirs))
+    return summary(_ratios(*sides))
 
 
-def convergence(
-    rows: Sequence[Row], differs: Callable[[int], bool] = lambda budget: False, error: Error = "rel_mse"
-) -> Estimate:
-    """Return the slope of log(error) over log(samples), over all renders of a method.
-
-    ``differs``: whether the mean differs from the reference at a budget. The interval is infinite where a
-    budget has fewer than `FEWEST_WITH_INTERVAL` renders.
-    """
-    if not rows:
-        raise Unavailable("not rendered")
-    runs: dict[float, list[float]] = {}
-    for budget in sorted({row["budget"] for row in rows}):
-        at = select(rows, budget=budget)
-        errors, _ = seed_errors(at, error, differs(budget))
-        if len(at) >= 2 and min(errors) > 0:
-            runs[float(np.median([row["spp"] for row in at]))] = errors
-    if len(runs) < 2:
-        raise Unavailable("fewer than two budgets with two renders")
-    found = slope(list(runs), list(runs.values()))
-    is_few = min(map(len, runs.values())) < FEWEST_WITH_INTERVAL
-    return Estimate(found.value, -math.inf, math.inf) if is_few else found
-
-
-def bias(rows: Sequence[Row], reference: Means) -> BiasCheck:
-    """Return the bias check of a method in a scene against the reference.
-
-    Uses the largest budget with enough renders.
-    """
-    budgets = {row["budget"]: select(rows, budget=row["budget"]) for row in rows}
-    enough = [at for at in budgets.values() if len(at) >= FEWEST_RUNS]
-    if not enough:
-        raise Unavailable(f"fewer than {FEWEST_RUNS} renders of one budget")
-    best = max(enough, key=lambda at: sum(row["spp"] for row in at))
-    return compare_means(Means.of([row["tile_means"] for row in best]), reference)
-
-
-def _paired_budgets(counts: Iterable[Counter[int]]) -> set[int]:
-    """Return a scene's budgets of two renders each, of integrators with so many at any budget; else all."""
-    found = list(counts)
-    budgets = set[int]().union(*found)
-    several = [of for of in found if max(of.values()) > 1]
-    return {n for n in budgets if all(of[n] > 1 for of in several)} or budgets
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Results:
     """Rows of a sweep, tile means of its references by scene, and results of probes.
 
     ``aside``: integrators of which efficiencies are not compared; ``compared``: the budget of comparisons.
+    Figures that tables share are cached, for the length of a command.
     """
 
-    rows: list[Row]
+    rows: pd.DataFrame
     references: dict[str, Means]
     probes: dict[str, Any]
-    aside: tuple[str, ...] = ()
+    aside: Sequence[str] = ()
     compared: int | None = None
 
     @cached_property
     def scenes(self) -> list[str]:
         """Scenes, in the order of the rows."""
-        return list(dict.fromkeys(row["scene"] for row in self.rows))
+        return list(self.rows["scene"].unique())
 
     @cached_property
     def methods(self) -> list[str]:
@@ -259,9 +187,9 @@ class Results:
 
         In the order of the preset, as far as scenes show it: before those that follow them in a scene.
         """
-        order: list[str] = [self.rows[0]["first"]]
-        for scene in self.scenes:
-            names = list(dict.fromkeys(row["method"] for row in self.rows if row["scene"] == scene))
+        order: list[str] = [self.rows["first"].iloc[0]]
+        for _, found in self.rows.groupby("scene", sort=False)["method"]:
+            names = list(found.unique())
             for i, name in enumerate(names):
                 if name not in order:
                     following = [order.index(later) for later in names[i + 1 :] if later in order[1:]]
@@ -280,7 +208,7 @@ class Results:
     @cached_property
     def at_equal_samples(self) -> list[str]:
         """Integrators with the samples of the first one, not its seconds."""
-        found = {row["method"] for row in self.rows if row.get("match") == "spp"}
+        found = set(self.rows["method"][self.rows["match"] == "spp"]) if "match" in self.rows else ()
         return [name for name in self.methods[1:] if name in found]
 
     @cached_property
@@ -294,8 +222,9 @@ class Results:
 
     def kind(self, method: str) -> str:
         """Return the type of an integrator; of one without parameters, the first word of its name."""
-        given = [row.get("parameters") for row in self.rows if row["method"] == method][:1]
-        return json.loads(given[0])["type"] if given and given[0] else method.split()[0]
+        rows = self.rows[self.rows["method"] == method]
+        has_parameters = "parameters" in rows and len(rows)
+        return json.loads(rows["parameters"].iloc[0])["type"] if has_parameters else method.split()[0]
 
     def tracer(self, scene: str) -> str:
         """Return the type of the last of `standard` in a scene."""
@@ -312,69 +241,80 @@ class Results:
                 return True
         return False
 
+    def present(self, scene: str, methods: Sequence[str], *budget: int) -> list[str]:
+        """Return those of the ``methods`` that were rendered in a scene."""
+        return [name for name in methods if len(self.of(scene, name, *budget))]
+
     def standard_in(self, scene: str) -> list[str]:
         """Return the `standard` integrators that were rendered in a scene."""
-        return [rival for rival in self.standard if self.of(scene, rival)]
+        return self.present(scene, self.standard)
 
     @cached_property
-    def _of(self) -> dict[tuple[str, str], list[Row]]:
-        """Rows by scene and integrator."""
-        found: dict[tuple[str, str], list[Row]] = {}
-        for row in self.rows:
-            found.setdefault((row["scene"], row["method"]), []).append(row)
-        return found
+    def _groups(self) -> dict[Any, pd.DataFrame]:
+        """Rows by scene and integrator, and by budget too."""
+        keys = ["scene", "method", "budget"]
+        return dict(iter(self.rows.groupby(keys[:2]))) | dict(iter(self.rows.groupby(keys)))
+
+    def of(self, scene: str, method: str, *budget: int) -> pd.DataFrame:
+        """Return the rows of an integrator in a scene, of all budgets or of one."""
+        return self._groups.get((scene, method, *budget), self.rows[:0])
 
     @cached_property
     def deciding(self) -> int:
         """The budget of comparisons: ``compared``, or the largest that every scene has, else the largest.
 
         Where a time limit left single renders at some budgets, only budgets with two renders of each
-        integrator count.
+        integrator count, of those with so many at any budget.
         """
-        counts: dict[str, dict[str, Counter[int]]] = {scene: {} for scene in self.scenes}
-        for row in self.rows:
-            counts[row["scene"]].setdefault(row["method"], Counter())[row["budget"]] += 1
-        common = set[int].intersection(*(_paired_budgets(of.values()) for of in counts.values()))
-        every = common or {row["budget"] for row in self.rows}
-        if self.compared is None:
-            return max(every)
-        if self.compared not in every:
-            known = ", ".join(map(str, sorted(every)))
+        every: set[int] = set(self.rows["budget"])
+        common = every
+        for _, rows in self.rows.groupby("scene"):
+            counts = pd.crosstab(rows["method"], rows["budget"])
+            paired = (counts[counts.max(axis=1) > 1] > 1).all()
+            common = common & {*(counts.columns[paired] if paired.any() else counts.columns)}
+        common = common or every
+        if self.compared is not None and self.compared not in common:
+            known = ", ".join(map(str, sorted(common)))
             raise CommandError(
                 f"spp={self.compared} must be one of {known}, of which all scenes have two renders of each "
                 "integrator"
             )
-        return self.compared
-
-    def of(self, scene: str, method: str, budget: int | None = None) -> list[Row]:
-        """Return the rows of an integrator in a scene."""
-        rows = self._of.get((scene, method), [])
-        return rows if budget is None else select(rows, budget=budget)
+        return int(self.compared or max(common))
 
     def bias(self, scene: str, method: str) -> BiasCheck:
-        """Return the bias check against the scene's reference."""
+        """Return the bias check against the scene's reference.
+
+        Uses the budget with the most samples of those with enough renders.
+        """
+        rows = self.of(scene, method)
         if scene not in self.references:
-            there = self.of(scene, method)
-            raise Unavailable(FEW if there else "not rendered")
-        return bias(self.of(scene, method), self.references[scene])
+            raise Unavailable(FEW if len(rows) else "not rendered")
+        samples = rows.groupby("budget", sort=False)["spp"].agg(["size", "sum"])
+        enough = samples["sum"][samples["size"] >= FEWEST_RUNS]
+        if enough.empty:
+            raise Unavailable(f"fewer than {FEWEST_RUNS} renders of one budget")
+        best = self.of(scene, method, enough.index[enough.argmax()])
+        return compare_means(means_of(best), self.references[scene])
 
     def probed(self, name: str) -> dict[str, list[float]]:
         """Return a probe's results for the software of the rows."""
-        probe, row = self.probes.get(name), self.rows[0]
+        probe, row = self.probes.get(name), self.rows.iloc[0]
         if probe is None:
             raise Unavailable("not measured")
         if probe["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
             raise Unavailable("measured of another version or on another machine")
         return probe["values"]
 
+    @cache  # noqa: B019
     def lacks(self, scene: str, method: str) -> str:
         """Describe the energy that an integrator lacks in a scene; empty if the bias check finds nothing."""
         try:
             check = self.bias(scene, method)
         except Unavailable:
             # Too few seeds for a check: only an image that is black where the reference is not fails.
-            rows = self.of(scene, method) if scene in self.references else []
-            return NOTHING if rows and not np.any([row["tile_means"] for row in rows]) else ""
+            rows = self.of(scene, method)
+            is_black = scene in self.references and len(rows) and not np.any([*rows["tile_means"]])
+            return NOTHING if is_black else ""
         return "" if check.passed else missing(check)
 
     def surplus(self, scene: str, method: str) -> Estimate:
@@ -382,25 +322,24 @@ class Results:
 
         At the deciding budget, or the largest of two renders or more.
         """
-        rows = self.of(scene, method)
-        counts = Counter(row["budget"] for row in rows)
-        several = [n for n, count in counts.items() if count > 1]
-        if not several:
+        counts = self.of(scene, method)["budget"].value_counts()
+        several = counts.index[counts > 1]
+        if not len(several):
             raise Unavailable(ALONE_HERE)
         if scene not in self.references:
             raise Unavailable(FEW)
-        budget = self.deciding if counts[self.deciding] > 1 else max(several)
-        columns = [row["tile_means"] for row in select(rows, budget=budget)]
-        share = missing_energy(Means.of(columns, fewest=2).whole, self.references[scene].whole)
+        rows = self.of(scene, method, self.deciding if self.deciding in several else max(several))
+        share = missing_energy(means_of(rows, 2).whole, self.references[scene].whole)
         return Estimate(-share.value, -share.high, -share.low)
 
+    @cache  # noqa: B019
     def differs(self, scene: str, method: str, budget: int | None = None) -> bool:
         """Return whether the mean of an integrator differs from the reference.
 
         By the bias check, or by the renders of one budget alone, by default the deciding one.
         """
         rows, reference = self.of(scene, method, budget or self.deciding), self.references.get(scene)
-        if reference is None or not rows:
+        if reference is None or rows.empty:
             return False
         return bool(self.lacks(scene, method)) or mean_differs(rows, reference)
 
@@ -409,17 +348,34 @@ class Results:
     ) -> RelativeError:
         """Return the relMSE of an integrator at a budget, by default the deciding one."""
         rows = self.of(scene, method, budget or self.deciding)
-        if not rows:
+        if rows.empty:
             raise Unavailable("not rendered")
         return relative_error(rows, error, self.differs(scene, method, budget))
 
     def convergence(self, scene: str, method: str) -> Estimate:
-        """Return the `convergence` of an integrator in a scene."""
-        return convergence(self.of(scene, method), lambda budget: self.differs(scene, method, budget))
+        """Return the `slope` of the raw error over all renders of an integrator in a scene.
+
+        The interval is infinite where a budget has fewer than `FEWEST_WITH_INTERVAL` renders.
+        """
+        rows = self.of(scene, method)
+        if rows.empty:
+            raise Unavailable("not rendered")
+        runs: dict[float, np.ndarray] = {}
+        for budget, at in rows.groupby("budget"):
+            errors, _ = seed_errors(at, "rel_mse", self.differs(scene, method, budget))
+            if len(at) >= 2 and errors.min() > 0:
+                runs[float(at["spp"].median())] = errors.to_numpy()
+        if len(runs) < 2:
+            raise Unavailable("fewer than two budgets with two renders")
+        found = slope(runs, runs.values())
+        is_few = min(map(len, runs.values())) < FEWEST_WITH_INTERVAL
+        return Estimate(found.value, -math.inf, math.inf) if is_few else found
 
     def gap(self, scene: str, method: str) -> Summary:
-        """Return `gap` of an integrator at the deciding budget."""
-        return gap(self.of(scene, method, self.deciding), self.differs(scene, method))
+        """Return raw over trimmed relMSE at the deciding budget: large where few values carry the error."""
+        rows, differs = self.of(scene, method, self.deciding), self.differs(scene, method)
+        (raw, _), (trimmed, _) = (_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
+        return summary(raw / trimmed)
 
     def by_gap(self, method: str) -> list[str]:
         """Return the scenes by decreasing `gap`; those without one are last."""
@@ -432,6 +388,7 @@ class Results:
 
         return sorted(self.scenes, key=size, reverse=True)
 
+    @cache  # noqa: B019
     def efficiency(
         self,
         scene: str,
@@ -448,8 +405,9 @@ class Results:
         first, budget = first or self.methods[0], budget or self.deciding
         ours, theirs = self.of(scene, first, budget), self.of(scene, rival, budget)
         differ = self.differs(scene, first, budget), self.differs(scene, rival, budget)
-        if error == "rel_mse" and all(differ) and not unlike(ours, theirs):
-            differ = False, False
+        if error == "rel_mse" and all(differ) and min(len(ours), len(theirs)) >= FEWEST_TESTED:
+            are_unlike = compared(ours, means_of(theirs))
+            differ = are_unlike, are_unlike
         return efficiency(ours, theirs, error, differ)
 
     def against_path(

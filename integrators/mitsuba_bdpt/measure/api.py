@@ -16,9 +16,10 @@ from . import options as available
 from .options import VARIANT
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from .equal_time import Shot
     from .project import Project
-    from .record import Row
     from .reference import Reference
 
 
@@ -105,11 +106,12 @@ def run_sweep(
     *,
     project: str | Path = ".",
     **options,
-) -> list[Row]:
+) -> pd.DataFrame:
     """Render the missing cells of a preset, a TOML file or a dictionary of its keys.
 
     ``dictionaries``: scenes by name; a preset without ``scenes`` renders all of them. ``options``: those of
-    `options.Sweep`. Returns the rows. Raises ``FailureError`` if a render failed; the other rows are kept.
+    `options.Sweep`. Returns the rows as a pandas frame. Raises ``FailureError`` if a render failed; the
+    other rows are kept.
     """
     from . import sweep as module
 

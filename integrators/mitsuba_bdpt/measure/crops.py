@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,27 +10,26 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 from matplotlib.patches import Rectangle
 
 from ..errors import CommandError
 from .estimates import RelativeError
 from .metrics import rel_mse_epsilon, tone_map
 from .paper import PAPER, WIDTHS, save
-from .tables import brief
 
 WINDOW = 6  # side of a window: this fraction of the image's
 COLOURS = ("#E69F00", "#56B4E9")  # of the two windows
-ERRORS = {"norm": LogNorm(1e-5, 10), "cmap": "viridis"}
+ERRORS = {"norm": LogNorm(1e-5, 10, clip=True), "cmap": "viridis"}
 
-GAP, LINE = 0.03, 0.105  # inches between images, and per line of text
-SCALE = 0.48  # inches of the scale of errors, with its labels in two lines
-CHARACTER = 0.052  # inches
-NARROW = 0.75  # inches of an image below which the scale of errors has two labels
+GAP, LINE, CHARACTER = 0.03, 0.105, 0.052  # inches between images, per line of text, and across
+SCALE = 0.48  # inches of the scale of errors
 SMALL = 6  # points
+
+Window = tuple[int, int, int]
+"""Left, top, side in pixels."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Column:
 
     image: np.ndarray
     caption: tuple[str, ...]
-    errors: np.ndarray
+    errors: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,8 @@ def judged(
     ``error``: the trimmed relMSE that its caption has, that of the tables of reports.
     """
     errors = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
-    figure = f"relMSE {brief(error)} (trimmed)"
-    return Column(image, (name, f"{spp} spp, {seconds:.2g} s", figure), errors)
+    figure = f"relMSE {error.brief} (trimmed)"
+    return Column(image, (name, f"{spp}\u00a0spp, {seconds:.2g}\u00a0s", figure), errors)
 
 
 def _side(height: int, width: int) -> int:
@@ -69,17 +67,16 @@ def _side(height: int, width: int) -> int:
     return max(4, min(height, width) // WINDOW)
 
 
-def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
-    """Return two disjoint windows (left, top, side) of the largest differences of two images of errors.
+def windows(first: np.ndarray, last: np.ndarray) -> list[Window]:
+    """Return two disjoint windows of the largest differences of two images of errors.
 
     At least a side apart, where the image has the room. Compares logarithms, so that no single pixel decides.
     """
-    height, width = first.shape
-    side = _side(height, width)
+    side = _side(*first.shape)
     difference = np.abs(np.log10(first + 1e-4) - np.log10(last + 1e-4))
     sums = np.pad(difference.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
     score = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-    chosen: list[tuple[int, int, int]] = []
+    chosen: list[Window] = []
     for _ in COLOURS:
         for left, top, _ in chosen:
             # Neighbours would show the same: they come after all others, and what overlaps never.
@@ -89,45 +86,6 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[tuple[int, int, int]]:
         top, left = (int(i) for i in np.unravel_index(np.argmax(score), score.shape))
         chosen.append((left, top, side))
     return chosen
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Sizes of a block in inches: width and height of an image, lines of captions."""
-
-    width: float
-    height: float
-    captions: tuple[str, ...]
-    lines: int
-
-    @staticmethod
-    def of(block: Block, wide: float) -> _Layout:
-        count = len(block.columns) + 1
-        width = (wide - (count + 1) * GAP) / count
-        most = max(int(width / CHARACTER), 8)
-        captions = [*(column.caption for column in block.columns), ("reference",)]
-        captions = [[_kept_together(line) for line in one] for one in captions]
-        wrapped = ["\n".join(textwrap.fill(line, most) for line in one) for one in captions]
-        lines = max(text.count("\n") for text in wrapped) + 1
-        return _Layout(width, width * block.target.shape[0] / block.target.shape[1], tuple(wrapped), lines)
-
-    @property
-    def window(self) -> float:
-        return (self.width - GAP) / 2
-
-    @property
-    def head(self) -> float:
-        """Title and captions."""
-        return LINE * (self.lines + 1.6)
-
-    @property
-    def whole(self) -> float:
-        return self.head + self.height + self.window + max(self.height, SCALE) + 3 * GAP
-
-
-def _kept_together(line: str) -> str:
-    """Return a line of a caption in which a number stays in one line with its unit, and with its bound."""
-    return re.sub(r"([≤≥~]) (?=\d)", "\\1\u00a0", re.sub(r"(\d) (s|spp)\b", "\\1\u00a0\\2", line))
 
 
 def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:
@@ -150,8 +108,8 @@ def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:
     return found
 
 
-def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> list[tuple[int, int, int]]:
-    """Return windows (left, top, side) about these places, within the image."""
+def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> list[Window]:
+    """Return windows about these places, within the image."""
     side = _side(height, width)
 
     def start(share: float, size: int) -> int:
@@ -168,73 +126,73 @@ def draw(
     In each, a column per image, the reference last: image, windows, errors in false colours. ``places``:
     centres of the windows, see `centres`; None: where errors differ most.
     """
-    wide = WIDTHS[columns]
-    layouts = [_Layout.of(block, wide) for block in blocks]
-    tall = sum(layout.whole for layout in layouts)
+    rows = [_heights(block, WIDTHS[columns]) for block in blocks]
+    heights = [sum(row) + len(row) * GAP for row in rows]
     with plt.rc_context(PAPER):
-        figure = plt.figure(figsize=(wide, tall))
-        top = tall
-        for block, layout in zip(blocks, layouts, strict=True):
+        figure = plt.figure(figsize=(WIDTHS[columns], sum(heights)))
+        parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
+        for part, block, row in zip(parts, blocks, rows, strict=True):
             if places is None:
                 chosen = windows(block.columns[0].errors, block.columns[-1].errors)
             else:
                 chosen = _around(places, *block.target.shape[:2])
-            _block(figure, block, layout, top, chosen)
-            top -= layout.whole
+            _block(part, block, row, chosen)
         save(figure, file)
-    return tall
+    return sum(heights)
 
 
-def _axis(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Add axes without ticks at a place in inches from the top left."""
-    wide, tall = figure.get_size_inches()
-    axis = figure.add_axes((left / wide, (top - height) / tall, width / wide, height / tall))
-    axis.set(xticks=[], yticks=[])
-    return axis
+def _captions(block: Block, wide: float) -> list[str]:
+    """Return the captions, wrapped to the width of an image of a block ``wide`` inches wide."""
+    every = [*(column.caption for column in block.columns), ("reference",)]
+    most = max(int((wide / len(every) - GAP) / CHARACTER), 8)
+    return ["\n".join(textwrap.fill(line, most) for line in caption) for caption in every]
 
 
-def _block(
-    figure: Figure, block: Block, layout: _Layout, top: float, chosen: Sequence[tuple[int, int, int]]
-) -> None:
-    """Draw a block below the height ``top``, with these windows."""
-    wide, tall = figure.get_size_inches()
+def _heights(block: Block, wide: float) -> list[float]:
+    """Return the heights in inches of title and captions, images, windows, errors."""
+    width = wide / (len(block.columns) + 1) - GAP
+    height = width * block.target.shape[0] / block.target.shape[1]
+    lines = max(text.count("\n") for text in _captions(block, wide)) + 1
+    return [LINE * (lines + 1.6), height, (width - GAP) / 2, max(height, SCALE)]
+
+
+def _block(figure: SubFigure, block: Block, heights: Sequence[float], chosen: Sequence[Window]) -> None:
+    """Draw a block, with these windows, in rows of these ``heights``."""
     exposure = math.log2(0.9 / max(float(np.quantile(block.target.max(axis=-1), 0.95)), 1e-9))
-    figure.text(GAP / wide, (top - 0.2 * LINE) / tall, block.title, va="top", weight="bold")
-    images = [*(column.image for column in block.columns), block.target]
-    errors = [*(column.errors for column in block.columns), None]
-    for i, (image, error, caption) in enumerate(zip(images, errors, layout.captions, strict=True)):
-        left = GAP + i * (layout.width + GAP)
-        y = top - layout.head
-        figure.text(left / wide, (y + 0.3 * LINE) / tall, caption, fontsize=SMALL, va="bottom")
-        shown = tone_map(image, exposure)
-        axis = _axis(figure, left, y, layout.width, layout.height)
+    wide, tall = figure.bbox.width / figure.dpi, figure.bbox.height / figure.dpi
+    columns = [*block.columns, Column(block.target, ())]
+    grid = figure.add_gridspec(
+        *(len(heights), 2 * len(columns)),
+        height_ratios=heights,
+        left=GAP / 2 / wide,
+        right=1 - GAP / 2 / wide,
+        bottom=GAP / tall,
+        top=1,
+        wspace=GAP / (wide / len(columns) / 2 - GAP),
+        hspace=GAP / np.mean(heights),
+    )
+    figure.text(GAP / wide, 1 - 0.2 * LINE / tall, block.title, va="top", weight="bold")
+    for i, (column, caption) in enumerate(zip(columns, _captions(block, wide), strict=True)):
+        place = slice(2 * i, 2 * i + 2)
+        shown = tone_map(column.image, exposure)
+        axis = figure.add_subplot(grid[1, place])
         axis.imshow(shown, interpolation="nearest", aspect="auto")
         axis.set_axis_off()
-        y -= layout.height + GAP
+        axis.set_title(caption, loc="left", fontsize=SMALL, pad=2)
         for j, ((x, up, side), colour) in enumerate(zip(chosen, COLOURS, strict=True)):
             frame = {"edgecolor": colour, "facecolor": "none", "linewidth": 0.8}
             axis.add_patch(Rectangle((x - 0.5, up - 0.5), side, side, **frame))
-            part = _axis(figure, left + j * (layout.window + GAP), y, layout.window, layout.window)
+            part = figure.add_subplot(grid[2, 2 * i + j], xticks=[], yticks=[])
             part.imshow(shown[up : up + side, x : x + side], interpolation="nearest", aspect="auto")
-            for spine in part.spines.values():
-                spine.set(color=colour, linewidth=0.8)
-        y -= layout.window + GAP
-        if error is None:
-            _bar(figure, left, y, layout)
-        else:
-            axis = _axis(figure, left, y, layout.width, layout.height)
-            axis.imshow(
-                np.maximum(error, ERRORS["norm"].vmin), interpolation="nearest", aspect="auto", **ERRORS
-            )
-            axis.set_axis_off()
-
-
-def _bar(figure: Figure, left: float, top: float, layout: _Layout) -> None:
-    """Draw the scale of the errors in the place below the reference."""
-    axis = _axis(figure, left + 0.08 * layout.width, top - GAP, 0.84 * layout.width, 0.07)
-    bar = figure.colorbar(ScalarMappable(**ERRORS), cax=axis, orientation="horizontal")
-    between = " " if layout.width > 1 else "\n"
-    bar.set_label(f"squared{between}relative error", fontsize=SMALL, labelpad=0)
-    bar.set_ticks([1e-4, 1e-2, 1] if layout.width > NARROW else [1e-4, 1])
-    bar.ax.tick_params(labelsize=SMALL, pad=1, length=2)
-    bar.ax.minorticks_off()
+            part.spines[:].set(color=colour, linewidth=0.8)
+        axis = figure.add_subplot(grid[3, place])
+        axis.set_axis_off()
+        if column.errors is not None:
+            axis.imshow(column.errors, interpolation="nearest", aspect="auto", **ERRORS)
+            continue
+        where = axis.inset_axes((0.08, 1 - 0.1 / heights[3], 0.84, 0.07 / heights[3]))
+        bar = figure.colorbar(ScalarMappable(**ERRORS), cax=where, orientation="horizontal")
+        bar.set_label("squared\nrelative error", fontsize=SMALL, labelpad=0)
+        bar.set_ticks([1e-4, 1])
+        bar.ax.tick_params(labelsize=SMALL, pad=1, length=2)
+        bar.ax.minorticks_off()

@@ -16,6 +16,7 @@ from typing import Any
 
 import mitsuba as mi
 import numpy as np
+import pandas as pd
 
 from ..errors import CommandError
 from ..files.images import read_layers
@@ -30,7 +31,6 @@ from .project import Project
 from .results import relative_errors
 from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers, samples_taken
 from .showing import steps
-from .tables import brief
 from .timing import alternating, timed
 
 TIMED = 3  # renders for the median of times
@@ -54,7 +54,7 @@ class Shot:
 
     @property
     def caption(self) -> str:
-        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {brief(self.error)} (trimmed)"
+        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.error.brief} (trimmed)"
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,8 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
         scene = file.load(job.resolution, options.sampler)
 
         def error(image: np.ndarray) -> RelativeError:
-            return relative_error([relative_errors(image, kept)], "rel_mse_trimmed", differs=False)
+            row = pd.DataFrame([relative_errors(image, kept)])
+            return relative_error(row, "rel_mse_trimmed", differs=False)
 
         return Subject(scene, kept.image, job.depth, error)
     (target,), _ = read_layers(options.reference, "")

@@ -26,20 +26,19 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from scipy import stats
 
 from .agreement import FEWEST_RUNS, SIGNIFICANCE, Means, missing_energy, sidak, welch
-from .metrics import CONFIDENCE, Estimate, values_of
-from .record import Error, Errors, Row
+from .metrics import CONFIDENCE, Estimate
+
+Error = Literal["rel_mse", "rel_mse_trimmed"]
+"""Columns of measured errors; ``reference_`` and the name: what the reference's own error adds to them."""
+
+KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
 
 Bound = Literal["", "≥", "≤", "~"]
 """Exact, at least, at most, or neither bound."""
-
-# Error columns of a row, and the reference's own.
-OWN: dict[Error, Literal["reference_rel_mse", "reference_rel_mse_trimmed"]] = {
-    "rel_mse": "reference_rel_mse",
-    "rel_mse_trimmed": "reference_rel_mse_trimmed",
-}
 
 # Above this share of the measured error the reference's own error is not subtracted: the difference would be
 # mostly noise.
@@ -51,10 +50,30 @@ RESAMPLES = 10_000
 # Fewest renders for which a 95 % interval is given; a range of fewer has their number beside it.
 FEWEST_WITH_INTERVAL = 5
 
+# Ratio of the ends of an interval from which on it says nothing.
+WIDE = 1e3
+
 # Fewest renders of a test for a differing mean; below `FEWEST_RUNS` the squared bias must be this share of
 # the error too: tiles of few, rare bright values differ too often, others hardly ever.
 FEWEST_TESTED = 3
 MATERIAL = 0.05
+
+
+def has_interval(found: Estimate, count: int) -> bool:
+    """Return whether a positive error of ``count`` renders has an interval that says something."""
+    return count >= FEWEST_WITH_INTERVAL and found.high <= WIDE * found.low
+
+
+def with_interval(found: Estimate, count: int, is_positive: bool = True) -> str:
+    """Format an error of ``count`` renders (its interval), or why there is none."""
+    low, high = (f"{end:.2e}" if end > 0 or is_positive else "0" for end in (found.low, found.high))
+    if count < FEWEST_WITH_INTERVAL or (is_positive and not has_interval(found, count)):
+        interval = "one render" if count == 1 else "too few renders for an interval"
+    elif is_positive:
+        interval = f"{low}–{high}"
+    else:
+        interval = "0" if high == "0" else f"{low} to {high}"
+    return f"{found.value:.2e} ({interval})"
 
 
 @dataclass(frozen=True)
@@ -72,49 +91,61 @@ class RelativeError:
     variance: Estimate | None = None
     squared_bias: Estimate | None = None
 
+    def __str__(self) -> str:
+        return f"{self.bound} {with_interval(self.total, self.count)}".lstrip()
 
-def seed_errors(rows: Sequence[Errors], error: Error, differs: bool) -> tuple[list[float], Bound]:
+    @property
+    def brief(self) -> str:
+        """Bound and relMSE with two digits, for captions."""
+        return f"{self.bound} {self.total.value:.2g}".lstrip()
+
+    @property
+    def parts(self) -> list[str]:
+        """Variance and squared bias, or why there are none."""
+        if self.variance is None or self.squared_bias is None:
+            return ["one render" if self.count == 1 else "images are missing, or samples differ"] * 2
+        bias = with_interval(self.squared_bias, self.count, is_positive=False)
+        return [with_interval(self.variance, self.count), bias]
+
+
+def seed_errors(rows: pd.DataFrame, error: Error, differs: bool) -> tuple[pd.Series, Bound]:
     """Return an estimate of the relMSE from each row, whose mean is unbiased, and its bound.
 
     ``differs``: whether the mean of the renders differs from the reference. If not, raw errors are scaled to
     the mean of `metrics.spread`, whose own values are not of one seed: each has a part of the others'
     fireflies.
     """
-    measured = _column(rows, error)
-    found = measured - _column(rows, OWN[error])
+    measured, own = rows[error], rows[f"reference_{error}"]
+    found = measured - own
     is_noisy = _is_noisy(rows, error)
     if error == "rel_mse" and _has_variance(rows):
-        spread = _column(rows, "variance")
+        spread = rows["variance"]
         if _is_variance(rows, differs):
             scaled = not is_noisy and found.min() > 0
-            return (found * (spread.mean() / found.mean()) if scaled else spread).tolist(), ""
+            return found * (spread.mean() / found.mean()) if scaled else spread, ""
         if is_noisy and len(rows) < FEWEST_TESTED:
-            return spread.tolist(), "≥"
+            return spread, "≥"
     if is_noisy:
-        return measured.tolist(), "~" if differs else "≤"
-    return found.tolist(), "≥" if differs else ""
+        return measured, "~" if differs else "≤"
+    return found, "≥" if differs else ""
 
 
-def _column(rows: Sequence[Errors], name: str) -> np.ndarray:
-    return np.array([row[name] for row in rows], dtype=np.float64)
+def _has_variance(rows: pd.DataFrame) -> bool:
+    return "variance" in rows and bool(rows["variance"].notna().all())
 
 
-def _has_variance(rows: Sequence[Errors]) -> bool:
-    return all(row.get("variance") is not None for row in rows)
-
-
-def _is_variance(rows: Sequence[Errors], differs: bool) -> bool:
+def _is_variance(rows: pd.DataFrame, differs: bool) -> bool:
     """Return whether the raw relMSE is the variance alone: the mean was tested, and agrees."""
     return not differs and len(rows) >= FEWEST_TESTED and _has_variance(rows)
 
 
-def _is_noisy(rows: Sequence[Errors], error: Error) -> bool:
+def _is_noisy(rows: pd.DataFrame, error: Error) -> bool:
     """Return whether the reference is too noisy to subtract its own error."""
-    measured, own = _column(rows, error), _column(rows, OWN[error])
+    measured, own = rows[error], rows[f"reference_{error}"]
     return bool(own.any()) and bool(own.sum() > SUBTRACTED * measured.sum() or (measured - own).min() <= 0)
 
 
-def relative_error(rows: Sequence[Errors], error: Error, differs: bool) -> RelativeError:
+def relative_error(rows: pd.DataFrame, error: Error, differs: bool) -> RelativeError:
     """Return the relMSE of the ``rows`` of an integrator at one budget."""
     values, bound = seed_errors(rows, error, differs)
     total = mean_of(values)
@@ -125,21 +156,21 @@ def relative_error(rows: Sequence[Errors], error: Error, differs: bool) -> Relat
     return RelativeError(spread if is_variance else total, bound, len(rows), spread, squared_bias(rows))
 
 
-def mean_of(values: Sequence[float]) -> Estimate:
+def mean_of(values: Sequence[float] | pd.Series) -> Estimate:
     """Return the mean of positive values with Student's 95 % interval of its logarithm.
 
     The standard error is the jackknife's. From 0 to infinity for a single value. The interval of few values
     with a long tail is too narrow: a rare value was not met.
     """
-    given = values_of("values", values, 1)
-    value, n = float(given.mean()), len(given)
-    if n == 1:
-        return Estimate(value, 0.0, math.inf)
-    return _of_logarithm(value, (given.sum() - given) / (n - 1))
+    given = pd.Series(values)
+    without = (given.sum() - given) / (len(given) - 1) if len(given) > 1 else None
+    return _of_logarithm(float(given.mean()), without)
 
 
-def _of_logarithm(value: float, without: np.ndarray) -> Estimate:
+def _of_logarithm(value: float, without: pd.Series | None) -> Estimate:
     """Return Student's interval of the logarithm of ``value``, of the estimates ``without`` each of n."""
+    if without is None:
+        return Estimate(value, 0.0, math.inf)
     if without.min() <= 0:
         half = _half_width(without)
         return Estimate(value, max(value - half, 0.0), value + half)
@@ -147,10 +178,10 @@ def _of_logarithm(value: float, without: np.ndarray) -> Estimate:
     return Estimate(value, value / factor, value * factor)
 
 
-def _half_width(without: np.ndarray) -> float:
+def _half_width(without: pd.Series) -> float:
     """Half of Student's interval, by the jackknife: of the estimates ``without`` each of n values."""
     n = len(without)
-    return float(stats.t.isf((1 - CONFIDENCE) / 2, n - 1) * math.sqrt(n - 1) * without.std())
+    return float(stats.t.isf((1 - CONFIDENCE) / 2, n - 1) * math.sqrt(n - 1) * without.std(ddof=0))
 
 
 def bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., Any]) -> Estimate:
@@ -160,30 +191,26 @@ def bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., Any]) -> E
     return Estimate(float(statistic(*samples)), float(low), float(high))
 
 
-def variance(rows: Sequence[Errors]) -> Estimate:
+def variance(rows: pd.DataFrame) -> Estimate:
     """Return the variance relative to the reference, with a 95 % interval over seeds.
 
     Student's interval of the logarithm, whose standard error is the jackknife's; from 0 to infinity for two
     renders, whose only difference shows no spread. Too narrow where the renders missed rare bright values.
     """
-    without = _variance_without(rows)
-    value = float(_column(rows, "variance").mean())
-    if without is None:
-        return Estimate(value, 0.0, math.inf)
-    return _of_logarithm(value, without)
+    return _of_logarithm(float(rows["variance"].mean()), _variance_without(rows))
 
 
-def _variance_without(rows: Sequence[Errors]) -> np.ndarray | None:
+def _variance_without(rows: pd.DataFrame) -> pd.Series | None:
     """Return the variances without each of the ``rows``; None for fewer than 3."""
     n = len(rows)
     if n < 3:
         return None
     # The sum of squares about the mean falls by that row's `metrics.spread`.
-    spread = _column(rows, "variance")
+    spread = rows["variance"]
     return ((n - 1) / n * spread.sum() - spread) / (n - 2)
 
 
-def squared_bias(rows: Sequence[Errors]) -> Estimate | None:
+def squared_bias(rows: pd.DataFrame) -> Estimate | None:
     """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
 
     None for a single render; infinite interval for two. Value and interval may be negative.
@@ -191,8 +218,8 @@ def squared_bias(rows: Sequence[Errors]) -> Estimate | None:
     n = len(rows)
     if n < 2 or not _has_variance(rows):
         return None
-    total = _column(rows, "rel_mse") - _column(rows, "reference_rel_mse")
-    value, variances = float(total.mean() - _column(rows, "variance").mean()), _variance_without(rows)
+    total = rows["rel_mse"] - rows["reference_rel_mse"]
+    value, variances = float(total.mean() - rows["variance"].mean()), _variance_without(rows)
     if variances is None:
         return Estimate(value, -math.inf, math.inf)
     without = (total.sum() - total) / (n - 1) - variances
@@ -200,45 +227,35 @@ def squared_bias(rows: Sequence[Errors]) -> Estimate | None:
     return Estimate(value, value - half, value + half)
 
 
-def mean_differs(rows: Sequence[Row], reference: Means) -> bool:
+def mean_differs(rows: pd.DataFrame, reference: Means) -> bool:
     """Return whether the mean of renders of one budget differs from the reference.
 
     By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light.
     Elsewhere it hardly ever rejects few renders, for which 95 % intervals of energy and squared bias suffice.
     """
     found, are_few = squared_bias(rows), len(rows) < FEWEST_RUNS
-    if not compared(rows, reference) and not (are_few and _intervals_leave_out_zero(rows, reference, found)):
-        return False
+    is_significant = compared(rows, reference)
+    if not is_significant and are_few and found is not None and found.low > 0:
+        energy = missing_energy(means_of(rows).whole, reference.whole)
+        is_significant = not energy.low <= 0 <= energy.high
     share = MATERIAL if are_few else 0.0
-    return found is None or found.value > share * float(np.mean([row["rel_mse"] for row in rows]))
+    return is_significant and (found is None or bool(found.value > share * rows["rel_mse"].mean()))
 
 
-def _intervals_leave_out_zero(rows: Sequence[Row], reference: Means, bias: Estimate | None) -> bool:
-    """Return whether the intervals of the squared ``bias`` and of the missing energy leave out 0."""
-    if bias is None or bias.low <= 0:
-        return False
-    columns = [row["tile_means"] for row in rows]
-    energy = missing_energy(Means.of(columns, fewest=FEWEST_TESTED).whole, reference.whole)
-    return not energy.low <= 0 <= energy.high
+def means_of(rows: pd.DataFrame, fewest: int = FEWEST_TESTED) -> Means:
+    """Return the means of the renders of the ``rows``, at least ``fewest``."""
+    return Means.of(np.stack([*rows["tile_means"]]), fewest=fewest)
 
 
-def compared(rows: Sequence[Row], other: Means) -> bool:
+def compared(rows: pd.DataFrame, other: Means) -> bool:
     """Return whether the tile means differ significantly; False for too few renders."""
     if len(rows) < FEWEST_TESTED:
         return False
-    means = Means.of([row["tile_means"] for row in rows], fewest=FEWEST_TESTED)
-    return sidak(welch(means.columns, other.columns).p) < SIGNIFICANCE
-
-
-def unlike(rows: Sequence[Row], others: Sequence[Row]) -> bool:
-    """Return whether the means of two integrators' renders differ; True for too few renders."""
-    if min(len(rows), len(others)) < FEWEST_TESTED:
-        return True
-    return compared(rows, Means.of([row["tile_means"] for row in others], fewest=FEWEST_TESTED))
+    return sidak(welch(means_of(rows).columns, other.columns).p) < SIGNIFICANCE
 
 
 def bound_of_ratio(over: Bound, under: Bound) -> Bound:
     """Return the bound of a ratio of two errors with the bounds ``over`` and ``under``."""
-    turned: dict[Bound, Bound] = {"": "", "≥": "≤", "≤": "≥", "~": "~"}
-    other = turned[under]
+    turned: dict[Bound, Bound] = {"≥": "≤", "≤": "≥"}
+    other = turned.get(under, under)
     return "~" if over and other and over != other else over or other

@@ -8,17 +8,16 @@ from __future__ import annotations
 
 import math
 from argparse import Namespace
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 from matplotlib.lines import Line2D
-from matplotlib.path import Path as MarkerPath
-from matplotlib.textpath import TextPath
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter
 
 from ..errors import CommandError
 from ..files.images import read_layers
@@ -35,13 +34,11 @@ from .analysis import (
     Results,
     Unavailable,
 )
-from .estimates import FEWEST_WITH_INTERVAL, Bound
+from .estimates import FEWEST_WITH_INTERVAL, KINDS, Error, has_interval
 from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
-from .record import Error
 from .reference import Reference
-from .results import load
-from .tables import has_interval
+from .results import image_file, load
 
 # Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
 STYLES = {
@@ -72,17 +69,10 @@ RAYS = {
 PANELS = {1: 2, 2: 4}
 """Scenes side by side, at most."""
 
-DASHES = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
-TWO_DASHES = MarkerPath([(-1, 0), (-0.25, 0), (0.25, 0), (1, 0)], [1, 2, 1, 2])
+DASHES: dict[Error, object] = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 SLOPE = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 0.8}
-KINDS: dict[Error, str] = {"rel_mse": "raw", "rel_mse_trimmed": "trimmed"}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
-SHORT = 30.0  # ratio of the ends of a logarithmic axis
 PAGE = 24.0  # cm, the height of the text on a journal's page
-POINTS = 72.0  # of an inch
-ENTRY = 5.0 * PAPER["legend.fontsize"]  # points beside the text of an entry of a legend: handle and gaps
-LOWEST = 0.7  # inches of a plot of efficiencies
-LINE = 0.13  # inches of a line of a legend
 
 
 def style(methods: Sequence[str], method: str) -> dict:
@@ -93,40 +83,32 @@ def style(methods: Sequence[str], method: str) -> dict:
 
 
 def convergence(
-    results: Results, against: str, path: Path, columns: int = 2, scenes: Sequence[str] | None = None
+    results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None, against: str = "spp"
 ) -> None:
     """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene, raw and trimmed.
 
     Means over seeds, those of the report's tables, with the 95 % interval of the raw error, and the median of
-    the seconds; the dotted line has slope -1. A single panel in two columns has the legend beside it.
+    the seconds; the dotted line has slope -1.
     """
     scenes = scenes or results.scenes
     across = min(PANELS[columns], len(scenes)) if len(scenes) > PANELS[1] or columns == 2 else 1
     rows, width = math.ceil(len(scenes) / across), WIDTHS[columns]
-    is_beside = columns == 2 and len(scenes) == 1
-    high = max(0.82 * (WIDTHS[1] if is_beside else width / across), 1.5)
+    high = max(0.82 * width / max(across, 2 * columns - 2), 1.5)
     with plt.rc_context(PAPER):
-        figure, axes = plt.subplots(
-            rows, across, figsize=(width, high * rows), squeeze=False, layout="constrained"
-        )
-        sloped = [
-            _curves(axis, results, scene, against) for scene, axis in zip(scenes, axes.flat, strict=False)
-        ]
+        size = width, high * rows
+        figure, axes = plt.subplots(rows, across, figsize=size, squeeze=False, layout="constrained")
         for axis in axes.flat[len(scenes) :]:
             axis.set_axis_off()
-        for i, axis in enumerate(axes.flat[: len(scenes)]):
-            if i + across >= len(scenes):
-                axis.set_xlabel(AXES[against])
-            if i % across == 0:
-                axis.set_ylabel("relMSE")
-        shown = [name for name in results.methods if any(results.of(scene, name) for scene in scenes)]
+        for i, (axis, scene) in enumerate(zip(axes.flat, scenes, strict=False)):
+            _curves(axis, results, scene, against)
+            axis.set_xlabel(AXES[against] if i + across >= len(scenes) else "")
+            axis.set_ylabel("" if i % across else "relMSE")
+        shown = [name for name in results.methods if any(len(results.of(scene, name)) for scene in scenes)]
         handles = _entries(results.methods, shown)
-        handles += [
-            Line2D([], [], color="black", linestyle=DASHES[kind], label=text) for kind, text in KINDS.items()
-        ]
-        if any(sloped):
-            handles.append(Line2D([], [], label="slope −1", **SLOPE))
-        _legend(figure, handles, is_beside)
+        kinds = {kind: DASHES[error] for error, kind in KINDS.items()}
+        handles += [Line2D([], [], color="black", linestyle=dash, label=kind) for kind, dash in kinds.items()]
+        handles.append(Line2D([], [], label="slope −1", **SLOPE))
+        _legend(figure, handles)
         save(figure, path)
 
 
@@ -140,138 +122,91 @@ def _entries(methods: Sequence[str], shown: Sequence[str], before: str = "", **m
     ]
 
 
-def _across(labels: Sequence[str], width: float) -> int:
-    """Return how many columns of a legend fit into the ``width`` in inches."""
-    sizes = [TextPath((0, 0), label, size=PAPER["legend.fontsize"]).get_extents().width for label in labels]
-
-    def taken(across: int) -> float:
-        columns = np.array_split(np.array(sizes), across)  # as Matplotlib fills them
-        return sum(float(column.max()) + ENTRY for column in columns) / POINTS
-
-    return max(n for n in range(1, len(labels) + 1) if n == 1 or taken(n) <= width)
-
-
-def _legend(figure, handles: Sequence, is_beside: bool = False) -> None:
-    """Put a legend under the axes, and make the figure higher by it, or beside them."""
-    if is_beside:
-        figure.legend(handles=handles, loc="outside right center")
-        return
+def _legend(figure, handles: Sequence) -> None:
+    """Put a legend of as many columns as fit under the axes, and make the figure higher by it."""
     width, height = figure.get_size_inches()
-    across = _across([handle.get_label() for handle in handles], width)
-    figure.set_size_inches(width, height + LINE * math.ceil(len(handles) / across) + 0.1)
-    figure.legend(handles=handles, loc="outside lower center", ncols=across, labelspacing=0.3)
+    for across in range(len(handles), 0, -1):
+        legend = figure.legend(handles=handles, loc="outside lower center", ncols=across, labelspacing=0.3)
+        extent = legend.get_window_extent()
+        if extent.width <= figure.bbox.width or across == 1:
+            break
+        legend.remove()
+    figure.set_size_inches(width, height + extent.height / figure.dpi + 0.05)
 
 
-def _curves(axis, results: Results, scene: str, against: str) -> bool:
-    """Plot all integrators in a scene; return whether there is a line of slope -1."""
-    first = None
+def _curves(axis, results: Results, scene: str, against: str) -> None:
+    """Plot all integrators in a scene."""
     for method in results.methods:
-        for error in KINDS:
-            points, bounds = _points(results, scene, method, against, error)
-            if not len(points):
+        for error in reversed(KINDS):
+            points = _points(results, scene, method, against, error)
+            if points.empty:
                 continue
             look = style(results.methods, method) | {"linestyle": DASHES[error]}
-            x, low, middle, high = points.T
-            # A single point has no line: two dashes stand for a dashed one.
-            dash = {"marker": TWO_DASHES, "markersize": 9} if len(points) == 1 else {"marker": ""}
-            axis.plot(x, middle, **look | (dash if error != "rel_mse" else {}))
             if error == "rel_mse":
-                axis.fill_between(x, low, high, color=look["color"], alpha=0.18, linewidth=0)
-                hollow = np.array([bool(bound) for bound in bounds])
-                axis.plot(x[hollow], middle[hollow], **look | {"linestyle": "", "markerfacecolor": "white"})
-            first = points if first is None else first
+                axis.plot(points["x"], points["y"], **look)
+                axis.fill_between(
+                    points["x"], points["low"], points["high"], color=look["color"], alpha=0.18, linewidth=0
+                )
+                hollow = points[points["bound"] != ""]
+                axis.plot(hollow["x"], hollow["y"], **look | {"linestyle": "", "markerfacecolor": "white"})
+            else:  # a single point has no line
+                axis.plot(points["x"], points["y"], **look | {"marker": "" if len(points) > 1 else "_"})
     axis.set(xscale="log", yscale="log", title=scene)
-    is_sloped = False
-    if first is not None and len(first) > 1:
-        is_sloped = True
-        (x0, _, y0, _), (x1, _, _, _) = first[0], first[-1]
-        axis.plot([x0, x1], [y0, y0 * x0 / x1], zorder=1, **SLOPE)
-    for side in (axis.xaxis, axis.yaxis):
-        _ticks(side)
-    return is_sloped
+    if axis.lines:
+        x, y = axis.lines[0].get_data()
+        axis.plot([x[0], x[-1]], [y[0], y[0] * x[0] / x[-1]], zorder=1, **SLOPE)
 
 
-def _ticks(side) -> None:
-    """Label powers of ten of a logarithmic axis; where there are few, 2 and 5 times these too, or others."""
-    low, high = side.get_view_interval()
-    side.set_minor_formatter(NullFormatter())
-    powers, fine = LogLocator(numticks=6), LogLocator(subs=(1.0, 2.0, 5.0), numticks=12)
-
-    def several(locator) -> bool:
-        return sum(low <= tick <= high for tick in locator.tick_values(low, high)) > 1
-
-    if high >= SHORT * low and several(powers):
-        side.set_major_locator(powers)
-        return
-    side.set_major_locator(fine if several(fine) else MaxNLocator(4, steps=[1, 2, 5, 10]))
-    side.set_major_formatter(FuncFormatter(lambda x, _: f"{x:.10g}"))
-
-
-def _points(
-    results: Results, scene: str, method: str, against: str, error: Error
-) -> tuple[np.ndarray, list[Bound]]:
-    """Return an integrator's points (n, 4) and their bounds.
-
-    Abscissa, low end, mean and high end of positive errors; the ends are NaN without an interval.
-    """
-    points: list[list[float]] = []
-    bounds: list[Bound] = []
-    counts = Counter(row["budget"] for row in results.of(scene, method))
+def _points(results: Results, scene: str, method: str, against: str, error: Error) -> pd.DataFrame:
+    """Return an integrator's positive errors ``y`` over ``x``, with their interval, if any, and bound."""
+    points: list[dict[str, object]] = []
+    groups = results.of(scene, method).groupby("budget")
     # Where time was too short for a second render, a single one would look as certain as the others.
-    several = [budget for budget in counts if counts[budget] > 1]
-    for budget in sorted(several or counts):
-        rows = results.of(scene, method, budget)
+    fewest = min(groups.size().max(), 2)
+    for budget, rows in groups:
         found = results.error(scene, method, error, budget)
         total = found.total
-        ends = [total.low, total.high] if has_interval(total, found.count) else [math.nan] * 2
-        if total.value > 0:
-            middle = float(np.median([row[against] for row in rows]))
-            points.append([middle, ends[0], total.value, ends[1]])
-            bounds.append(found.bound)
-    order = np.argsort([point[0] for point in points])
-    return np.array(points)[order] if points else np.empty((0, 4)), [bounds[i] for i in order]
+        if len(rows) >= fewest and total.value > 0:
+            ends = (total.low, total.high) if has_interval(total, found.count) else (math.nan, math.nan)
+            point = {"x": rows[against].median(), "y": total.value, "low": ends[0], "high": ends[1]}
+            points.append(point | {"bound": found.bound})
+    numbers = dict.fromkeys(["x", "y", "low", "high"], float)
+    return pd.DataFrame(points, columns=[*numbers, "bound"]).astype(numbers).sort_values("x")
 
 
-def efficiencies(
-    results: Results,
-    rivals: Sequence[str],
-    path: Path,
-    columns: int = 2,
-    scenes: Sequence[str] | None = None,
-) -> None:
-    """Plot efficiencies per scene, the first integrator's over each of the ``rivals``.
+def efficiencies(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None) -> None:
+    """Plot efficiencies per scene, the first integrator's over each of its rivals.
 
     Median with its 95 % interval, of fewer than `FEWEST_WITH_INTERVAL` seeds their range; trimmed filled, raw
     hollow; arrows where a ratio is a bound.
     """
-    scenes = scenes or results.scenes
+    scenes, rivals = scenes or results.scenes, results.rivals
     with plt.rc_context(PAPER):
-        most = max(len(_present(results, scene, rivals)) for scene in scenes)
-        high = max((0.08 * max(most, 1) + 0.06) * len(scenes), LOWEST)
+        most = max(len(results.present(scene, rivals)) for scene in scenes)
+        high = max((0.08 * max(most, 1) + 0.06) * len(scenes), 0.7)
         figure, axis = plt.subplots(figsize=(WIDTHS[columns], high + 0.4), layout="constrained")
         counts: set[int] = set()
         for place, scene in enumerate(scenes):
             if place % 2:
                 axis.axhspan(place - 0.5, place + 0.5, color="#f3f3f3", zorder=0, linewidth=0)
-            here = _present(results, scene, rivals)
+            here = results.present(scene, rivals)
             for i, rival in enumerate(here):
-                for j, error in enumerate(("rel_mse_trimmed", "rel_mse")):
+                for j, error in enumerate(KINDS):
                     y = place + 0.8 * ((2 * i + j + 0.5) / (2 * len(here)) - 0.5)
-                    counts |= _dot(axis, results, scene, rival, error, y, style(results.methods, rival))
+                    counts |= _dot(axis, results, scene, rival, error, y)
         axis.axvline(1, color="black", linewidth=0.6)
         axis.set(xscale="log", xlabel=f"efficiency of {results.methods[0]}, {results.deciding} spp")
-        _ticks(axis.xaxis)
         axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}x"))
-        axis.set_yticks(range(len(scenes)), scenes)
-        axis.tick_params(axis="y", length=0)
-        axis.set_ylim(len(scenes) - 0.5, -0.5)
+        _name_scenes(axis, scenes)
         axis.grid(axis="x")
         axis.set_axisbelow(True)
-        shown = [rival for rival in rivals if any(results.of(scene, rival) for scene in scenes)]
+        shown = [rival for rival in rivals if any(rival in results.present(s, rivals) for s in scenes)]
         handles = _entries(results.methods, shown, "over ", linestyle="")
         plain = {"color": "#666666", "linestyle": "", "marker": handles[0].get_marker() if handles else "o"}
+        are_few = min(counts, default=FEWEST_WITH_INTERVAL) < FEWEST_WITH_INTERVAL
+        interval = "95 % interval" + are_few * f" (range if n < {FEWEST_WITH_INTERVAL})"
         handles += [
-            Line2D([], [], label=_interval(counts), color="#666666", linewidth=0.8),
+            Line2D([], [], label=interval, color="#666666", linewidth=0.8),
             Line2D([], [], label="trimmed", **plain),
             Line2D([], [], label="raw", markerfacecolor="white", **plain),
         ]
@@ -282,27 +217,20 @@ def efficiencies(
         save(figure, path)
 
 
-def _present(results: Results, scene: str, rivals: Sequence[str]) -> list[str]:
-    """Return the ``rivals`` that were rendered in a scene."""
-    return [rival for rival in rivals if results.of(scene, rival)]
+def _name_scenes(axis, scenes: Sequence[str]) -> None:
+    """Name a row of the plot after each scene, the first on top."""
+    axis.set_yticks(range(len(scenes)), scenes)
+    axis.tick_params(axis="y", length=0)
+    axis.set_ylim(len(scenes) - 0.5, -0.5)
 
 
-def _interval(counts: set[int]) -> str:
-    """Name what lines of medians of these ``counts`` of seeds show: that of few is their range."""
-    few = sorted(count for count in counts if count < FEWEST_WITH_INTERVAL)
-    if not few:
-        return "95 % interval"
-    if len(few) < len(counts):
-        return f"95 % interval; range if n < {FEWEST_WITH_INTERVAL}"
-    return f"range of {few[0]} seeds" if len(few) == 1 else f"range of {few[0]} to {few[-1]} seeds"
-
-
-def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float, look: dict) -> set[int]:
+def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float) -> set[int]:
     """Plot one efficiency with its interval at the height ``y``; return its number of seeds, if any."""
     try:
         ratio = results.efficiency(scene, rival, error)
     except Unavailable:
         return set()
+    look = style(results.methods, rival)
     face = look["color"] if error == "rel_mse_trimmed" else "white"
     axis.plot([ratio.low, ratio.high], [y, y], color=look["color"], linewidth=0.8)
     axis.plot(ratio.median, y, **look | {"markerfacecolor": face, "linestyle": "", "markeredgewidth": 0.6})
@@ -324,9 +252,7 @@ def rays(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] |
             look = {"color": colour, "hatch": hatch, "edgecolor": "white", "linewidth": 0.3, "label": label}
             axis.barh(range(len(scenes)), widths, left=left, **look)
             left += widths
-        axis.set_yticks(range(len(scenes)), scenes)
-        axis.tick_params(axis="y", length=0)
-        axis.set_ylim(len(scenes) - 0.5, -0.5)
+        _name_scenes(axis, scenes)
         axis.set_xlabel(f"rays per camera subpath, {results.methods[0]}, {results.deciding} spp")
         _legend(figure, axis.get_legend_handles_labels()[0])
         save(figure, path)
@@ -334,18 +260,14 @@ def rays(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] |
 
 def _rays_per_sample(results: Results, scene: str, kind: str) -> float:
     rows = results.of(scene, results.methods[0], results.deciding)
-    rows = [row for row in rows if row.get(f"rays_{kind}") is not None]
-    pixels = [row["width"] * row["height"] for row in rows]
-    counts = [row[f"rays_{kind}"] / row["spp"] / n for row, n in zip(rows, pixels, strict=True)]
-    return float(np.median(counts)) if counts else 0.0
+    counts = rows.get(f"rays_{kind}", pd.Series(dtype=float)) / rows["spp"] / (rows["width"] * rows["height"])
+    return float(counts.median()) if counts.notna().any() else 0.0
 
 
 PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
-    "samples": lambda results, path, columns, scenes: convergence(results, "spp", path, columns, scenes),
-    "seconds": lambda results, path, columns, scenes: convergence(results, "seconds", path, columns, scenes),
-    "efficiency": lambda results, path, columns, scenes: efficiencies(
-        results, results.rivals, path, columns, scenes
-    ),
+    "samples": partial(convergence, against="spp"),
+    "seconds": partial(convergence, against="seconds"),
+    "efficiency": efficiencies,
     "rays": rays,
 }
 """What the command `figure` draws, beside the images of ``crops``."""
@@ -359,17 +281,15 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
     place of equal time.
     """
     columns: list[crops.Column] = []
-    for method in [*results.rivals, results.methods[0]]:
-        rows = sorted(results.of(scene, method, results.deciding), key=lambda row: row["rel_mse_trimmed"])
-        shown = rows[(len(rows) - 1) // 2] if rows else None
-        file = folder / "images" / scene / f"{shown['key']}.exr" if shown else None
-        if shown is None or file is None or not file.exists():
-            continue
-        (image,), _ = read_layers(file, "")
-        called = f"{method} (equal spp)" if method in results.at_equal_samples else method
-        seconds = float(np.median([row["seconds"] for row in rows]))
-        error = results.error(scene, method)
-        columns.append(crops.judged(called, shown["spp"], seconds, error, image, kept.image))
+    for method in results.present(scene, [*results.rivals, results.methods[0]], results.deciding):
+        rows = results.of(scene, method, results.deciding).sort_values("rel_mse_trimmed", kind="stable")
+        shown = rows.iloc[(len(rows) - 1) // 2]
+        file = image_file(folder, shown)
+        if file.exists():
+            (image,), _ = read_layers(file, "")
+            called = f"{method} (equal spp)" if method in results.at_equal_samples else method
+            seconds, error = rows["seconds"].median(), results.error(scene, method)
+            columns.append(crops.judged(called, shown["spp"], seconds, error, image, kept.image))
     if not columns:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
     return crops.Block(scene, tuple(columns), kept.image)
@@ -377,15 +297,15 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
 
 def _among(results: Results, names: Sequence[str] | None) -> Results:
     """Return the results of the first integrator and of these others; None: all that are compared."""
+    methods = results.rows["method"]
     if names is None:
-        return replace(results, rows=[row for row in results.rows if row["method"] not in results.aside])
+        return replace(results, rows=results.rows[~methods.isin(results.aside)])
     for name in names:
         if name not in results.methods:
             raise CommandError(
                 f"--integrators {name}: not in the sweep, which has {', '.join(results.methods)}"
             )
-    kept = {results.methods[0], *names}
-    return replace(results, rows=[row for row in results.rows if row["method"] in kept], aside=())
+    return replace(results, rows=results.rows[methods.isin([results.methods[0], *names])], aside=())
 
 
 def run(options: Namespace) -> int:

@@ -37,6 +37,11 @@ class Estimate:
     low: float
     high: float
 
+    def __str__(self) -> str:
+        if math.isinf(self.high):
+            return f"{self.value:.2f} (too few renders for an interval)"
+        return f"{self.value:.2f} ({self.low:.2f} to {self.high:.2f})"
+
 
 def image_of(name: str, value: Image) -> np.ndarray:
     """Return ``value`` as finite float64 of shape (height, width, 3)."""

@@ -8,8 +8,6 @@ its plots. The template is page.html.
 from __future__ import annotations
 
 import base64
-import html
-import json
 import math
 import re
 import tempfile
@@ -17,35 +15,31 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
+from jinja2 import Template
 from markdown_it import MarkdownIt
+from markupsafe import Markup
 
 from ..files.images import check_output, read_layers
 from ..files.texts import write_text
 from ..files.whole import check_own
-from .analysis import NOTHING, Results, Unavailable
+from .analysis import Results, Unavailable
+from .estimates import KINDS
 from .project import Project
 from .reference import HALF_MAX
-from .report import KINDS, Report
-from .tables import brief, ratio
+from .report import Report
+from .results import image_file
 
 TITLE = "mitsuba-bdpt: sweep"
 """How the title of every page begins."""
 
 FRAME = Path(__file__).with_suffix(".html")
 
-BOUNDS = {
-    "": ("", ""),
-    "≥": ("at least ", "at most "),
-    "≤": ("at most ", "at least "),
-    "~": ("about ", "about "),
-}
-"""How an efficiency and its reciprocal are bounded, in words."""
-
 COLUMNS = {
     "scene": "scene",
     "integrator": "method",
     "budget": "budget",
-    "renders": None,
+    "renders": "renders",
     "samples per pixel": "spp",
     "seconds": "seconds",
     "relMSE, trimmed": "rel_mse_trimmed",
@@ -56,37 +50,19 @@ COLUMNS = {
 }
 
 
-def answer(results: Results, scene: str) -> tuple[float, str]:
-    """Return the ratio over a scene's strongest path tracer, and a sentence about it.
-
-    The ratio is infinite where path tracers find nothing, NaN where there is none.
-    """
-    rival = results.tracer(scene)
-    lacks = results.path_lacks(scene)
-    try:
-        found = results.against_path(scene)
-    except Unavailable as why:
-        return math.nan, f"No figure: {str(why).rstrip('.')}."
-    added = f" {rival} fails the bias check here: {lacks}." if lacks else ""
-    least, most = BOUNDS[found.bound]
-    if found.median >= 1:
-        span = f"({ratio(found.smallest)[:-1]} to {ratio(found.largest)})"
-        words = f"{rival} takes {least}{ratio(found.median)} the time for the same error {span}.{added}"
-        return (math.inf if lacks == NOTHING else found.median), words
-    span = f"({ratio(1 / found.largest)[:-1]} to {ratio(1 / found.smallest)})"
-    words = f"{rival} is ahead: its efficiency is {most}{ratio(1 / found.median)} ours {span}.{added}"
-    return found.median, words
-
-
-def answers(results: Results) -> str:
-    """Return the list of all scenes, by decreasing gain."""
-    found = {scene: answer(results, scene) for scene in results.scenes}
-    order = sorted(found, key=lambda scene: -1 if math.isnan(found[scene][0]) else found[scene][0])[::-1]
-    items = [
-        f'<li><a href="#scene-{scene}"><b>{scene}</b></a>: {html.escape(found[scene][1])}</li>'
-        for scene in order
-    ]
-    return f"<ul>\n{chr(10).join(items)}\n</ul>"
+def answers(results: Results) -> dict[str, str]:
+    """Return the efficiencies over scenes' strongest path tracers, by decreasing median, as texts."""
+    found: dict[str, tuple[float, str]] = {}
+    for scene in results.scenes:
+        lacks = results.path_lacks(scene)
+        added = f"; {results.tracer(scene)} fails the bias check: {lacks}" if lacks else ""
+        try:
+            ratio = results.against_path(scene)
+        except Unavailable as why:
+            found[scene] = -1.0, f"{why}{added}"
+        else:
+            found[scene] = ratio.median, f"efficiency over {results.tracer(scene)}: {ratio}{added}"
+    return {scene: found[scene][1] for scene in sorted(found, key=found.__getitem__, reverse=True)}
 
 
 def encoded(image: np.ndarray) -> str:
@@ -95,22 +71,20 @@ def encoded(image: np.ndarray) -> str:
     return base64.b64encode(half.tobytes()).decode()
 
 
-def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
+def scene_data(folder: Path, results: Results, made: dict, scene: str, words: str) -> dict:
     """Return a scene's images by name, captions and size."""
     target = made[scene].image
     images, captions = {}, {}
-    for method in results.methods:
+    for method in results.present(scene, results.methods, results.deciding):
         rows = results.of(scene, method, results.deciding)
-        file = folder / "images" / scene / f"{rows[0]['key']}.exr" if rows else None
-        if file is None or not file.exists():
-            continue
-        (image,), _ = read_layers(file, "")
-        images[method] = encoded(image)
-        seconds = float(np.median([row["seconds"] for row in rows]))
-        captions[method] = (
-            f"{method}: {rows[0]['spp']} samples per pixel, {seconds:.3g} s, "
-            f"relMSE {brief(results.error(scene, method))} (trimmed)"
-        )
+        file = image_file(folder, rows.iloc[0])
+        if file.exists():
+            (image,), _ = read_layers(file, "")
+            images[method] = encoded(image)
+            captions[method] = (
+                f"{method}: {rows['spp'].iloc[0]} samples per pixel, {rows['seconds'].median():.3g} s, "
+                f"relMSE {results.error(scene, method).brief} (trimmed)"
+            )
     bright = float(np.quantile(target.max(axis=-1), 0.95))
     return {
         "name": scene,
@@ -120,7 +94,7 @@ def scene_data(folder: Path, results: Results, made: dict, scene: str) -> dict:
         "exposure": round(4 * math.log2(0.9 / max(bright, 1e-6))) / 4,
         "images": images | {"reference": encoded(target)},
         "figures": captions,
-        "words": answer(results, scene)[1],
+        "words": words,
     }
 
 
@@ -129,24 +103,17 @@ def lines(results: Results) -> list[list]:
 
     Over seeds the mean of errors, and the median of samples and seconds.
     """
-    found = []
-    for scene in results.scenes:
-        for method in results.methods:
-            for budget in sorted({row["budget"] for row in results.of(scene, method)}):
-                rows = results.of(scene, method, budget)
-                line = [scene, method, budget, len(rows)]
-                for column in list(COLUMNS.values())[len(line) :]:
-                    if column in KINDS:
-                        error = results.error(scene, method, column, budget)
-                        line.append([error.total.value, error.bound] if error.bound else error.total.value)
-                        continue
-                    values = [row[column] for row in rows if row[column] is not None]
-                    average = np.median if column in ("spp", "seconds") else np.mean
-                    middle = float(average(values)) if values else math.nan
-                    line.append(middle if math.isfinite(middle) else None)
-                line[4] = int(line[4])
-                found.append(line)
-    return found
+    averages = dict.fromkeys(["spp", "seconds"], "median")
+    averages |= dict.fromkeys(["mape", "flip", "delta_e_itp"], "mean")
+    groups = results.rows.groupby(["scene", "method", "budget"])
+    found = groups.agg(averages).assign(renders=groups.size()).astype({"spp": int})
+    for kind in KINDS:
+        errors = [results.error(scene, method, kind, budget) for scene, method, budget in found.index]
+        cells = [[one.total.value, one.bound] if one.bound else one.total.value for one in errors]
+        found[kind] = pd.Series(cells, found.index, object)
+    order = {name: i for i, name in enumerate([*results.scenes, *results.methods])}
+    found = found.sort_index(key=lambda level: level.map(lambda name: order.get(name, name))).reset_index()
+    return found[list(COLUMNS.values())].astype(object).where(found.notna(), None).to_numpy().tolist()
 
 
 def reported(report: Report) -> str:
@@ -162,24 +129,21 @@ def reported(report: Report) -> str:
         return re.sub(r'src="(\w+\.png)"', embedded, MarkdownIt().enable("table").render(text))
 
 
+def filled(**parts: object) -> str:
+    """Return the template filled with ``title``, ``answers``, ``report`` and ``data``."""
+    template = Template(FRAME.read_text(encoding="utf-8"), autoescape=True, trim_blocks=True)
+    return template.render(parts)
+
+
 def page(folder: Path, report: Report) -> str:
-    results = report.results
-    data = {
-        "columns": list(COLUMNS),
-        "rows": lines(results),
-        "scenes": [scene_data(folder, results, report.made, scene) for scene in results.scenes],
-    }
-    parts = {
-        "TITLE": f"{TITLE} {html.escape(folder.resolve().name)}",
-        "ANSWERS": answers(results),
-        "REPORT": reported(report),
-        # Only "</" could end a script element.
-        "DATA": json.dumps(data, allow_nan=False).replace("</", "<\\/"),
-    }
-    text = FRAME.read_text(encoding="utf-8")
-    for name, part in parts.items():
-        text = text.replace(f"@{name}@", part)
-    return text
+    results, words = report.results, answers(report.results)
+    scenes = [scene_data(folder, results, report.made, scene, words[scene]) for scene in results.scenes]
+    return filled(
+        title=f"{TITLE} {folder.resolve().name}",
+        answers=words,
+        report=Markup(reported(report)),
+        data={"columns": list(COLUMNS), "rows": lines(results), "scenes": scenes},
+    )
 
 
 def run(options: Namespace) -> int:

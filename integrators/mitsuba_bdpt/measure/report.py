@@ -1,9 +1,9 @@
 """Tables and plots of a sweep.
 
-Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them.
-Explanations are read from notes.toml, if present. Parts of another Markdown file between the lines
-`<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``efficiency``, ``errors``, ``first
-images`` or ``gallery`` (of images in ../images/gallery).
+Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them, by the
+template report.md.jinja. Explanations are read from notes.toml, if present. Parts of another Markdown file
+between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``efficiency``,
+``errors``, ``first images`` or ``gallery`` (of images in ../images/gallery).
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from __future__ import annotations
 import json
 import re
 from argparse import Namespace
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from jinja2 import Template
 
 from ..errors import CommandError
 from ..files.texts import read_toml, text_of, write_text
 from ..files.whole import check_own, check_writable
 from . import figures
-from .agreement import BiasCheck
 from .analysis import (
     INDEPENDENT,
     LIGHT_TRACER,
@@ -37,26 +37,39 @@ from .analysis import (
     Unavailable,
     cost,
 )
-from .estimates import RelativeError
+from .estimates import KINDS, Error
 from .metrics import rel_mse_epsilon
 from .project import Project
-from .record import Error, Row
 from .reference import Reference
 from .results import load, missing_of
-from .tables import (
-    by_scene,
-    positive,
-    ranged,
-    ratio,
-    relative,
-    replace_part,
-    said,
-    spanned,
-    squared,
-    table,
-)
+from .tables import markdown, ratio, replace_part, spanned
+
+Figure = Callable[[str], object]
+"""A figure of a scene, see `said`."""
 
 # -- tables -----------------------------------------------------------------------------------
+
+
+def said(figure: Callable[..., object], *given: object) -> str:
+    """Call ``figure`` and format what it returns, or the reason why there is none."""
+    try:
+        return str(figure(*given))
+    except Unavailable as why:
+        return str(why)
+
+
+def by_scene(scenes: Sequence[str], columns: Mapping[str, Figure]) -> str:
+    """Return a table of a row per scene; ``columns``: figures by head."""
+    cells = {head: [said(figure, scene) for scene in scenes] for head, figure in columns.items()}
+    return markdown(pd.DataFrame({"scene": [f"`{scene}`" for scene in scenes], **cells}))
+
+
+def _grouped(scenes: Sequence[str], key: Callable[[str], Hashable]) -> dict[Any, list[str]]:
+    """Return the scenes by key, those without left out."""
+    found: dict[Any, list[str]] = defaultdict(list)
+    for scene in scenes:
+        found[key(scene)].append(scene)
+    return found
 
 
 def efficiency_table(results: Results) -> str:
@@ -66,19 +79,17 @@ def efficiency_table(results: Results) -> str:
     """
     if not results.rivals:
         return f"There is no integrator to compare {results.methods[0]} with; add one to the preset.\n"
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for scene in results.scenes:
-        rivals = tuple(rival for rival in results.rivals if results.of(scene, rival))
-        groups.setdefault(rivals, []).append(scene)
+    groups = _grouped(results.scenes, lambda scene: tuple(results.present(scene, results.rivals)))
     return "\n".join(by_scene(scenes, _efficiencies(results, rivals)) for rivals, scenes in groups.items())
 
 
-def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Callable[[str], object]]:
+def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Figure]:
     """Return the columns of the first integrator's efficiencies over the ``rivals`` and everything."""
-    columns: dict[str, Callable[[str], object]] = {}
-    for rival in rivals:
-        columns[f"over {rival}, trimmed"] = partial(results.efficiency, rival=rival)
-        columns[f"over {rival}, raw"] = partial(results.efficiency, rival=rival, error="rel_mse")
+    columns: dict[str, Figure] = {
+        f"over {rival}, {kind}": partial(results.efficiency, rival=rival, error=error)
+        for rival in rivals
+        for error, kind in KINDS.items()
+    }
     if NONE in results.aside and NONE in results.methods:
         columns[f"over {NONE}, trimmed"] = partial(results.efficiency, rival=NONE)
     if any(results.lacks(scene, rival) for scene in results.scenes for rival in rivals):
@@ -90,44 +101,38 @@ def _lacking(results: Results, rivals: Sequence[str], scene: str) -> str:
     """Describe what each of the ``rivals`` lacks in a scene; once where they lack the same."""
     found = {rival: results.lacks(scene, rival) for rival in rivals}
     several = len(rivals) > 1 and len(set(found.values())) > 1
-    said = [f"{rival}: {text}" if several else text for rival, text in found.items() if text]
-    return "; ".join(dict.fromkeys(said)) or "none found"
+    texts = [f"{rival}: {text}" if several else text for rival, text in found.items() if text]
+    return "; ".join(dict.fromkeys(texts)) or "none found"
 
 
 def errors_table(results: Results) -> str:
     """Table of relMSE at the deciding budget: a row per scene and integrator, with its bias."""
-    head = ["scene", "integrator", "samples per pixel", "seconds", "renders"]
-    head += ["relMSE, trimmed", "relMSE, raw", "variance", "squared bias", "energy"]
-    lines: list[list[str]] = []
+    lines: list[dict[str, str]] = []
     for scene in results.scenes:
-        for method in results.methods:
-            if rows := results.of(scene, method, results.deciding):
-                trimmed, raw = (results.error(scene, method, error) for error in KINDS)
-                lines.append(
-                    [
-                        *(f"`{scene}`", method, f"{np.median([row['spp'] for row in rows]):.0f}"),
-                        *(spanned([row["seconds"] for row in rows]), str(len(rows))),
-                        *(relative(trimmed), relative(raw), *_parts(raw)),
-                        results.lacks(scene, method) or said(_energy, results, scene, method),
-                    ]
-                )
-    return table(head, lines)
-
-
-def _parts(raw: RelativeError) -> tuple[str, str]:
-    """Format variance and squared bias, or why there are none."""
-    if raw.variance is None or raw.squared_bias is None:
-        why = "one render" if raw.count == 1 else "images are missing, or samples differ"
-        return why, why
-    return positive(raw.variance, raw.count), squared(raw.squared_bias, raw.count)
+        for method in results.present(scene, results.methods, results.deciding):
+            rows = results.of(scene, method, results.deciding)
+            trimmed, raw = (results.error(scene, method, error) for error in KINDS)
+            variance, squared_bias = raw.parts
+            lines.append(
+                {
+                    "scene": f"`{scene}`",
+                    "integrator": method,
+                    "samples per pixel": f"{rows['spp'].median():.0f}",
+                    "seconds": spanned(rows["seconds"]),
+                    "renders": str(len(rows)),
+                    "relMSE, trimmed": str(trimmed),
+                    "relMSE, raw": str(raw),
+                    "variance": variance,
+                    "squared bias": squared_bias,
+                    "energy": results.lacks(scene, method) or said(_energy, results, scene, method),
+                }
+            )
+    return markdown(pd.DataFrame(lines))
 
 
 def _energy(results: Results, scene: str, method: str) -> str:
     found = results.surplus(scene, method)
     return f"{100 * found.value:+.2g} % ± {50 * (found.high - found.low):.2g}"
-
-
-KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
 
 
 def budgets_table(results: Results) -> str:
@@ -136,48 +141,50 @@ def budgets_table(results: Results) -> str:
     def figure(error: Error, budget: int, scene: str) -> Summary:
         return results.against_path(scene, error, budget)
 
-    groups: dict[tuple[int, ...], list[str]] = {}
-    for scene in results.scenes:
+    def budgets(scene: str) -> tuple[int, ...]:
+        """Return the budgets with a figure: not of a single render, or none, or an exact one."""
         found: list[int] = []
-        for budget in sorted({row["budget"] for row in results.of(scene, results.methods[0])}):
+        for budget in sorted(results.of(scene, results.methods[0])["budget"].unique()):
             try:
                 figure("rel_mse", budget, scene)
-            except Unavailable:  # a single render, or none, or an exact one
+            except Unavailable:
                 continue
             found.append(budget)
-        if found:
-            groups.setdefault(tuple(found), []).append(scene)
-    tables: list[str] = []
-    for budgets, scenes in groups.items():
-        columns: dict[str, Callable[[str], object]] = {
-            f"{budget} spp, {kind}": partial(figure, error, budget)
-            for budget in budgets
-            for error, kind in KINDS.items()
-        }
-        tables.append(by_scene(scenes, columns))
-    return "\n".join(tables)
+        return tuple(found)
+
+    return "\n".join(
+        by_scene(
+            scenes,
+            {
+                f"{budget} spp, {kind}": partial(figure, error, budget)
+                for budget in found
+                for error, kind in KINDS.items()
+            },
+        )
+        for found, scenes in _grouped(results.scenes, budgets).items()
+        if found
+    )
 
 
 def first_images_table(results: Results) -> str:
     """Table of seconds from an empty kernel cache to the first image, introduced; empty if not measured."""
-    found: dict[tuple[str, str], float] = {}
-    for row in results.rows:
-        if (seconds := row.get("seconds_first_image")) is not None:
-            found[row["scene"], row["method"]] = seconds
+    if "seconds_first_image" not in results.rows:
+        return ""
+    rows = results.rows.dropna(subset="seconds_first_image")
+    found = rows.groupby(["scene", "method"])["seconds_first_image"].last().to_dict()
+    ours = results.methods[0]
 
     def over(rival: str, scene: str) -> str:
-        ours, theirs = found.get((scene, results.methods[0])), found.get((scene, rival))
-        return "–" if ours is None or theirs is None else f"{theirs:.3g} s, {ratio(ours / theirs)}"
+        seconds = found.get((scene, rival))
+        return "–" if seconds is None else f"{seconds:.3g} s, {ratio(found[scene, ours] / seconds)}"
 
-    columns: dict[str, Callable[[str], object]] = {
-        results.methods[0]: lambda scene: f"{found[scene, results.methods[0]]:.3g} s",
+    columns: dict[str, Figure] = {
+        ours: lambda scene: f"{found[scene, ours]:.3g} s",
         **{f"{rival}, ratio to it": partial(over, rival) for rival in results.standard},
     }
-    scenes = [scene for scene in results.scenes if (scene, results.methods[0]) in found]
-    if not scenes:
-        return ""
+    scenes = [scene for scene in results.scenes if (scene, ours) in found]
     text = "Seconds from an empty kernel cache to the first image, at the fewest samples of the sweep:"
-    return f"{text}\n\n{by_scene(scenes, columns)}\n"
+    return f"{text}\n\n{by_scene(scenes, columns)}\n" if scenes else ""
 
 
 def gaps_table(results: Results) -> str:
@@ -186,7 +193,7 @@ def gaps_table(results: Results) -> str:
     For the first integrator and the first of `Results.standard`, by decreasing ratio.
     """
     ours, rivals = results.methods[0], _first_rivals(results)
-    columns: dict[str, Callable[[str], object]] = {ours: partial(results.gap, method=ours)}
+    columns: dict[str, Figure] = {ours: partial(results.gap, method=ours)}
     if rivals:
         columns[" or ".join(rivals)] = lambda scene: results.gap(
             scene, (results.standard_in(scene) or rivals)[0]
@@ -206,59 +213,49 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     rival = " or ".join(_first_rivals(results) or RIVALS[:1])
 
     def costs(method: str, scene: str) -> Summary:
-        first = results.standard_in(scene)[:1]
-        theirs = results.of(scene, first[0], results.deciding) if first else []
-        return cost(results.of(scene, method, results.deciding), theirs)
+        first = (results.standard_in(scene) or RIVALS)[0]
+        return cost(*(results.of(scene, name, results.deciding) for name in (method, first)))
 
     def bias(scene: str) -> str:
         try:
-            verdict = _verdict(results.bias(scene, ours), made[scene].merged)
+            verdict = _verdict(results, scene, made[scene].merged)
         except Unavailable as few:
             why = str(few)
             verdict = said(lambda: f"energy {_energy(results, scene, ours)} ({why}: no verdict)")
         return f"{verdict}, by {_maker(made[scene])}"
 
-    columns: dict[str, Callable[[str], object]] = {
-        f"cost of a sample over {rival}": partial(costs, ours),
-        f"{NONE} over {rival}": partial(costs, NONE),
-        "slope": partial(_slope, results, notes),
-        "slope, independent points": partial(results.convergence, method=INDEPENDENT),
-        "bias check": bias,
+    def over_light_tracer(scene: str) -> str:
+        lacks = results.lacks(scene, LIGHT_TRACER)
+        return said(results.efficiency, scene, LIGHT_TRACER) + (f"; {lacks}" if lacks else "")
+
+    columns: dict[str, tuple[str, Figure]] = {
+        f"cost of a sample over {rival}": (ours, partial(costs, ours)),
+        f"{NONE} over {rival}": (NONE, partial(costs, NONE)),
+        "slope": (ours, partial(_slope, results, notes)),
+        "slope, independent points": (INDEPENDENT, partial(results.convergence, method=INDEPENDENT)),
+        "bias check": (ours, bias),
     }
     if LIGHT_TRACER in results.aside:  # else it is in the table of efficiencies
-        columns[f"efficiency over {LIGHT_TRACER}"] = lambda scene: _with_bias(results, scene, LIGHT_TRACER)
-    of = {f"{NONE} over {rival}": NONE, "slope, independent points": INDEPENDENT}
-    of[f"efficiency over {LIGHT_TRACER}"] = LIGHT_TRACER
-    return by_scene(results.scenes, _rendered(results, columns, of))
-
-
-def _rendered(
-    results: Results, columns: dict[str, Callable[[str], object]], of: Mapping[str, str]
-) -> dict[str, Callable[[str], object]]:
-    """Return the ``columns`` without those ``of`` integrators that were not rendered."""
-    return {name: made for name, made in columns.items() if of.get(name) in (None, *results.methods)}
-
-
-def _with_bias(results: Results, scene: str, rival: str) -> str:
-    """Return the efficiency over ``rival``, and the energy that it lacks."""
-    lacks = results.lacks(scene, rival)
-    return said(results.efficiency, scene, rival) + (f"; {lacks}" if lacks else "")
+        columns[f"efficiency over {LIGHT_TRACER}"] = (LIGHT_TRACER, over_light_tracer)
+    rendered = {head: figure for head, (name, figure) in columns.items() if name in results.methods}
+    return by_scene(results.scenes, rendered)
 
 
 def _slope(results: Results, notes: dict[str, str], scene: str) -> str:
     rows = results.of(scene, results.methods[0])
     found = results.convergence(scene, results.methods[0])
-    if len(set(map(_chosen, rows))) > 1:
-        return said(lambda: found) + ", between decisions"
+    if rows["decisions"].map(_chosen).nunique() > 1:
+        return f"{found}, between decisions"
     expected = found.low <= -1 <= found.high or scene in notes or not notes
-    return said(lambda: found) + ("" if expected else ", **unexplained**")
+    return f"{found}" + ("" if expected else ", **unexplained**")
 
 
-def _verdict(check: BiasCheck, merged: bool) -> str:
+def _verdict(results: Results, scene: str, merged: bool) -> str:
     """Format a bias check, with the surplus of energy and its interval in percent.
 
     ``merged``: the reference contains light that only `merging` samples.
     """
+    check = results.bias(scene, results.methods[0])
     half = 50 * (check.missing.high - check.missing.low)
     failed = "fails by what `merging` finds" if merged and check.missing.low > 0 else "**failed**"
     verdict = "passed" if check.passed else failed
@@ -268,72 +265,67 @@ def _verdict(check: BiasCheck, merged: bool) -> str:
 def choices_table(results: Results) -> str:
     """Table of the pilots' choices and costs, skipped strategies, and rays per sample."""
 
-    def rows(scene: str) -> list[Row]:
-        return results.of(scene, results.methods[0], results.deciding)
+    def rows(scene: str, method: str = results.methods[0]) -> pd.DataFrame:
+        return results.of(scene, method, results.deciding)
 
     def chosen(scene: str) -> str:
-        counts = Counter(map(_chosen, rows(scene))).most_common()
+        counts = Counter(rows(scene)["decisions"].map(_chosen)).most_common()
         return "; ".join(f"{text or 'no pilot'} ({n})" for text, n in counts) or "not rendered"
 
     def left_out(scene: str) -> str:
-        skipped = [s for row in rows(scene)[:1] for s in json.loads(row["statistics"]).get("skipped", [])]
+        first = rows(scene)["statistics"].iloc[:1]
+        skipped = [s for text in first for s in json.loads(text).get("skipped", [])]
         return ", ".join(s["class"] for s in skipped if s["level"] == "not worth its cost here") or "nothing"
 
-    columns: dict[str, Callable[[str], object]] = {
+    columns: dict[str, Figure] = {
         "chosen (number of renders)": chosen,
         "left out in the first render": left_out,
         "share of the pilot in the first render": lambda scene: f"{pilot_percent(rows(scene)):.1f} %",
         "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
-        f"the same, {NONE}": lambda scene: _rays_per_sample(results.of(scene, NONE, results.deciding)),
     }
-    return by_scene(results.scenes, _rendered(results, columns, {f"the same, {NONE}": NONE}))
+    if NONE in results.methods:
+        columns[f"the same, {NONE}"] = lambda scene: _rays_per_sample(rows(scene, NONE))
+    return by_scene(results.scenes, columns)
 
 
-def _chosen(row: Row) -> str:
+def _chosen(decisions: str) -> str:
     """Return the pilot's last choice as parameters; empty without a pilot."""
-    decisions = json.loads(row["decisions"] or "null")
-    last = decisions[-1] if decisions else None
-    if last is None:
+    found = json.loads(decisions or "null")
+    if not found:
         return ""
-    share = last["light_paths"]
+    share = found[-1]["light_paths"]
     light_paths = f"1/{round(1 / share)}" if share else "0"
-    return f"light_paths={light_paths}, connections={last['connections']}"
+    return f"light_paths={light_paths}, connections={found[-1]['connections']}"
 
 
-def pilot_percent(rows: Sequence[Row]) -> float:
+def pilot_percent(rows: pd.DataFrame) -> float:
     """Return the pilots' share of a scene's first render in percent; later ones reuse them."""
-    shares: list[float] = []
-    for row in rows:
-        if (first := row.get("seconds_pilot")) is None:
-            raise Unavailable("rows of a version that cached no pilots")
-        shares.append(first / (first + row["seconds"]))
-    if not shares:
+    if rows.empty:
         raise Unavailable("not rendered")
-    return 100 * float(np.median(shares))
+    if "seconds_pilot" not in rows or rows["seconds_pilot"].isna().any():
+        raise Unavailable("rows of a version that cached no pilots")
+    return 100 * float((rows["seconds_pilot"] / (rows["seconds_pilot"] + rows["seconds"])).median())
 
 
-def _rays_per_sample(rows: Sequence[Mapping[str, Any]]) -> str:
+def _rays_per_sample(rows: pd.DataFrame) -> str:
     """Rays per sample: camera, light; shadow rays of s = 1, t = 1, inner."""
-    if not rows or rows[0].get("rays_camera") is None:
+    if "rays_camera" not in rows or rows["rays_camera"].iloc[:1].dropna().empty:
         return "–"
-    samples = rows[0]["spp"] * rows[0]["width"] * rows[0]["height"]
+    first = rows.iloc[0]
     kinds = (("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner"))
-    return "; ".join(
-        " + ".join(f"{rows[0][f'rays_{kind}'] / samples:.2f}" for kind in group) for group in kinds
-    )
+    samples = first["spp"] * first["width"] * first["height"]
+    return "; ".join(" + ".join(f"{first[f'rays_{kind}'] / samples:.2f}" for kind in of) for of in kinds)
 
 
 def references_table(made: dict[str, Reference]) -> str:
-    return by_scene(
-        made,
-        {
-            "max_depth": lambda scene: made[scene].provenance["max_depth"],
-            "by": lambda scene: _maker(made[scene]),
-            "samples per pixel": lambda scene: made[scene].provenance.get("spp", "–"),
-            "own relMSE": lambda scene: f"{made[scene].error:.1e}",
-            "epsilon of relMSE": lambda scene: f"{rel_mse_epsilon(made[scene].image):.3g}",
-        },
-    )
+    columns: dict[str, Figure] = {
+        "max_depth": lambda scene: made[scene].provenance["max_depth"],
+        "by": lambda scene: _maker(made[scene]),
+        "samples per pixel": lambda scene: made[scene].provenance.get("spp", "–"),
+        "own relMSE": lambda scene: f"{made[scene].error:.1e}",
+        "epsilon of relMSE": lambda scene: f"{rel_mse_epsilon(made[scene].image):.3g}",
+    }
+    return by_scene(list(made), columns)
 
 
 def _maker(kept: Reference) -> str:
@@ -351,114 +343,58 @@ def gallery(results: Results) -> str:
 
     def figure(scene: str) -> str:
         lacks = results.path_lacks(scene)
-        rival = results.tracer(scene)
-        return ranged(results.against_path(scene)) + (f"<br>`{rival}`: {lacks}" if lacks else "")
+        return f"{results.against_path(scene)}" + (f"<br>`{results.tracer(scene)}`: {lacks}" if lacks else "")
 
     cells = [
         f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
     ]
     cells += [""] * (-len(cells) % GALLERY_COLUMNS)
-    rows = [cells[i : i + GALLERY_COLUMNS] for i in range(0, len(cells), GALLERY_COLUMNS)]
-    return table(rows[0], rows[1:])
+    first, *rows = np.reshape(cells, (-1, GALLERY_COLUMNS)).tolist()
+    return markdown(pd.DataFrame(rows, columns=first))
 
 
 def stronger(results: Results) -> str:
     """Name the baselines of efficiencies by budget."""
     names = results.standard or [RIVALS[0]]
     if set(names) <= {*RIVALS, *MEDIA_RIVALS}:
-        media = (
-            ", with media the stronger of `volpath` and `volpathmis`," if set(names) & {*MEDIA_RIVALS} else ""
-        )
-        return f"the stronger `path`{media}"
+        media = ", with media the stronger of `volpath` and `volpathmis`,"
+        return "the stronger `path`" + (media if set(names) & {*MEDIA_RIVALS} else "")
     return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
 
 
-# -- files ------------------------------------------------------------------------------------
+# -- the page ---------------------------------------------------------------------------------
 
 
-def notes_text(notes: dict[str, str]) -> str:
-    """Format the explanations, each with its scenes."""
-    lines: list[str] = []
-    for text in dict.fromkeys(notes.values()):
-        scenes = ", ".join(f"`{scene}`" for scene in notes if notes[scene] == text)
-        lines.append(f"* {scenes}: {text}\n")
-    return "".join(lines)
-
-
-def machine(results: Results) -> str:
+def machine(rows: pd.DataFrame) -> str:
     """Describe machine and software of the measurements.
 
     Raises ``CommandError`` for rows of several machines or versions, or of one scene by several sources of
     the plugin.
     """
-    found: set[tuple[str, str]] = set()
-    source_of: dict[str, str] = {}
-    scenes: dict[str, set[str]] = {}
-    for row in results.rows:
-        versions, scene = json.loads(row["versions"]), row["scene"]
-        source = versions.pop("source")
-        if source_of.setdefault(scene, source) != source:
-            raise CommandError(f"the rows of {scene} are by several sources of the plugin; render them anew")
-        scenes.setdefault(source, set()).add(scene)
-        found.add((row["machine"], json.dumps(versions)))
-    if len(found) > 1:
-        raise CommandError(f"the rows are from several machines or versions: {sorted(found)}")
-    ((where, versions),) = found
-    text = where + "; " + ", ".join(f"{name} {version}" for name, version in json.loads(versions).items())
-    main, *others = sorted(scenes, key=lambda source: -len(scenes[source]))
-    named = "".join(f", {source} for `{'`, `'.join(sorted(scenes[source]))}`" for source in others)
-    return f"{text}, source {main}{named}"
+    found = rows[["scene", "machine", "versions"]].drop_duplicates()
+    versions = [json.loads(text) for text in found["versions"]]
+    found["source"] = [one.pop("source") for one in versions]
+    found["versions"] = [", ".join(f"{name} {version}" for name, version in one.items()) for one in versions]
+    wheres = (found["machine"] + "; " + found["versions"]).unique()
+    sources = found[["scene", "source"]].drop_duplicates()
+    if sources["scene"].duplicated().any():
+        scene = sources["scene"][sources["scene"].duplicated()].iloc[0]
+        raise CommandError(f"the rows of {scene} are by several sources of the plugin; render them anew")
+    if len(wheres) > 1:
+        raise CommandError(f"the rows are from several machines or versions: {sorted(wheres)}")
+    main, *others = sources["source"].value_counts().index
+    scenes = sources.groupby("source")["scene"].agg(lambda names: "`, `".join(sorted(names)))
+    return f"{wheres[0]}, source {main}" + "".join(f", {one} for `{scenes[one]}`" for one in others)
 
 
-MARK = "Made by `mitsuba-bdpt report`"
-"""What every report has in it."""
-
-
-def title(results: Results, folder: Path) -> str:
-    """Return the title: the folder, which has the preset's name, and the scene if there is one only."""
-    name = folder.resolve().name
-    return ": ".join([name[:1].upper() + name[1:], *(results.scenes if len(results.scenes) == 1 else ())])
-
-
-def _clock(results: Results) -> str:
-    """Describe the seconds, where they are not those of the clock on the wall."""
-    processor = any(row.get("clock") == "processor" for row in results.rows)
-    return "Seconds are processor seconds, of all threads together.\n" if processor else ""
-
-
-def _equal_times(results: Results) -> str:
-    """Describe the budgets at which times are equal."""
-    if all(name in results.at_equal_samples for name in results.methods[1:]):
-        return ""
-    found: dict[int, list[str]] = {}
-    for scene in results.scenes:
-        rows = [row for row in results.rows if row["scene"] == scene]
-        largest, at = max(row["budget"] for row in rows), [row.get("equal_time_spp") for row in rows]
-        for spp in {n for n in at if n is not None and n != largest}:
-            found.setdefault(spp, []).append(f"`{scene}`")
-    few = "; ".join(f"at {spp} spp: {', '.join(scenes)}" for spp, scenes in sorted(found.items()))
-    few = f" (for lack of time {few})" if few else ""
-    return (
-        f"Samples are matched for equal time at the largest budget{few}, so that times\nat others are nearly "
-        "equal; what is left is in the efficiency, as if errors fell with 1 / time."
-    )
-
-
-def _equal_samples(results: Results) -> str:
-    """Name the integrators that are not at equal time."""
-    names = ", ".join(f"`{name}`" for name in results.at_equal_samples)
-    return f"Not at equal time, but with the samples of the first integrator: {names}. " if names else ""
-
-
-def missing_text(folder: Path) -> str:
-    """Return the paragraph about renders that were cut, with the command that renders them; or nothing."""
-    found = missing_of(folder)
-    if not found:
-        return ""
-    cut = "; ".join(f"`{scene}`, {one['text']}" for scene, one in found.items())
-    commands = dict.fromkeys(one["command"] for one in found.values() if one["command"])
-    how = f" Render them by {', '.join(f'`{command}`' for command in commands)}." if commands else ""
-    return f"**Renders are missing**, cut for lack of time: {cut}.{how}\n\n"
+def matched(results: Results) -> dict[int, list[str]]:
+    """Return the scenes by the budget at which times are equal, where it is not the largest."""
+    found: dict[int, list[str]] = defaultdict(list)
+    for scene, rows in results.rows.groupby("scene", sort=False):
+        at = rows.get("equal_time_spp", pd.Series(dtype=float)).dropna().unique()
+        for spp in sorted({*at} - {rows["budget"].max()}):
+            found[int(spp)].append(f"`{scene}`")
+    return dict(sorted(found.items()))
 
 
 # Standard deviations of the logarithm of seconds over seeds. Other programs ran where that of wall seconds is
@@ -468,179 +404,62 @@ BUSY = 3.0
 FEWEST_TIMED = 3
 
 
-def _is_disturbed(rows: Sequence[Row]) -> bool:
-    """Return whether wall seconds of equal work differ much more than its processor seconds."""
-    if len(rows) < FEWEST_TIMED or any(not row.get("cpu_seconds") for row in rows):
-        return False
-    wall, processor = (
-        float(np.std(np.log([row.get(name, 0.0) for row in rows]), ddof=1))
-        for name in ("seconds", "cpu_seconds")
-    )
-    return wall > max(DISTURBED, BUSY * processor)
+def _disturbance(rows: pd.DataFrame) -> str:
+    """Return the ranges of seconds where wall seconds differ more than processor seconds; else nothing."""
+    if len(rows) < FEWEST_TIMED or "cpu_seconds" not in rows or not (rows["cpu_seconds"] > 0).all():
+        return ""
+    seconds = rows[["seconds", "cpu_seconds"]]
+    wall, processor = np.log(seconds).std()
+    if wall <= max(DISTURBED, BUSY * processor):
+        return ""
+    ranges = [f"{low:.3g}–{high:.3g} s" for low, high in zip(seconds.min(), seconds.max(), strict=True)]
+    return f"{ranges[0]} (processor {ranges[1]})"
 
 
-def busy_text(results: Results) -> str:
-    """Return the paragraph about scenes whose wall seconds other programs disturbed; or nothing."""
+def disturbed(results: Results) -> list[str]:
+    """Return the scenes whose wall seconds other programs disturbed, with the integrators."""
     found: list[str] = []
     for scene in results.scenes:
-        sides = {
-            name: results.of(scene, name, results.deciding) for name in (results.methods[0], *results.rivals)
-        }
-        disturbed = [f"{name} {_ranges(rows)}" for name, rows in sides.items() if _is_disturbed(rows)]
-        if disturbed:
-            found.append(f"`{scene}`: {', '.join(disturbed)}")
-    if not found:
-        return ""
-    why = "wall seconds differ over seeds where processor seconds do not, and so may efficiencies"
-    how = '`clock = "processor"` in the preset compares processor seconds; the sweep then renders anew'
-    return f"**Other programs ran meanwhile**: {why}. {'; '.join(found)}. {how}.\n\n"
+        names = [results.methods[0], *results.rivals]
+        texts = {name: _disturbance(results.of(scene, name, results.deciding)) for name in names}
+        if any(texts.values()):
+            found.append(f"`{scene}`: {', '.join(f'{name} {text}' for name, text in texts.items() if text)}")
+    return found
 
 
 # Seconds, and multiples of those of both renders, within which the renders of one seed follow one another.
 APART, APART_TIMES = 60.0, 10.0
 
 
-def _is_apart(first: Row, second: Row) -> bool:
-    """Return whether two renders that are compared are of different runs of a sweep."""
-    began, other = (datetime.fromisoformat(row["started"]) for row in (first, second))
-    between = abs((began - other).total_seconds())
-    return between > APART + APART_TIMES * (first["seconds"] + second["seconds"])
-
-
-def apart_text(results: Results) -> str:
-    """Return the paragraph about integrators whose renders did not follow those of the first; or nothing."""
-    found: dict[str, list[str]] = {}
+def apart(results: Results) -> dict[str, list[str]]:
+    """Return the scenes, by integrator, in which its renders did not follow those of the first."""
+    found: dict[str, list[str]] = defaultdict(list)
     for scene in results.scenes:
-        firsts = {row["seed"]: row for row in results.of(scene, results.methods[0], results.deciding)}
+        ours = results.of(scene, results.methods[0], results.deciding)
         for name in results.rivals:
-            rows = results.of(scene, name, results.deciding)
-            if any(_is_apart(firsts[row["seed"]], row) for row in rows if row["seed"] in firsts):
-                found.setdefault(name, []).append(f"`{scene}`")
-    if not found:
-        return ""
-    what = "; ".join(f"{name} in {', '.join(scenes)}" for name, scenes in found.items())
-    why = "and efficiencies have what changed on the machine between them"
-    how = "A sweep into another folder (`-o`) renders all anew"
-    first = results.methods[0]
-    return f"**Seconds of different runs** are compared with those of {first}, {why}: {what}. {how}.\n\n"
+            pairs = ours.merge(results.of(scene, name, results.deciding), on="seed")
+            began, other = (pd.to_datetime(pairs[f"started_{side}"]) for side in "xy")
+            allowed = APART + APART_TIMES * (pairs["seconds_x"] + pairs["seconds_y"])
+            if ((began - other).abs().dt.total_seconds() > allowed).any():
+                found[name].append(f"`{scene}`")
+    return found
 
 
-def _ranges(rows: Sequence[Row]) -> str:
-    wall, processor = (
-        "–".join(f"{end(row.get(name, 0.0) for row in rows):.3g}" for end in (min, max))
-        for name in ("seconds", "cpu_seconds")
-    )
-    return f"{wall} s (processor {processor} s)"
+MARK = "Made by `mitsuba-bdpt report`"
+"""What every report has in it."""
 
-
-def _introduction(results: Results) -> str:
-    """Introduce the figures, with machine and software."""
-    return f"""{MARK} from the data beside it. Machine and versions: {machine(results)}.
-
-Efficiency is 1 / (seconds · relMSE), a ratio of the renders of one seed, which followed one another;
-median (smallest–largest) over seeds; the figure has the 95 % interval of the median, for up to five seeds
-the same range. The range of five seeds holds the median in 94 % of cases, of four, three and two in 87, 75
-and 50 %. relMSE is the mean of (x − r)² / (r² + 0.01 mean(r)²), *trimmed*
-without the worst 0.1 % of values, {results.deciding} samples per pixel unless said. Its expectation is free
-of the reference's noise: raw, it is the variance over seeds; trimmed, and raw of one or two seeds, the
-error against the reference less its own. Where the mean of the renders differs from the reference, the
-squared bias is added, and the figure is a bound, since rare light that was not met is in no variance: ≥ where
-the other integrator's error is at least the one measured, ≤ where the first integrator's is, ~ where both
-are.
-{_equal_times(results)}
-{_equal_samples(results)}Where seeds were added until an interval was narrow enough, it is slightly too
-narrow (it holds the median in 90 % of cases, not 95 %).
-{_clock(results)}"""
-
-
-def _differences(results: Results) -> str:
-    """Return the sentence on energy that integrators lack or have in excess; nothing where none does."""
-    others = [name for name in results.methods if results.kind(name) != "bdpt"]
-    if not any(results.lacks(scene, name) for scene in results.scenes for name in others):
-        return ""
-    return (
-        "Energy that an integrator of Mitsuba's lacks or has in excess may be light that it does not find,\n"
-        "or a known difference: see *Differences from path and volpath* (docs/user/differences.md).\n\n"
-    )
-
-
-def _by_budget(results: Results) -> str:
-    """Return the table of efficiencies by budget with its sentence; nothing where there are none."""
-    found = budgets_table(results)
-    which = f"over {stronger(results)} of those that pass the bias check, or of all where none does"
-    return f"By budget, {which}:\n\n{found}\n" if found else ""
-
-
-def page(
-    results: Results,
-    made: dict[str, Reference],
-    notes: dict[str, str],
-    name: str,
-    missing: str = "",
-) -> str:
-    """Return the page of all tables, as Markdown, under a title; ``missing``: see `missing_text`."""
-    if unknown := sorted(set(notes) - set(results.scenes)):
-        raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
-    picture = "![Efficiency per scene](efficiency.png)"
-    return f"""# {name}
-
-{missing}{busy_text(results)}{apart_text(results)}{_introduction(results)}
-## Efficiency
-
-{efficiency_table(results)}
-{_differences(results)}{picture if results.has_efficiency(results.scenes) else ""}
-
-{_by_budget(results)}{first_images_table(results)}How much of the error single values carry:
-raw over trimmed relMSE at {results.deciding} samples per pixel:
-
-{gaps_table(results)}
-## Errors
-
-At {results.deciding} samples per pixel of the first integrator: mean (95 % interval over the seeds, from five
-renders on; of few seeds with rare bright values it is too narrow); of seconds the median (smallest–largest).
-Variance and squared bias add up to the raw error where the mean of the renders differs from the reference,
-and of two renders; elsewhere the squared bias is 0 within its noise, and may be
-negative. Energy: that of the image over the reference's, as a difference with its 95 % interval, or what is
-missing by the bias check.
-
-{errors_table(results)}
-## What was skipped
-
-By `{results.methods[0]}`, decided by a pilot in the first render of each scene, at {results.deciding} samples
-per pixel.
-Rays: closest hits of camera + light subpaths; shadow rays for s = 1 + t = 1 + other connections.
-
-{choices_table(results)}
-## Cost, convergence, bias
-
-Of `{results.methods[0]}`. Slope: exponent of raw relMSE over samples, −1 for independent samples, with its
-95 % interval ("between decisions": budgets differ in what is skipped, since a short render has no pilot).
-Bias check: Welch's test of 4 x 4 tiles and the whole image at a significance of 0.1 %, the surplus of energy,
-and what the reference was made by: where that is `bdpt`, with nothing skipped and other counts, what both
-have in common is left to the package's own tests.
-
-{checks_table(results, made, notes)}
-{notes_text(notes)}
-![relMSE over samples](samples.png)
-
-![relMSE over seconds](seconds.png)
-
-![Rays by kind](rays.png)
-
-## References
-
-{references_table(made)}"""
+TEMPLATE = Path(__file__).with_suffix(".md.jinja")
 
 
 @dataclass(frozen=True)
 class Report:
-    """The results in a folder, with notes."""
+    """The results in a folder, with notes by scene, and what was cut of scenes."""
 
     results: Results
     made: dict[str, Reference]
     notes: dict[str, str]
     title: str
-    missing: str = ""
+    missing: Mapping[str, Mapping[str, str]]
 
     @staticmethod
     def of(project: Project, folder: Path, spp: int | None = None) -> Report:
@@ -652,18 +471,55 @@ class Report:
         notes.pop("aside", None)  # read by `results.load`
         for scene, text in notes.items():
             text_of(file, scene, text)
-        return Report(results, made, notes, title(results, folder), missing_text(folder))
+        if unknown := sorted(set(notes) - set(results.scenes)):
+            raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
+        name = folder.resolve().name  # the preset's
+        scene = f": {results.scenes[0]}" if len(results.scenes) == 1 else ""
+        title = name[:1].upper() + name[1:] + scene
+        return Report(results, made, notes, title, missing_of(folder))
 
     def text(self) -> str:
         """Return the page of all tables, as Markdown."""
-        return page(self.results, self.made, self.notes, self.title, self.missing)
+        results, rows = self.results, self.results.rows
+        notes: dict[str, list[str]] = defaultdict(list)
+        for scene, text in self.notes.items():
+            notes[text].append(f"`{scene}`")
+        others = [name for name in results.methods if results.kind(name) != "bdpt"]
+        template = Template(TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True)
+        return template.render(
+            title=self.title,
+            mark=MARK,
+            missing=self.missing,
+            commands=list(dict.fromkeys(one["command"] for one in self.missing.values() if one["command"])),
+            disturbed=disturbed(results),
+            apart=apart(results),
+            machine=machine(rows),
+            spp=results.deciding,
+            ours=results.methods[0],
+            has_equal_time=set(results.methods[1:]) != {*results.at_equal_samples},
+            matched=matched(results),
+            at_equal_samples=results.at_equal_samples,
+            is_of_processor="clock" in rows and (rows["clock"] == "processor").any(),
+            efficiency=efficiency_table(results),
+            has_known_differences=any(results.lacks(s, name) for s in results.scenes for name in others),
+            has_efficiency=results.has_efficiency(results.scenes),
+            budgets=budgets_table(results),
+            stronger=stronger(results),
+            first_images=first_images_table(results),
+            gaps=gaps_table(results),
+            errors=errors_table(results),
+            choices=choices_table(results),
+            checks=checks_table(results, self.made, self.notes),
+            notes=notes,
+            references=references_table(self.made),
+        )
 
     def draw(self, folder: Path) -> None:
         """Write the plots that the page shows."""
         if self.results.has_efficiency(self.results.scenes):
-            figures.efficiencies(self.results, self.results.rivals, folder / "efficiency.png")
-        figures.convergence(self.results, "seconds", folder / "seconds.png")
-        figures.convergence(self.results, "spp", folder / "samples.png")
+            figures.efficiencies(self.results, folder / "efficiency.png")
+        figures.convergence(self.results, folder / "seconds.png", against="seconds")
+        figures.convergence(self.results, folder / "samples.png", against="spp")
         figures.rays(self.results, folder / "rays.png")
 
 

@@ -1,21 +1,20 @@
-"""A sweep's files: cells, tables, spreads over seeds."""
+"""A sweep's files: cells, tables, variances over seeds."""
 
 from __future__ import annotations
 
-import csv
+import io
 import json
 import os
 import re
 import shutil
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
-import pyarrow.parquet
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
@@ -24,7 +23,6 @@ from ..files.whole import replacing
 from . import agreement, analysis, metrics
 from .preset import FIRST_SEED, Cell, Cells, Preset
 from .project import Project
-from .record import Errors, Row
 from .reference import Reference, load_reference, read_reference, reference_path
 from .scenes import MeasuredScene, digest
 from .tables import described
@@ -39,8 +37,9 @@ def first_image_file(output: Path, cell: Cell) -> Path:
     return output / "first" / f"{cell.key}.json"
 
 
-def image_file(output: Path, cell: Cell) -> Path:
-    return output / "images" / cell.scene / f"{cell.key}.exr"
+def image_file(output: Path, render: Any) -> Path:
+    """Return the file of the image of a render: a `Cell` or a row."""
+    return output / "images" / render.scene / f"{render.key}.exr"
 
 
 def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
@@ -80,17 +79,16 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
     }
 
 
-def relative_errors(image: np.ndarray, ref: Reference) -> Errors:
+def relative_errors(image: np.ndarray, ref: Reference) -> dict[str, float]:
     """Return the relMSE of an image, raw and trimmed, and what the reference's own error adds to each."""
-    return Errors(
-        rel_mse=metrics.rel_mse(image, ref.image),
-        rel_mse_trimmed=metrics.rel_mse(image, ref.image, metrics.TRIM),
-        reference_rel_mse=ref.share_of(image, 0.0),
-        reference_rel_mse_trimmed=ref.share_of(image, metrics.TRIM),
-    )
+    found: dict[str, float] = {}
+    for name, trim in (("rel_mse", 0.0), ("rel_mse_trimmed", metrics.TRIM)):
+        found[name] = metrics.rel_mse(image, ref.image, trim)
+        found[f"reference_{name}"] = ref.share_of(image, trim)
+    return found
 
 
-def read_rows(output: Path, cells: Cells, wanted) -> list[Row]:
+def read_rows(output: Path, cells: Cells, wanted: Sequence[Cell]) -> pd.DataFrame:
     """Return the rows of the finished cells among ``wanted``.
 
     Computes errors again if the reference has changed.
@@ -103,47 +101,48 @@ def read_rows(output: Path, cells: Cells, wanted) -> list[Row]:
             continue
         row = read_json(file, "delete it, to render it anew")
         if not path.exists() or row["reference_sha256"] != digest(path):
-            image = _image(output, cell)
-            row |= errors(image, *judge_of(*cells.where()), cell.seed == FIRST_SEED)
+            row |= errors(_image(output, cell), *judge_of(*cells.where()), cell.seed == FIRST_SEED)
             write_json(file, row)
-        found.append(_with_points(row))
-    return found
+        found.append(row)
+    return _with_points(pd.DataFrame(found))
 
 
-def _with_points(row: Row) -> Row:
-    """Set the ``sampler`` of a row to what made its random numbers, of `bdpt` its ``points``; return it.
+def _with_points(rows: pd.DataFrame) -> pd.DataFrame:
+    """Set the ``sampler`` of rows to what made their random numbers, of `bdpt` its ``points``.
 
     Files of cells and older tables have the sensor's, which `bdpt` does not use.
     """
-    given = json.loads(row.get("parameters", "{}"))
-    if given.get("type") == "bdpt":
-        row["sampler"] = given.get("points", "sobol")
-    return row
+    if "parameters" not in rows:
+        return rows
+    given = rows["parameters"].map(json.loads)
+    points = [one.get("points", "sobol") if one.get("type") == "bdpt" else None for one in given]
+    return rows.assign(sampler=pd.Series(points, rows.index, str).fillna(rows["sampler"]))
 
 
-def _image(output: Path, cell: Cell) -> np.ndarray:
-    """Read the image of a finished cell; raises ``CommandError`` if it is missing."""
+def _image(output: Path, render: Any) -> np.ndarray:
+    """Read the image of a finished cell, see `image_file`; raises ``CommandError`` if it is missing."""
     try:
-        (image,), _ = read_layers(image_file(output, cell), "")
+        (image,), _ = read_layers(image_file(output, render), "")
     except (OSError, CommandError) as error:
-        file = str(cell_file(output, cell))
+        file = str(cell_file(output, render))
         raise CommandError(f"{error}: delete {file!r} too, to render the image anew") from error
     return image
 
 
-def rows(preset: Preset, cells: Cells, output: Path) -> list[Row]:
+def rows(preset: Preset, cells: Cells, output: Path) -> pd.DataFrame:
     """Return the rows of all finished cells of a scene, in order.
 
     Cells are those that were rendered: a source edited meanwhile changes their names.
     """
-    wanted = cells.possible()
-    found = read_rows(output, cells, wanted)
-    spreads = _spreads(output, cells, wanted, found) if found else {}
+    found = read_rows(output, cells, cells.possible())
+    if found.empty:
+        return found
     first = {c.method: _first_image(output, c) for c in cells.of(min(cells.subject.spp), FIRST_SEED)}
-    for row in found:
-        row |= {"variance": spreads[row["key"]], "first": preset.methods[0].name}
-        row["seconds_first_image"] = first[row["method"]]
-    return found
+    return found.assign(
+        variance=_variances(output, cells, found),
+        first=preset.methods[0].name,
+        seconds_first_image=found["method"].map(first).astype(float),
+    )
 
 
 def _first_image(output: Path, cell: Cell) -> float | None:
@@ -152,87 +151,66 @@ def _first_image(output: Path, cell: Cell) -> float | None:
     return float(np.median(read_json(file, "delete it, to render it anew"))) if file.exists() else None
 
 
-def _spreads(output: Path, cells: Cells, wanted: list[Cell], table: list[Row]) -> dict[str, float | None]:
-    """Return `metrics.spread` by the rows' keys, for each integrator and budget.
+def _variances(output: Path, cells: Cells, table: pd.DataFrame) -> pd.Series:
+    """Return `metrics.spread` of each row, over the seeds of its integrator and budget.
 
-    None for fewer than two renders, differing numbers of samples, or missing images. Cached in
-    OUTPUT/variances, since reading the images is slow.
+    NaN for fewer than two renders, differing numbers of samples, or missing images.
     """
-    there = {row["key"]: row for row in table}
-    groups: dict[tuple[str, int], list[Cell]] = {}
-    for cell in wanted:
-        if cell.key in there:
-            groups.setdefault((cell.method, cell.budget), []).append(cell)
-    file = output / "variances" / f"{cells.subject.name}.json"
-    kept = read_json(file, "delete it, to take the variance anew") if file.exists() else {}
-    now: dict[str, list[float] | None] = {}
-    found: dict[str, float | None] = dict.fromkeys(there)
-    for group in groups.values():
-        mark = " ".join([there[group[0].key]["reference_sha256"], *(cell.key for cell in group)])
-        now[mark] = kept[mark] if mark in kept else _spread(output, cells, group, there)
-        values = now[mark] or [None] * len(group)
-        found |= {cell.key: value for cell, value in zip(group, values, strict=True)}
-    if now != kept:
-        write_json(file, now)
+    found, ref = pd.Series(np.nan, table.index), None
+    for _, group in table.groupby(["method", "budget"]):
+        renders = list(group.itertuples())
+        are_there = all(image_file(output, render).exists() for render in renders)
+        if len(group) > 1 and group["spp"].nunique() == 1 and are_there:
+            ref = ref or load_reference(*cells.where())
+            found[group.index] = metrics.spread([_image(output, render) for render in renders], ref.image)
     return found
 
 
-def _spread(output: Path, cells: Cells, group: list[Cell], there: dict[str, Row]) -> list[float] | None:
-    """Like `_spreads`, of the compared cells ``group``, whose rows are ``there``."""
-    files = [image_file(output, cell) for cell in group]
-    if (
-        len(group) < 2
-        or len({there[cell.key]["spp"] for cell in group}) > 1
-        or not all(file.exists() for file in files)
-    ):
-        return None
-    return metrics.spread([_image(output, cell) for cell in group], load_reference(*cells.where()).image)
-
-
-def _stored(file: Path) -> list[Row]:
+def _stored(file: Path) -> pd.DataFrame:
     """Return the rows of a file; older sweeps have the variance as ``spread``."""
-    table = pyarrow.parquet.read_table(pa.BufferReader(file.read_bytes()))
-    names = ["variance" if name == "spread" else name for name in table.column_names]
-    return [_with_points(row) for row in table.rename_columns(names).to_pylist()]
+    return _with_points(pd.read_parquet(file).rename(columns={"spread": "variance"}))
 
 
-def beside(table: list[Row], order: Sequence[str] | None, output: Path) -> list[Row]:
+def beside(table: pd.DataFrame, order: Sequence[str] | None, output: Path) -> pd.DataFrame:
     """Return ``table`` and stored rows of other scenes, in ``order``; None: as stored, new ones last."""
-    file, done = output / "rows.parquet", {row["scene"] for row in table}
+    file = output / "rows.parquet"
     try:
-        others = _stored(file) if file.exists() else []
-    except pyarrow.ArrowInvalid as error:
+        others = _stored(file) if file.exists() else table[:0]
+    except pa.ArrowInvalid as error:
         raise CommandError(
             f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
         ) from error
-    order = order or list(dict.fromkeys(row["scene"] for row in [*others, *table]))
-    found = table + [row for row in others if row["scene"] in order and row["scene"] not in done]
-    return sorted(found, key=lambda row: order.index(row["scene"]))
+    if others.empty:
+        return table
+    done = set(table.get("scene", ()))
+    every = pd.concat([others, table])
+    order = list(order or every["scene"].unique())
+    kept = pd.concat([table, others[~others["scene"].isin(done)]])
+    kept = kept[kept["scene"].isin(order)]
+    return kept.sort_values("scene", key=lambda names: names.map(order.index), kind="stable")
 
 
-def lost(table: list[Row], output: Path) -> list[str]:
+def lost(table: pd.DataFrame, output: Path) -> list[str]:
     """Return messages about stored rows whose render is not among those of the ``table``.
 
     An edited scene has its own message.
     """
-    before = _before(output) if table else []
-    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
-    kept = {tuple(row[key] for key in keys) for row in table}
-    versions = {row["scene"]: row["scene_sha256"] for row in table}
-
-    def is_edited(row: Row) -> bool:
-        return versions.get(row["scene"], row["scene_sha256"]) != row["scene_sha256"]
-
-    edited = Counter(row["scene"] for row in before if is_edited(row))
+    before = _before(output)
+    if table.empty or before.empty:
+        return []
+    now = before["scene"].map(table.groupby("scene")["scene_sha256"].first())
+    is_edited = now.notna() & (now != before["scene_sha256"])
     told = [
         f"{name}: the scene has changed: {count} renders of it before are no longer in the tables, and used "
         "again if it is reverted"
-        for name, count in edited.items()
+        for name, count in before["scene"][is_edited].value_counts(sort=False).items()
     ]
-    gone = [row for row in before if not is_edited(row) and tuple(row[key] for key in keys) not in kept]
-    if not gone:
+    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
+    is_kept = pd.MultiIndex.from_frame(before[keys]).isin(pd.MultiIndex.from_frame(table[keys]))
+    gone = before[~is_edited & ~is_kept]
+    if gone.empty:
         return told
-    names = ", ".join(dict.fromkeys(f"{row['scene']} by {row['method']}" for row in gone))
+    names = ", ".join((gone["scene"] + " by " + gone["method"]).unique())
     text = (
         f"{output}: {len(gone)} rows are not of this preset, and no longer in the tables: {names}. Their "
         "renders are kept: sweep the earlier preset again to have its rows, and name another folder by -o"
@@ -240,12 +218,12 @@ def lost(table: list[Row], output: Path) -> list[str]:
     return [*told, text]
 
 
-def _before(output: Path) -> list[Row]:
+def _before(output: Path) -> pd.DataFrame:
     """Return the stored rows; none if they are missing or damaged, and so written anew."""
     try:
         return _stored(output / "rows.parquet")
-    except (FileNotFoundError, pyarrow.ArrowInvalid):
-        return []
+    except (FileNotFoundError, pa.ArrowInvalid):
+        return pd.DataFrame()
 
 
 def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:
@@ -268,57 +246,29 @@ def missing_of(output: Path) -> dict[str, dict[str, str]]:
     return read_json(file, "delete it, and sweep again") if file.exists() else {}
 
 
-COLUMNS: dict[str, Callable[[Row], object]] = {
-    "scene": lambda row: row["scene"],
-    "integrator": lambda row: row["method"],
-    "parameters": lambda row: described(dict(sorted(json.loads(row["parameters"]).items()))),
-    "sampler": lambda row: row["sampler"],
-    "spp": lambda row: row["spp"],
-    "seed": lambda row: row["seed"],
-    "clock": lambda row: row.get("clock", "wall"),
-}
-"""First columns of rows.csv."""
-
-NUMBERS = (
-    "budget",
-    "equal_time_spp",
-    "seconds",
-    "cpu_seconds",
-    "seconds_compile",
-    "seconds_pilot",
-    "seconds_first_image",
-    "rel_mse",
-    "rel_mse_trimmed",
-    "reference_rel_mse",
-    "reference_rel_mse_trimmed",
-    "variance",
-    "mse",
-    "mape",
-    "flip",
-    "delta_e_itp",
-    "mean",
-    "energy",
-    "width",
-    "height",
-    "max_depth",
+COLUMNS = (
+    *("scene", "integrator", "parameters", "sampler", "spp", "seed", "clock", "budget", "equal_time_spp"),
+    *("seconds", "cpu_seconds", "seconds_compile", "seconds_pilot", "seconds_first_image"),
+    *("rel_mse", "rel_mse_trimmed", "reference_rel_mse", "reference_rel_mse_trimmed", "variance"),
+    *("mse", "mape", "flip", "delta_e_itp", "mean", "energy", "width", "height", "max_depth"),
 )
-"""Further columns of rows.csv, named as in rows."""
+"""Columns of rows.csv, before those of the rays and the image."""
 
 
-def named_image(row: Row) -> str:
+def named_image(row: Any) -> str:
     """Return the name of a render's image, scene_integrator_spp_seed.exr."""
-    method = re.sub(r"[^\w.=+-]+", "-", row["method"])
-    return f"{row['scene']}_{method}_{row['spp']}_{row['seed']}.exr"
+    method = re.sub(r"[^\w.=+-]+", "-", row.method)
+    return f"{row.scene}_{method}_{row.spp}_{row.seed}.exr"
 
 
-def _name_images(table: list[Row], output: Path) -> list[str]:
+def _name_images(table: pd.DataFrame, output: Path) -> list[str]:
     """Link the images of the rows under their names; returns these, empty where there is no image.
 
     Names of the rows before are removed.
     """
     names: list[str] = []
-    for row in table:
-        stored, name = output / "images" / row["scene"] / f"{row['key']}.exr", named_image(row)
+    for row in table.itertuples():
+        stored, name = image_file(output, row), named_image(row)
         names.append(name if stored.exists() else "")
         if stored.exists():
             with replacing(output / "images" / name) as temporary:
@@ -326,41 +276,36 @@ def _name_images(table: list[Row], output: Path) -> list[str]:
                     os.link(stored, temporary)
                 except OSError:  # no links on this file system
                     shutil.copyfile(stored, temporary)
-    for name in {named_image(row) for row in _before(output)}.difference(names):
+    for name in {named_image(row) for row in _before(output).itertuples()}.difference(names):
         (output / "images" / name).unlink(missing_ok=True)
     return names
 
 
-def write_tables(table: list[Row], output: Path) -> None:
+def write_tables(table: pd.DataFrame, output: Path) -> None:
     """Write rows.parquet with all columns, rows.csv with a number or a text in each cell, and rows.json.
 
     rows.json has the parameters, decisions, statistics and versions of each render, in the order of the rows.
     """
-    columns = list(dict.fromkeys(key for row in table for key in row))
-    whole = [{key: row.get(key) for key in columns} for row in table]
-    rays = [key for key in columns if key.startswith("rays_")]
-    tidy = [
-        {name: made(row) for name, made in COLUMNS.items()}
-        | {name: row.get(name) for name in (*NUMBERS, *rays)}
-        | {"image": image}
-        for row, image in zip(table, _name_images(table, output), strict=True)
-    ]
-    encoded = {"encoding": "utf-8", "errors": "backslashreplace", "newline": ""}
-    with replacing(output / "rows.csv") as temporary, temporary.open("w", **encoded) as file:
-        writer = csv.DictWriter(file, tidy[0])
-        writer.writeheader()
-        writer.writerows(tidy)
-    parts = "parameters", "decisions", "statistics", "versions"
-    found = [
-        {key: row[key] for key in ("scene", "method", "spp", "seed", "key", "machine", "started")}
-        | {key: json.loads(row[key] or "null") for key in parts}
-        for row in table
-    ]
-    write_json(output / "rows.json", found)
-    arrays = pa.Table.from_pylist(whole)
-    place, written = columns.index("tile_means"), pa.BufferOutputStream()
-    means = arrays["tile_means"].cast(pa.list_(pa.float32()))  # seven digits, as written
-    pyarrow.parquet.write_table(arrays.set_column(place, "tile_means", means), written, compression="zstd")
+    rays = [name for name in table if name.startswith("rays_")]
+    counts = table.columns.intersection([*rays, "equal_time_spp"])
+    table = table.astype(dict.fromkeys(counts, "Int64"))
+    parts = {
+        name: [json.loads(text or "null") for text in table[name]]
+        for name in ("parameters", "decisions", "statistics", "versions")
+    }
+    plain = ["scene", "method", "spp", "seed", "key", "machine", "started"]
+    write_json(output / "rows.json", table[plain].assign(**parts).to_dict("records"))
+    tidy = table.rename(columns={"method": "integrator"}).assign(
+        parameters=[described(dict(sorted(found.items()))) for found in parts["parameters"]],
+        clock=table.get("clock", pd.Series("wall", table.index)).fillna("wall"),
+        image=_name_images(table, output),
+    )
+    encoded = {"encoding": "utf-8", "errors": "backslashreplace"}
+    with replacing(output / "rows.csv") as temporary:
+        tidy.reindex(columns=[*COLUMNS, *rays, "image"]).to_csv(temporary, index=False, **encoded)
+    means = [np.array(found, np.float32) for found in table["tile_means"]]  # seven digits, as written
+    written = io.BytesIO()
+    table.assign(tile_means=means).to_parquet(written, compression="zstd", index=False)
     with replacing(output / "rows.parquet") as temporary:
         temporary.write_bytes(written.getvalue())
 
@@ -370,9 +315,9 @@ def decided(row: Mapping[str, Any]) -> float:
     return row["cpu_seconds"] if row.get("clock") == "processor" else row["seconds"]
 
 
-def decisive(rows: list[Row]) -> list[Row]:
-    """Return the ``rows`` with the seconds by which they are compared."""
-    return [{**row, "seconds": decided(row)} for row in rows]
+def decisive(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows with the seconds by which they are compared."""
+    return table.assign(seconds=table.apply(decided, axis=1))
 
 
 def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
@@ -382,23 +327,21 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     no results, or if errors are against other references than the ``project``'s.
     """
     try:
-        rows = decisive(_stored(folder / "rows.parquet"))
-    except (FileNotFoundError, NotADirectoryError, pyarrow.ArrowInvalid) as error:
+        table = decisive(_stored(folder / "rows.parquet"))
+    except (FileNotFoundError, NotADirectoryError, pa.ArrowInvalid) as error:
         raise CommandError(
             f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
         ) from error
-    made, digests = {}, {}
-    for row in rows:
-        scene = row["scene"]
-        if scene not in made:
-            path = reference_path(project, scene, row["resolution"], row["max_depth"])
-            if not path.is_file():
-                raise CommandError(
-                    f"{folder}: the reference of {scene} is not in {str(project.references)!r}; name the "
-                    "folder of the sweep's project by --project, or run the sweep again, which makes it"
-                )
-            made[scene], digests[scene] = read_reference(path), digest(path)
-        if row["reference_sha256"] != digests[scene]:
+    made: dict[str, Reference] = {}
+    for scene, rows in table.groupby("scene", sort=False):
+        path = reference_path(project, scene, rows["resolution"].iloc[0], rows["max_depth"].iloc[0])
+        if not path.is_file():
+            raise CommandError(
+                f"{folder}: the reference of {scene} is not in {str(project.references)!r}; name the "
+                "folder of the sweep's project by --project, or run the sweep again, which makes it"
+            )
+        made[scene] = read_reference(path)
+        if (rows["reference_sha256"] != digest(path)).any():
             raise CommandError(
                 f"{folder}: the errors in {scene} were taken against another reference; run "
                 f"{project.sweep_command(folder)}, which takes them anew"
@@ -409,7 +352,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     notes = folder / "notes.toml"
     given = read_toml(notes) if notes.exists() else {}
     aside = list_of(notes, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
-    found = analysis.Results(rows, means, measured, tuple(aside))
+    found = analysis.Results(table, means, measured, aside)
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
             f"{notes}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"

@@ -31,6 +31,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pandas as pd
 
 from .. import workers
 from ..errors import CommandError, message
@@ -45,7 +46,6 @@ from .options import REFERENCE_SECONDS, VARIANT
 from .options import Sweep as SweepOptions
 from .preset import FIRST_SEED, Cell, Cells, Preset, machine, preset_of, read_preset, software
 from .project import Project
-from .record import Row
 from .reference import make_command
 from .results import (
     beside,
@@ -286,15 +286,15 @@ class Sweep:
         raise_interrupt(error)
         self.failed.append(f"{what}: {' '.join(message(error).split())}")
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> pd.DataFrame:
         """Return the rows of finished cells; unreadable scenes are recorded in ``failed``."""
-        found = []
+        found = [pd.DataFrame()]
         for cells in self.scenes:
             try:
-                found += rows(self.preset, cells, self.output)
+                found.append(rows(self.preset, cells, self.output))
             except Exception as error:
                 self._note(f"{cells.subject.name}: no rows", error)
-        return found
+        return pd.concat(found, ignore_index=True)
 
     def run(self, progress: Renders, client=None, seconds: float | None = None):
         """Render the missing cells, showing ``progress``.
@@ -471,20 +471,19 @@ def _work(cell: Cell) -> float:
     return float(cell.budget) * cell.resolution**2
 
 
-def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
+def poor_reference(cells: Cells, table: pd.DataFrame) -> list[str]:
     """Return messages about rows that the reference is too noisy for.
 
     Each with the command that refines the reference.
     """
-    rows = analysis.select(table, scene=cells.subject.name)
-    if not rows:
+    rows = table[table["scene"] == cells.subject.name] if len(table) else table
+    if rows.empty:
         return []
     project, scene, resolution, depth = cells.where()
     words = "--spp", str(max(cells.subject.spp))
     make = make_command(project, project.called(scene), resolution, depth, *words)
-    keys = dict.fromkeys((row["method"], row["budget"]) for row in rows)
-    cells_of = {key: analysis.select(rows, method=key[0], budget=key[1]) for key in keys}
-    poor = [key for key, at in cells_of.items() if seed_errors(at, "rel_mse_trimmed", False)[1]]
+    groups = rows.groupby(["method", "budget"], sort=False)
+    poor = [key for key, at in groups if seed_errors(at, "rel_mse_trimmed", False)[1]]
     if not poor:
         return []
     others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
@@ -493,14 +492,14 @@ def poor_reference(cells: Cells, table: list[Row]) -> list[str]:
     return [f"{text}whose trimmed errors are upper bounds. To go on: {make}"]
 
 
-def short_of_target(table: list[Row]) -> list[str]:
+def short_of_target(table: pd.DataFrame) -> list[str]:
     """Return messages about integrators that ended before the preset's target error."""
     renders = {}
-    for row in table:
-        target = json.loads(row["parameters"]).get("target_error", 0)
+    for row in table.itertuples():
+        target = json.loads(row.parameters).get("target_error", 0)
         if target > 0:
-            key = row["scene"], row["budget"], row["method"], target
-            error = json.loads(row["statistics"])["error"]
+            key = row.scene, row.budget, row.method, target
+            error = json.loads(row.statistics)["error"]
             renders.setdefault(key, []).append(error is None or not error <= target)
     return [
         f"{scene}, {budget} spp, {method}: {sum(short)} of {len(short)} renders did not reach "
@@ -512,7 +511,7 @@ def short_of_target(table: list[Row]) -> list[str]:
 
 def swept(
     project: Project, preset: str | Mapping[str, Any], options: SweepOptions | Namespace
-) -> tuple[list[Row], list[str]]:
+) -> tuple[pd.DataFrame, list[str]]:
     """Render the missing cells of a ``preset``; returns all rows, and failures.
 
     ``preset``: a TOML file, its name, or its content as a dictionary. With ``seconds``, missing references
@@ -554,7 +553,7 @@ def swept(
         table = beside(table, whole.scenes, output)
     for told in lost(table, output):
         print(f"warning: {told}")
-    if table:
+    if len(table):
         write_tables(table, output)
     command = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
     scenes = [subject.name for subject in whole.subjects]
@@ -571,15 +570,15 @@ def swept(
     return table, sweep.failed
 
 
-def _tell(sweep: Sweep, table: list[Row]) -> None:
+def _tell(sweep: Sweep, table: pd.DataFrame) -> None:
     """Print what time did not allow, warnings, and the number of rows."""
     # What was cut comes first: the figures depend on it.
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
-    if len({row["method"] for row in table}) == 1:
+    if len(methods := set(table.get("method", ()))) == 1:
         print(
-            f"{table[0]['method']} is the only integrator, and compared with none; tables [[integrator]] of "
+            f"{methods.pop()} is the only integrator, and compared with none; tables [[integrator]] of "
             "the preset replace the default ones: list these too"
         )
     poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
