@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -255,7 +255,7 @@ class Results:
         keys = ["scene", "method", "budget"]
         return dict(iter(self.rows.groupby(keys[:2]))) | dict(iter(self.rows.groupby(keys)))
 
-    def of(self, scene: str, method: str, *budget: int) -> pd.DataFrame:
+    def of(self, scene: str, method: str, *budget: Hashable) -> pd.DataFrame:
         """Return the rows of an integrator in a scene, of all budgets or of one."""
         return self._groups.get((scene, method, *budget), self.rows[:0])
 
@@ -293,8 +293,7 @@ class Results:
         enough = samples["sum"][samples["size"] >= FEWEST_RUNS]
         if enough.empty:
             raise Unavailable(f"fewer than {FEWEST_RUNS} renders of one budget")
-        best = self.of(scene, method, enough.index[enough.argmax()])
-        return compare_means(means_of(best), self.references[scene])
+        return compare_means(means_of(self.of(scene, method, enough.idxmax())), self.references[scene])
 
     def probed(self, name: str) -> dict[str, list[float]]:
         """Return a probe's results for the software of the rows."""
