@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 7118,
+    "measure": 6555,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2286,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2931, "tests": 38945}
-MOST_WORDS = 29068
+OUTSIDE = {"scripts": 2930, "tests": 38929}
+MOST_WORDS = 29067
 
 
 def _lines(files):

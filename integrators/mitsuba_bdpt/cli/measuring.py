@@ -17,10 +17,7 @@ from ..measure import options
 from . import mistakes
 from .values import property_
 
-NEEDED = (
-    *("colour", "flip_evaluator", "jinja2", "markdown_it", "matplotlib", "pandas", "pyarrow", "pydantic"),
-    *("scipy", "tabulate"),
-)
+NEEDED = "colour flip_evaluator jinja2 markdown_it matplotlib pandas pyarrow pydantic scipy tabulate".split()
 """What the extra ``[measure]`` installs, as modules."""
 
 
