@@ -295,6 +295,15 @@ def test_meters_of_one_ray_find_photons():
     np.testing.assert_allclose(found, centre, rtol=0.1)
 
 
+def test_crop_windows_of_one_pixel_find_photons():
+    """As many as in the whole film; standard deviation of the means: 18 and 8 %."""
+    scene = under_glass(point())
+    whole = images(scene, 64, 4, merging="auto")[:, 8, 8]
+    scene["sensor"]["film"] |= {"crop_width": 1, "crop_height": 1, "crop_offset_x": 8, "crop_offset_y": 8}
+    found = images(scene, 64, 4, first=9, merging="auto")
+    np.testing.assert_allclose(found.mean(), whole.mean(), rtol=0.4)
+
+
 # -- photons -----------------------------------------------------------------------------------------------
 
 

@@ -29,8 +29,7 @@ _PER_DISC = 64
 # their square (experiments, "Which paths are merged").
 _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 
-# Where no pixels can be measured (meters) all camera vertices share few discs: photon subpaths of a pass, at
-# least, and pixels of a film of which as many samples have the same radius.
+# Without pixels (meters): least photon subpaths of a pass, and pixels of a film with as small a radius.
 _METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
 
 # Bits of the edges and of the subpath's index in the sort key of photons.
@@ -68,6 +67,7 @@ class Passes:
         # Densities decide where the light of an even sky is merged.
         self._aim = replace(aim, no_sky=False)
         self._radius, self._pixels = settings.internals.merging_radius, pixels
+        self._uncropped = max(pixels, math.prod(sensor.film().size()))  # photons do not know the crop window
 
     def trace(
         self, kernel: TraceContext, points: Points, samples: int, done: int, start: mi.Float | None
@@ -79,7 +79,7 @@ class Passes:
         """
         if self._footprints.measured:
             radius = after(self._radius, done + samples)  # in pixels
-            count = photons_of_pass(samples * self._pixels, self._pixels, radius)
+            count = photons_of_pass(samples * self._uncropped, self._uncropped, radius)
         else:
             radius = after(self._radius, (done + samples) * self._pixels / _METER_PIXELS)
             count = max(photons_of_pass(samples * self._pixels, math.inf, radius), _METER_PHOTONS)

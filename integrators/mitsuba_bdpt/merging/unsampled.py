@@ -95,7 +95,7 @@ def estimate(
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
     footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
-    of_samples = RADIUS * math.sqrt(kernel.camera.region.size.prod() * sets / count)
+    of_samples = RADIUS * math.sqrt(math.prod(kernel.camera.sensor.film().size()) * sets / count)
     discs = footprints.radius(of_samples if footprints.measured else 1.0)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths)
