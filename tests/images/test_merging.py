@@ -125,9 +125,8 @@ def test_floor_under_glass(light):
 
 
 def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
-    """The lamp is near to the plate, so that the floor's irradiance is strongly curved. With the same
-    photons, what discs of 1.5 and three pixels lack of those of half a pixel is as 1 : 4.4, with a standard
-    error of 0.5; between 3 and 7 (of the radius itself it would be 2.5, of its cube 8.3)."""
+    """What discs of 1.5 and 3 pixels lack of those of half a pixel is as 1 : 4.4, with a standard error of
+    0.5; between 3 and 7 (of the radius itself it would be 2.5, of its cube 8.3)."""
     monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
     scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
@@ -151,10 +150,8 @@ def under_a_spot(away):
 
 
 def test_far_from_the_origin(monkeypatch):
-    """At 10^4 scene units coordinates are 0.001 apart; discs of a tenth of a pixel, 0.0013, hold too few
-    points, or too many. Expected: the mean of the same scene at the origin, within 3 %. There rays leave
-    surfaces by 0.02, which shortens the way from the lamp: 1.7 % brighter, with discs of any size. Standard
-    error 0.4 %."""
+    """At 10^4 scene units coordinates are 0.001 apart; discs of 0.0013 hold too few points, or too many.
+    Rays leave surfaces by 0.02: 1.7 % brighter. Standard error 0.4 %."""
     monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
     monkeypatch.setattr(photon_pass, "FEWEST_PHOTONS", 1 << 17)
     monkeypatch.setattr(passes, "_PER_DISC", 1 << 17)
@@ -169,8 +166,7 @@ def test_far_from_the_origin(monkeypatch):
 
 
 def test_wavelengths_lie_evenly():
-    """The numbers that choose wavelengths, those of a set a quarter apart, lie evenly in each pass;
-    neighbouring sets begin in different quarters; later passes have others between."""
+    """In each pass; neighbouring sets begin in different quarters; later passes have others between."""
     number = dr.arange(mi.UInt32, wavelength_sets.SETS)
     starts = []
     for done in range(8):
@@ -196,9 +192,7 @@ SMALL = {
 
 @cache
 def small(shape):
-    """A scene in which all light has met this shape under the glass, and its image's brightness without
-    merging. The lamp lies where its reflection in the glass is not seen.
-    """
+    """A scene in which all light has met this shape under the glass, and its brightness without merging."""
     scene = under_glass(ball(1.0) | {"center": [6.0, 0.0, 4.5]})
     scene["floor"] = SMALL[shape] | {"bsdf": matte()}
     scene["sensor"]["fov"] = 36
@@ -207,10 +201,7 @@ def small(shape):
 
 
 def of_a_square(share):
-    """The share of the light that is left of a square, of pairs of points in a disc that both are in it.
-
-    The radius is ``share`` of half of the width a: 1 - 2 mean|x| / a + mean|x y| / a^2 over the disc.
-    """
+    """1 - 2 mean|x| / a + mean|x y| / a^2 over a disc, whose radius is ``share`` of half of the width a."""
     return 1 - 4 / (3 * np.pi) * share + share**2 / (8 * np.pi)
 
 

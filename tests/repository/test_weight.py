@@ -25,7 +25,7 @@ MOST = {
     "": 1451,  # top files
 }
 OUTSIDE = {"scripts": 2930, "tests": 38929}
-MOST_WORDS = 29067
+MOST_WORDS = 29063
 
 
 def _lines(files):
