@@ -166,19 +166,6 @@ def test_sizes_that_are_refused(capsys):
     assert rendered.image("a.exr", "RGB")[0].shape == (4, 4, 3)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [["--size", "16"], ["--size", "0x4"], ["--crop", "1,2,3"], ["--crop", "0,0,0,4"], ["--frames", "3-1"]]
-    + [["--resume", "plain.xml"], ["--resume", "yes"]]
-    + [["--frames", "x"], ["--frames", "0-4:0"], ["--threads", "0"]],
-    ids=" ".join,
-)
-def test_values_that_are_refused(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        build_parser().parse_args(["render", "scene.xml", *arguments])
-    assert ended.value.code == 2 and "must" in capsys.readouterr().err
-
-
 def test_ranges_of_frames():
     assert values.frames("3") == [3] and values.frames("0-3") == [0, 1, 2, 3]
     assert values.frames("0-10:5,7") == [0, 5, 10, 7]
@@ -361,13 +348,6 @@ def test_a_warning_is_one_line_on_standard_error(tmp_path, capfd):
     assert "\x1b" not in shown.out + shown.err and "bdpt: " not in shown.out
     mi.Log(mi.LogLevel.Warn, "after the command")
     assert "WARN" in capfd.readouterr().out
-
-
-def test_version_names_mitsubas(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["--version"])
-    assert ended.value.code == 0
-    assert re.fullmatch(r"mitsuba-bdpt \S+ \(mitsuba 3\.\S+, drjit \S+\)\n", capsys.readouterr().out)
 
 
 def test_a_drive_that_is_gone_does_not_cost_the_image(capsys, monkeypatch, tmp_path):

@@ -5,7 +5,7 @@ import re
 import signal
 import subprocess
 import sys
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 import OpenEXR
@@ -185,21 +185,6 @@ def test_what_a_scene_names_is_part_of_it():
         checkpoints.digest(options)
 
 
-def test_many_files_of_a_scene(monkeypatch):
-    names = [f"{i}.ply" for i in range(100)]
-    for name in names:
-        Path(name).write_text("a mesh")
-    shapes = "".join(f'<shape type="ply"><string name="filename" value="{name}"/></shape>' for name in names)
-    Path("scene.xml").write_text(f'<scene version="3.0.0">{shapes}{shapes}</scene>')
-    state = parsed(Path("scene.xml"), {})
-    compared, original = [], PurePath.__eq__
-    with searching(Path("scene.xml")), monkeypatch.context() as patch:
-        patch.setattr(PurePath, "__eq__", lambda a, b: compared.append(a) or original(a, b))
-        found = named_files(state)
-    assert [path.name for path in found] == ["scene.xml", *names]
-    assert len(compared) < 2 * 2 * len(names)
-
-
 @pytest.mark.parametrize(
     "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin1"]
 )
@@ -288,11 +273,6 @@ def test_a_render_that_had_reached_its_error_is_not_traced_on(monkeypatch):
     assert rendered.image("a.exr")[1]["spp"] == kept.spp and not Path("a.checkpoint.npz").exists()
 
 
-def test_an_error_that_is_not_reached_is_said(capsys):
-    assert main([*ARGUMENTS, "--target-error", "1e-9", "--spp", "32", "-o", "a.exr"]) == 0
-    assert "not the 1e-09 asked for" in capsys.readouterr().out
-
-
 def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
     arguments = [*ARGUMENTS, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
     interrupt(monkeypatch, arguments)
@@ -335,12 +315,6 @@ def test_until_an_error(capsys):
 def test_contradictions_are_refused(arguments, words, capsys):
     assert main([*ARGUMENTS[:4], "-o", "a.exr", *arguments]) == 2
     assert words in capsys.readouterr().err and not Path("a.exr").exists()
-
-
-def test_defaults_of_the_command_line():
-    options = build_parser().parse_args(["render", "a.xml"])
-    assert options.checkpoint is options.target_error is options.scheduler is options.parts is None
-    assert not options.resume
 
 
 def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):

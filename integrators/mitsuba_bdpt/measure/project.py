@@ -26,9 +26,6 @@ from .scenes import DictionaryScene, MeasuredScene, SceneFile
 PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
 """Stems of scene files that are named by their folders: of exporters, one folder per scene."""
 
-LISTED = 30
-"""Names of scenes that a message lists, at most."""
-
 
 @dataclass(frozen=True)
 class Project:
@@ -104,7 +101,7 @@ class Project:
         known = self.scene_names()
         if not known:
             return f", or put it into {str(self.scenes)!r} and give its name"
-        text = f", or a name; there are {listed(known, LISTED)}; {did_you_mean(name, known)}"
+        text = f", or a name; there are {listed(known, 30)}; {did_you_mean(name, known)}"
         return text.rstrip("; ")
 
     def depth(self, scene: MeasuredScene) -> int:
@@ -118,15 +115,15 @@ class Project:
 
     def preset(self, name: str) -> Path:
         """Return the path of a preset, by file or name; it may not exist."""
-        return self._found(Path(name), self.root / "presets" / f"{name}.toml")
+        return self._found(name, self.root / "presets" / f"{name}.toml")
 
     def results(self, name: str) -> Path:
         """Return the results of a sweep, by folder or name; they may not exist."""
-        return self._found(Path(name), self.root / "results" / name)
+        return self._found(name, self.root / "results" / name)
 
     @staticmethod
-    def _found(given: Path, named: Path) -> Path:
-        return named if named.exists() and not given.exists() else given
+    def _found(given: str, named: Path) -> Path:
+        return named if named.exists() and not Path(given).exists() else Path(given)
 
 
 def name_of(file: Path) -> str:

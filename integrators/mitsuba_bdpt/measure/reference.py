@@ -62,20 +62,17 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
 
 
 def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """Return the command line that makes or refines the reference of a scene, with its limit of time.
+    """Return the command line, or for a dictionary the call, that makes or refines a reference.
 
-    ``called``: the scene's name; for a dictionary, returns the call in Python. ``more``: further options and
-    their values.
+    ``called``: the scene's name. ``more``: further options and their values.
     """
-    more = *more, "--seconds", f"{REFERENCE_SECONDS:g}"
-    if called in project.given:
-        options = {"resolution": resolution, "max_depth": max_depth} | dict(
-            zip((name.strip("-") for name in more[::2]), more[1::2], strict=True)
-        )
-        said = "".join(f", {name}={value}" for name, value in options.items())
-        return f"mitsuba_bdpt.measure.make_reference(SceneDict({called!r}, ...){said})"
-    words = ["reference", called, "--resolution", str(resolution), "--max-depth", str(max_depth), *more]
-    return project.command(*words)
+    size = "--resolution", str(resolution), "--max-depth", str(max_depth)
+    words = [*size, *more, "--seconds", f"{REFERENCE_SECONDS:g}"]
+    if called not in project.given:
+        return project.command("reference", called, *words)
+    names = (name.strip("-").replace("-", "_") for name in words[::2])
+    said = "".join(f", {name}={value}" for name, value in zip(names, words[1::2], strict=True))
+    return f"mitsuba_bdpt.measure.make_reference(SceneDict({called!r}, ...){said})"
 
 
 def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_depth: int) -> Reference:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -28,13 +28,13 @@ from ..files.whole import from_utf8
 from ..host.introspection import media_of
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A scene's integrator, `has_media`, and the image's size or why it has none."""
+class _Look(NamedTuple):
+    """A scene's integrator, `has_media`, the size of its film, and whether that has colours."""
 
     integrator: mi.Integrator
     has_media: bool
-    size: tuple[int, int] | CommandError
+    size: tuple[int, int]
+    has_colours: bool
 
 
 class MeasuredScene(ABC):
@@ -73,10 +73,9 @@ class MeasuredScene(ABC):
     def load(self, resolution: int | None = None, sampler: str | None = None, **definitions: Any) -> mi.Scene:
         """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
 
-        Size and sampler are of the first sensor, see `_resize`; None keeps the scene's own. ``definitions``:
-        values of its parameters. Film and sampler are changed after parsing: what parameters such as
-        ``$resolution`` would change beside the width is the file's. Raises ``CommandError`` for a scene
-        without sensor, ``RuntimeError`` (of Mitsuba) for an invalid one.
+        Size and sampler are of the first sensor; None keeps the scene's own. ``definitions``: values of its
+        parameters. Raises ``CommandError`` for a scene without sensor, ``RuntimeError`` (of Mitsuba) for an
+        invalid one.
         """
         scene = unless_incompatible(lambda merges: self._instantiated(definitions, sampler, merges))
         if resolution is not None:
@@ -88,10 +87,12 @@ class MeasuredScene(ABC):
 
         Raises ``CommandError`` for a film without colours.
         """
-        own = self._look.size
-        if isinstance(own, CommandError):
-            raise own
-        return own if resolution is None else _widened(own, resolution)
+        if not self._look.has_colours:
+            raise CommandError(
+                f"scene={self.called}: its film has no colours, of which errors are taken; give it the "
+                'pixel_format "rgb"'
+            )
+        return self._look.size if resolution is None else _widened(self._look.size, resolution)
 
     @cached_property
     def max_depth(self) -> int:
@@ -107,11 +108,9 @@ class MeasuredScene(ABC):
     def _look(self) -> _Look:
         """Loads the scene once, which may be slow."""
         scene = self.load()
-        try:
-            size = _size_of(scene, self.called)
-        except CommandError as error:  # raised only when the size is needed
-            size = error
-        return _Look(scene.integrator(), has_media(scene), size)
+        film = choose_sensor(scene, 0).film()
+        width, height = map(int, film.size())
+        return _Look(scene.integrator(), has_media(scene), (width, height), film.base_channels_count() >= 3)
 
 
 @dataclass(frozen=True)
@@ -284,31 +283,17 @@ def check_plugins(name: str, parameters: Mapping[str, Any], sampler: str | None,
             raise CommandError(f"{what}: {last}") from error
 
 
-def _size_of(scene: mi.Scene, called: str) -> tuple[int, int]:
-    """Return width and height of the first sensor; raises like `MeasuredScene.size`."""
-    film = choose_sensor(scene, 0).film()
-    if film.base_channels_count() < 3:
-        raise CommandError(
-            f"scene={called}: its film has no colours, of which errors are taken; give it the "
-            'pixel_format "rgb"'
-        )
-    width, height = film.size()
-    return int(width), int(height)
-
-
 def _widened(size: tuple[int, int], width: int) -> tuple[int, int]:
-    """Scale a film's ``size`` to a width."""
     return width, max(round(width * size[1] / size[0]), 1)
 
 
-def _resize(scene, width: int) -> None:
+def _resize(scene: mi.Scene, width: int) -> None:
     """Scale the first sensor's film to a width, however the file sets its size, without crop window."""
-    old_width, old_height = choose_sensor(scene, 0).film().size()
-    size = list(_widened((int(old_width), int(old_height)), width))
+    old_width, old_height = map(int, choose_sensor(scene, 0).film().size())
+    size = list(_widened((old_width, old_height), width))
     changed = mi.traverse(scene.sensors()[0])
-    changed["film.size"] = size
+    changed["film.size"] = changed["film.crop_size"] = size
     changed["film.crop_offset"] = [0, 0]
-    changed["film.crop_size"] = size
     changed.update()
 
 
