@@ -197,10 +197,6 @@ def test_encodings_of_a_scene_file(encoding):
     with searching(Path("names.xml")):
         found = named_files(parsed(Path("names.xml"), {}))
     assert [path.name for path in found] == ["names.xml", name]
-    box = SCENE.read_text().partition("<scene")[2].partition(">")[2].rpartition("</scene>")[0]
-    Path("box.xml").write_bytes(text.format(box).encode(encoding))
-    command = [ARGUMENTS[0], "box.xml", *ARGUMENTS[2:]]
-    assert main([*command, "--spp", "4", "-o", "a.exr", "--checkpoint", "60"]) == 0
 
 
 def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):

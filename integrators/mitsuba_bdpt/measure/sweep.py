@@ -78,18 +78,14 @@ class Bench:
 
     def __init__(self, cells: Cells, output: Path, seconds: float | None = None):
         self.cells, self.output, self.seconds = cells, output, seconds
-        _, self._file, self._resolution, self._depth = cells.where()
-        self._scenes, self._integrators, self._first, self._spp = {}, {}, {}, {}
+        _, file, resolution, depth = cells.where()
+        self.scene = cache(lambda sampler: file.load(resolution, sampler))
+        self._loaded = cache(lambda parameters: integrator_of(dict(parameters), depth))
+        self._first: dict[tuple[str, int], tuple[float, float]] = {}
+        self._spp: dict[str, dict[str, float]] = {}
 
-    def scene(self, sampler: str):
-        if sampler not in self._scenes:
-            self._scenes[sampler] = self._file.load(self._resolution, sampler)
-        return self._scenes[sampler]
-
-    def integrator(self, cell: Cell):
-        if cell.parameters not in self._integrators:
-            self._integrators[cell.parameters] = integrator_of(dict(cell.parameters), self._depth)
-        return self._integrators[cell.parameters]
+    def integrator(self, cell: Cell) -> mi.Integrator:
+        return self._loaded(cell.parameters)
 
     def timed(self, cell: Cell, spp: int, seed: int) -> Timed:
         """Render with the integrator of a cell."""
@@ -130,8 +126,7 @@ class Bench:
     def _equal(self, cell: Cell) -> dict[str, float]:
         """Return the ``samples`` of an integrator in the time of one of the first, and at which ``spp``.
 
-        Measured once, at the largest budget, or the largest that the limit of time allows, and kept in a
-        file.
+        Measured once, and kept in a file.
         """
         if cell.method not in self._spp:
             one = next(c for c in self.cells.of(max(self.cells.subject.spp), 0) if c.method == cell.method)
@@ -242,10 +237,15 @@ class Sweep:
         self.project, self.preset, self.output = project, preset, output
         self.cut, self.wanted = dict[str, str](), 0
         self.failed = list(preset.left_out)
-        self.scenes = [Cells(project, preset, subject) for subject in preset.subjects]
-        self._todo = [[c for c in cells.planned() if not self._is_there(c)] for cells in self.scenes]
+        scenes = [Cells(project, preset, subject) for subject in preset.subjects]
+        self._todo = {cells: [c for c in cells.planned() if not self._is_there(c)] for cells in scenes}
         self._judges, self._tried = {}, set()
         self._progress = Renders()  # placeholder until `run`
+
+    @property
+    def scenes(self) -> list[Cells]:
+        """The scenes that have references."""
+        return list(self._todo)
 
     def check(self):
         """Raise ``CommandError`` for plugins and references that cannot be made."""
@@ -257,9 +257,8 @@ class Sweep:
 
     def _jobs(self) -> list[tuple[Cells, Job]]:
         """Return the scenes that lack renders or their reference, with these."""
-        jobs = [Job(*cells.where(), spp=max(cells.subject.spp)) for cells in self.scenes]
-        every = zip(self.scenes, jobs, self._todo, strict=True)
-        return [(cells, job) for cells, job, missing in every if missing or job.is_missing]
+        jobs = {cells: Job(*cells.where(), spp=max(cells.subject.spp)) for cells in self.scenes}
+        return [(cells, job) for cells, job in jobs.items() if self._todo[cells] or job.is_missing]
 
     def prepare(self, seconds: float | None = None, limit: float | None = None):
         """Make the references that are missing, or of another version of their scene, before rendering.
@@ -271,15 +270,12 @@ class Sweep:
         if seconds is None:
             lacking = sum(job.is_missing for _, job in wanted)
             seconds = REFERENCE_SECONDS if limit is None else limit / 2 / max(lacking, 1)
-        lost = []
         for cells, job in wanted:
             try:
                 obtained(replace(job, seconds=seconds))
             except Exception as error:
                 self._note(f"{job.scene.name}: left out", error)
-                lost.append(cells)
-        kept = [i for i, cells in enumerate(self.scenes) if cells not in lost]
-        self.scenes, self._todo = [self.scenes[i] for i in kept], [self._todo[i] for i in kept]
+                del self._todo[cells]
 
     def _note(self, what: str, error: Exception):
         """Record a failure; re-raises ``KeyboardInterrupt``."""
@@ -302,17 +298,16 @@ class Sweep:
         ``client``: of a cluster, to render there. ``seconds``: limit, shared equally by the scenes; what does
         not fit is recorded in ``cut``.
         """
-        scenes, todo = self.scenes, self._todo
         self._progress = progress
-        progress.plan(_work(cell) for missing in todo for cell in missing)
+        progress.plan(_work(cell) for missing in self._todo.values() for cell in missing)
         if client is not None:
-            self._remote(client, scenes, todo)
+            self._remote(client)
             return
         self._probes()
         if seconds is not None:
             self._limited(seconds)
             return
-        for cells, missing in zip(scenes, todo, strict=True):
+        for cells, missing in self._todo.items():
             bench = Bench(cells, self.output)
             self._first_images(cells)
             while missing := missing or self._more(cells):
@@ -323,10 +318,8 @@ class Sweep:
     def _limited(self, seconds: float):
         """Render what fits into the ``seconds``, see `Pending`, of which the scenes have equal shares."""
         end = time.monotonic() + seconds
-        lacking = [
-            (cells, missing) for cells, missing in zip(self.scenes, self._todo, strict=True) if missing
-        ]
-        pending = [Pending(cells, missing, self._known_seconds(cells)) for cells, missing in lacking]
+        todo = self._todo.items()
+        pending = [Pending(cells, missing, self._known_seconds(cells)) for cells, missing in todo if missing]
         benches: dict[int, Bench] = {}
         for cells in self.scenes:
             self._first_images(cells)
@@ -334,7 +327,7 @@ class Sweep:
         def rendered(i: int) -> int:
             """Render what fits of a scene into its share of the time left."""
             if i not in benches:
-                benches[i] = Bench(lacking[i][0], self.output, seconds / len(lacking))
+                benches[i] = Bench(pending[i].cells, self.output, seconds / len(pending))
             sharing = sum(bool(other.late) for other in pending[i:])
             share = (end - time.monotonic()) / max(sharing, 1)
             done = pending[i].render(partial(self._cell, benches[i]), max(share, 0.0))
@@ -409,14 +402,13 @@ class Sweep:
             self._judges[cells.where()] = judge_of(*cells.where())
         store(self.output, cell, *result, self._judges[cells.where()])
 
-    def _remote(self, client, scenes: list[Cells], todo: list[list[Cell]]):
-        """Render the cells of ``todo``, and those that follow, on a cluster."""
-        while any(
-            todo := [missing or self._more(cells) for cells, missing in zip(scenes, todo, strict=True)]
-        ):
+    def _remote(self, client):
+        """Render the missing cells, and those that follow, on a cluster."""
+        todo = self._todo
+        while any((todo := {cells: todo[cells] or self._more(cells) for cells in todo}).values()):
             groups = [
                 (cells, list(group))
-                for cells, missing in zip(scenes, todo, strict=True)
+                for cells, missing in todo.items()
                 for _, group in groupby(missing, key=lambda cell: (cell.budget, cell.seed))
             ]
             for index, results in workers.results(client, measured, groups):
@@ -427,7 +419,7 @@ class Sweep:
                     else:
                         self._store(cells, cell, result)
                     self._progress.end(_description(cell), _work(cell))
-            todo = [[] for _ in scenes]
+            todo = {cells: [] for cells in todo}
 
     def _more(self, cells: Cells) -> list[Cell]:
         """Return the cells of a further seed; none if narrow enough or at the limit."""
