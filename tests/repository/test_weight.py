@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6555,
+    "measure": 6526,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2286,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1451,  # top files
 }
-OUTSIDE = {"scripts": 2930, "tests": 38929}
+OUTSIDE = {"scripts": 2930, "tests": 38803}
 MOST_WORDS = 29063
 
 
