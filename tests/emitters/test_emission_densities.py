@@ -15,7 +15,6 @@ from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import boxes
 from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
-from mitsuba_bdpt.sensors import kinds as sensors
 from mitsuba_bdpt.transport.photons.aim import Aim
 from scipy import stats
 
@@ -36,13 +35,17 @@ def emission(name, **others):
     ball = {"type": "sphere", "center": [0.3, 0.5, 0], "radius": 0.5}
     scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": parts.EMITTERS[name]()} | others)
     emitters = Emitters(scene)
-    u = [mi.Float(v) for v in numbers(4)]
-    like = dr.zeros(mi.Interaction3f)  # time and wavelengths
-    like.time = mi.Float(0.3)
     with evaluated_mode(name == "timed_sunsky"):
-        e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+        e = sampled(emitters, time=0.3)
         dr.eval(e)
     return scene, emitters, e
+
+
+def sampled(emitters, time=0.0):
+    u = [mi.Float(v) for v in numbers(4)]
+    like = dr.zeros(mi.Interaction3f)  # time and wavelengths
+    like.time = mi.Float(time)
+    return emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
 
 
 def test_no_emitter_is_left_out():
@@ -201,44 +204,11 @@ def test_places_on_a_surface(name):
     agree(*bins, density, float(shape.surface_area()[0]))
 
 
-@pytest.mark.parametrize("radiance", ["uniform", "textured"])
-@pytest.mark.parametrize("inwards", [False, True])
-def test_spheres_that_to_world_turns(inwards, radiance):
-    """A sphere's sampled points turn with its ``to_world``, their normals do not in Mitsuba. Expected:
-    normals point away from the centre, or towards it, within 1e-5 (single precision), rays leave on that
-    side; emission, next-event estimation and an irradiance meter on the sphere agree on it."""
-    transform = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0, 0.8], 115).scale(0.7)
-    ball = {"type": "sphere", "to_world": transform, "flip_normals": inwards, "bsdf": parts.grey(0)}
-    lamp = {"type": "area", "radiance": parts.texture() if radiance == "textured" else 1.0}
-    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    meter = {"type": "irradiancemeter", "film": film}
-    scene = mi.load_dict({"type": "scene", "lamp": ball | {"emitter": lamp, "sensor": meter}})
-    emitters = Emitters(scene)
-    (area,) = emitters.groups
-    assert area._any_inner == (inwards and radiance == "uniform")  # one with a texture samples that
-    u = [mi.Float(v) for v in numbers(4)]
-    like = dr.zeros(mi.Interaction3f)
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
-    at = dr.zeros(mi.SurfaceInteraction3f, COUNT)
-    at.p = mi.Point3f(1, 2, 3.2 if inwards else 6)
-    direct = emitters.sample_direct(at, mi.Point2f(u[0], u[1]), mi.Bool(True))
-    camera = sensors.prepare(scene.sensors()[0], emitters.shape_errors, scene)
-    z0, n_shading, anchor = camera._sample(mi.Point2f(u[0], u[1]), like)
-    for p, n in ((e.si.p, e.anchor.n), (direct.anchor.p, direct.anchor.n), (z0, n_shading), (z0, anchor.n)):
-        away = dr.normalize(p - mi.Point3f(1, 2, 3)) * (-1 if inwards else 1)
-        np.testing.assert_allclose(column(n), column(away), atol=1e-5)
-    made = column(dr.max(e.weight)) > 0  # Mitsuba has no point for 3e-4 of the samples of a texture
-    assert (column(dr.dot(e.anchor.n, e.d))[made] > -1e-5).all() and made.mean() > 0.999
-    lit = column(dr.max(direct.weight)) > 0
-    assert (column(dr.dot(direct.anchor.n, direct.d))[lit] < 1e-5).all()
-    assert lit.mean() > (0.99 if inwards or radiance == "uniform" else 0.2)
-
-
-@pytest.mark.parametrize("name", ["projector", "textured projector"])
-def test_power_of_a_projector(name):
-    """A projector's weight is irradiance at distance 1 over the density of its directions. Expected: the mean
-    weight is its power, the integral of Mitsuba's own intensity over directions (points at distance 1 and
-    `sample_direction`). Statistic: five standard errors of both sides."""
+@pytest.mark.parametrize("name", ["spot", "projector", "textured projector"])
+def test_power_of_cones(name):
+    """The weight is the intensity over the density of directions. Expected: the mean weight is the power, the
+    integral of Mitsuba's own intensity over directions (points at distance 1 and `sample_direction`).
+    Statistic: five standard errors of both sides."""
     scene, _, e = emission(name)
     lamp = scene.emitters()[0]
     d = column(e.d)
@@ -270,28 +240,15 @@ def test_selection_beside_what_cannot_be_traced():
 
 def meadow(emitter):
     """A block on a large ground."""
-    transform = mi.ScalarTransform4f()
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "ground": {
-                "type": "rectangle",
-                "to_world": transform.rotate([1, 0, 0], -90).scale(8),
-                "bsdf": {"type": "diffuse", "reflectance": 0.5},
-            },
-            "block": {
-                "type": "cube",
-                "to_world": transform.translate([1, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5),
-            },
-            "emitter": emitter,
-            "sensor": {
-                "type": "perspective",
-                "fov": 50,
-                "to_world": transform.look_at([0, 4, 6], [0.5, 0, 0], [0, 1, 0]),
-                "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
-            },
-        }
-    )
+    ground = {"type": "rectangle", "to_world": parts.T().rotate([1, 0, 0], -90).scale(8)}
+    block = parts.T().translate([1, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)
+    scene = {
+        "sensor": parts.perspective((0, 4, 6), (0.5, 0, 0), 50, size=8),
+        "ground": ground | {"bsdf": {"type": "diffuse", "reflectance": 0.5}},
+        "block": {"type": "cube", "to_world": block},
+        "emitter": emitter,
+    }
+    return mi.load_dict({"type": "scene"} | scene)
 
 
 FROM_INFINITY = {
@@ -307,9 +264,7 @@ def test_aimed_emission(name):
     to the disk of the scene, and to that of the block; half and more pass the block's sphere. Statistic: five
     standard errors."""
     emitters = Emitters(meadow(FROM_INFINITY[name]))
-    u = [mi.Float(v) for v in numbers(4)]
-    like = dr.zeros(mi.Interaction3f)
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    e = sampled(emitters)
     stated = column(e.pdf_second)
     for distance in (0.0, 7.0):
         again = column(emitters.direction_density(e, e.si.p + distance * e.d, e.d, mi.Bool(True)))
@@ -355,16 +310,9 @@ def test_details():
 def test_aimed_points_know_that_they_are(scale):
     """A point on the rim of the details' disk may be outside of it by rounding. Expected: no start that was
     aimed has less than that part, and none has none."""
-    transform = mi.ScalarTransform4f()
-    disks = emitter_disks.Disks(
-        mi.load_dict(
-            {
-                "type": "scene",
-                "ground": {"type": "rectangle", "to_world": transform.scale(scale)},
-                "ball": {"type": "sphere", "center": [0.3, 0.2, 1], "radius": 1.0},
-            }
-        )
-    )
+    ground = {"type": "rectangle", "to_world": parts.T().scale(scale)}
+    ball = {"type": "sphere", "center": [0.3, 0.2, 1], "radius": 1.0}
+    disks = emitter_disks.Disks(mi.load_dict({"type": "scene", "ground": ground, "ball": ball}))
     u = [mi.Float(v) for v in numbers(4)]
     d = mi.warp.square_to_uniform_sphere(mi.Point2f(u[2], u[3]))
     _, density = disks.start(d, mi.Point2f(u[0], u[1]))
@@ -400,26 +348,21 @@ CORNER = """<scene version="3.0.0">
 </scene>"""
 
 
+GREY = parts.grey(0.5)
+
+
 def room_of_rectangles():
     """A room of five rectangles of one BSDF, open to a white sky, with a small cube on its floor."""
-    grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    place = mi.ScalarTransform4f()
     sides = {"floor": ([1, 0, 0], -90), "ceiling": ([1, 0, 0], 90), "left": ([0, 1, 0], 90)}
     sides |= {"right": ([0, 1, 0], -90), "back": ([0, 1, 0], 0)}
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb", "rfilter": {"type": "box"}}
-    eye = place.look_at([0, 0, 0.9], [0, 0, -1], [0, 1, 0])
     return {
         "type": "scene",
         "sky": {"type": "constant"},
-        "cube": {"type": "cube", "to_world": place.translate([0, -0.8, 0]).scale(0.2)},
-        "sensor": {"type": "perspective", "fov": 70, "to_world": eye, "film": film},
+        "cube": {"type": "cube", "to_world": parts.T().translate([0, -0.8, 0]).scale(0.2)},
+        "sensor": parts.perspective((0, 0, 0.9), (0, 0, -1), 70),
     } | {
-        name: {
-            "type": "rectangle",
-            "to_world": place.rotate(axis, angle).translate([0, 0, -1]),
-            "bsdf": grey,
-        }
-        for name, (axis, angle) in sides.items()
+        name: {"type": "rectangle", "to_world": parts.T().rotate(*turn).translate([0, 0, -1]), "bsdf": GREY}
+        for name, turn in sides.items()
     }
 
 
@@ -491,18 +434,9 @@ def test_aimed_light_subpaths_that_reach_a_lens():
     """For and t = 0 the density is asked for at the sensor, which may lie outside the scene. Expected: with
     all strategies, the sky that a wide lens far outside sees directly past the scene, and beside it, is that
     of `path`. Statistic: as above, against the mean of a long render (1e-3 for its error)."""
-    transform = mi.ScalarTransform4f()
     scene = meadow(FROM_INFINITY["sky"])
-    sensor = mi.load_dict(
-        {
-            "type": "thinlens",
-            "fov": 60,
-            "aperture_radius": 3.0,
-            "focus_distance": 20.0,
-            "to_world": transform.look_at([0, 5, 25], [0, 0, 0], [0, 1, 0]),
-            "film": {"type": "hdrfilm", "width": 6, "height": 6, "rfilter": {"type": "box"}},
-        }
-    )
+    lens = {"type": "thinlens", "aperture_radius": 3.0, "focus_distance": 20.0}
+    sensor = mi.load_dict(parts.perspective((0, 5, 25), (0, 0, 0), 60, size=6) | lens)
     assert Emitters(scene).disks.details is not None
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 1, "skip": "none"})
     path = mi.load_dict({"type": "path", "max_depth": 1})
