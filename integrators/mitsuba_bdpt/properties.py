@@ -248,7 +248,7 @@ def check_not_frozen():
 
 
 def check_film(sensor, settings: Settings, groups: Sequence[str] = ()):
-    """Check the film against the requested layers, of light ``groups`` too; returns its colours.
+    """Check the film against the layers, of light ``groups`` too; returns its colours and `Channels`.
 
     Raises ``UnsupportedError`` for layers that the film cannot have, ``UsageError`` for a film without pixels
     or too large.
@@ -269,9 +269,9 @@ def check_film(sensor, settings: Settings, groups: Sequence[str] = ()):
     if width < 1 or height < 1:
         what = "film" if [width, height] == list(film.size()) else "crop window"
         raise UsageError(f"the {what} of {width} x {height} has no pixels; it needs one at least")
-    stokes = POLARIZED if settings.stokes else 0
-    parts = [len(layers) for layers in partitions(settings, groups)]
-    channels = Channels.of(film, len(colour.names), count, stokes, parts)
+    alpha, stokes = int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha)), POLARIZED if settings.stokes else 0
+    parts = tuple(len(layers) for layers in partitions(settings, groups))
+    channels = Channels(len(colour.names), alpha, count, stokes, parts)
     film_limits.check_film(film, channels, settings.variance)
     film_limits.check_strategies(film, settings.strategy_depth, settings.merge_images)
-    return colour
+    return colour, channels

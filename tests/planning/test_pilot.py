@@ -690,7 +690,7 @@ def test_loops_are_recorded_once(parameters, capfd):
     loops more often, which took a third of the time of short renders. Expected: Dr.Jit's log does not
     say so, of a pass and of a pilot."""
     render, before = of(cornell(8), **parameters), dr.log_level()
-    drawn = render.points.of(schedule.Step(0, 0, 1, 1, True))
+    drawn = render.points.of(schedule.Step(0, 0, 1, 1))
     dr.set_log_level(dr.LogLevel.Debug)
     try:
         counts = kernel.trace(render.kernel, sink.Image(render.accumulator), Batch(0, 4, 0, 1), drawn, 1)

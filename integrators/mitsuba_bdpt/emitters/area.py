@@ -168,12 +168,11 @@ class AreaEmitters(Group):
 
     def with_guide(self, guide) -> Group:
         other = super().with_guide(guide)
-        other._tables = table(rows(self._emitters, _Table(), self._directions))
+        shapes = rows(self._emitters, None, lambda emitter: emitter.get_shape())
+        about = self._facts.about
+        tables = rows(shapes, _Table(), lambda s: about("directions", partial(_Table.of, s), s))
+        other._tables = table(tables)
         return other
-
-    def _directions(self, emitter) -> _Table:
-        shape = emitter.get_shape()
-        return self._facts.about("directions", partial(_Table.of, shape), shape)
 
     def place(self, index, p, d, active) -> Place:
         known = look_up(self._tables, index, active)

@@ -22,8 +22,7 @@ import numpy as np
 from ..errors import UsageError
 from ..settings import Settings
 from . import denoising
-from .colour import POLARIZED
-from .layers import film_layers, image_count, partitions, strategies, strategy_count, strategy_index
+from .layers import film_layers, image_count, strategies, strategy_count, strategy_index
 from .replicates import Replicates
 from .taps import Taps, is_wide
 
@@ -136,19 +135,6 @@ def reduce_mode(numbers: int, samples: int, additions: int = 16, otherwise=dr.Re
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Parts of a film's sums.
-
-    ``strips``: number of sums of each pixel's camera samples, see `batch.strip_count`; ``samples`` per pixel
-    of a launch, at most; ``light_groups``: their names.
-    """
-
-    strips: int
-    samples: int
-    light_groups: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
 class Channels:
     """Order of the channels of a pixel's camera samples.
 
@@ -163,12 +149,6 @@ class Channels:
     features: int
     stokes: int = 0
     partitions: tuple[int, ...] = ()
-
-    @classmethod
-    def of(cls, film, colours: int, features: int, stokes: int, partitions: Sequence[int] = ()) -> Channels:
-        """Return the channels of a film with these numbers of channels of each kind."""
-        alpha = int(mi.has_flag(film.flags(), mi.FilmFlags.Alpha))
-        return cls(colours, alpha, features, stokes, tuple(partitions))
 
     @property
     def layers(self) -> int:
@@ -208,6 +188,20 @@ class Channels:
         return [*colours, *[alpha] * self.alpha, mi.Float(1), *features, *stokes, *layers]
 
 
+@dataclass(frozen=True)
+class Parts:
+    """Parts of a film's sums.
+
+    ``channels`` of a pixel; ``strips``: number of sums of each pixel's camera samples, see
+    `batch.strip_count`; ``samples`` per pixel of a launch, at most; ``light_groups``: their names.
+    """
+
+    channels: Channels
+    strips: int
+    samples: int
+    light_groups: tuple[str, ...] = ()
+
+
 # Names of the blocks in `Snapshot.arrays`.
 _NAMES = ("camera", "light", "strategies")
 
@@ -230,13 +224,7 @@ class Accumulator:
         self.variance, self.replicates = settings.variance, Replicates()
         self.stokes = colour.stokes
         colour.prepare(film_layers(settings, colour.names, parts.light_groups))
-        self._channels = Channels.of(
-            film,
-            len(colour.names),
-            features.count if features else 0,
-            POLARIZED if self.stokes else 0,
-            [len(layers) for layers in partitions(settings, parts.light_groups)],
-        )
+        self._channels = parts.channels
         self.alpha, self.layers = bool(self._channels.alpha), self._channels.layers
         # Strips of rows, of the camera's sums and of strategies, are separated by the filter's border.
         self._stride = self.size[1] + 2 * (self.rfilter.border_size() + border)
@@ -330,10 +318,6 @@ class Accumulator:
         sums, passes = self._done
         of_variance = self.replicates.store() if self.variance else {}
         return passes, of_variance | dict(zip(_NAMES, sums, strict=False))
-
-    def ends_replicates(self) -> bool:
-        """Return whether all passes belong to complete replicates."""
-        return self.variance and self.replicates.spp == sum(self.passes) > 0
 
     def restore(self, passes: tuple[int, ...], arrays: dict):
         """Restore the state that `store` returned."""
@@ -448,7 +432,9 @@ class Accumulator:
         else:
             layers += pixels.features
         if self.variance:
-            layers += self._variance(sum(passes), pixels.weight)
+            shape = self.size[1], self.size[0], self._channels.colours
+            variance = _channels(self.replicates.variance(sum(passes), shape))
+            layers += [value * pixels.weight for value in variance]
         layers += _added(*pixels.layers, to_film)
         if self.strategies is not None:
             layers += self._strategy_layers(self.strategies, sums[2], to_film)
@@ -469,11 +455,6 @@ class Accumulator:
         )
         found = denoising.denoised(image, guides[..., denoising.ALBEDO], guides[..., denoising.NORMAL])
         return [value * pixels.weight for value in _channels(found)]
-
-    def _variance(self, spp: int, weight: mi.Float64) -> list[mi.Float64]:
-        """Return the variance of each colour, weighted by the filter's ``weight``."""
-        shape = self.size[1], self.size[0], self._channels.colours
-        return [value * weight for value in _channels(self.replicates.variance(spp, shape))]
 
     def _strategy_layers(self, block: Block, sums: mi.Float64, to_film: mi.Float64) -> list[mi.Float64]:
         """Return the channels of the strategy images in film order; ``to_film``: factor of splats."""

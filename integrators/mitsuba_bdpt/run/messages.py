@@ -36,30 +36,23 @@ def log(statistics: dict):
         )
 
 
-def warn_of_parameters(prepared, sensor, settings):
-    """Warn once about parameters that spoil images."""
-    for text in spoilt(prepared, settings):
-        warn_once(prepared.scene, sensor, f"bdpt: {text}")
-
-
 def warn_of_light_groups(scene, sensor, groups: LightGroups | None):
     """Warn once about patterns of light ``groups`` that match no emitter."""
     for text in groups.warnings if groups is not None else ():
         warn_once(scene, sensor, text)
 
 
-def warn_of_media(prepared, sensor):
-    """Warn once about media of a prepared scene that are ignored or contradictory."""
-    media = prepared.light_media
-    if media is None:
-        return
-    texts = [p.strange for p in prepared.space.media.properties]
-    if media.contradiction:
+def warn_of_scene(prepared, sensor, settings):
+    """Warn once about parameters that spoil images, and media that are ignored or contradictory."""
+    texts, media = list(spoilt(prepared, settings)), prepared.light_media
+    if media is not None:
+        texts += [p.strange for p in prepared.space.media.properties]
+    if media is not None and media.contradiction:
         texts.append(
             f"{media.contradiction}; light subpaths would see another scene than the camera, so there are "
             "none: the image is that of `volpath`"
         )
-    if media.hides_infinity and prepared.emitters.at_infinity:
+    if media is not None and media.hides_infinity and prepared.emitters.at_infinity:
         texts.append(
             "the medium that the sensor declares has no end, and no light from infinity (sky, sun) arrives "
             "through it; put a shape with a null BSDF around it"

@@ -93,7 +93,7 @@ class Render:
         check_not_frozen()
         self.light_groups = LightGroups.of(scene, settings.light_groups)
         names = () if self.light_groups is None else self.light_groups.names
-        colour = check_film(sensor, settings, names)
+        colour, channels = check_film(sensor, settings, names)
         self.meter, self.part = Meter(), 0
         self._is_open = settings.merging == "auto"
         settings = replace(settings, merging=settings.merging is True)
@@ -124,7 +124,7 @@ class Render:
         border = self.prepared.camera.region.border
         best = self.merging.best_pass if self.merging else 0
         self._longest = longest = longest_pass(self.prepared.camera, settings, best)
-        parts = Parts(strip_count(longest), min(longest, spp), names)
+        parts = Parts(channels, strip_count(longest), min(longest, spp), names)
         self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
         # Result of `_guide`.
@@ -261,8 +261,7 @@ class Render:
             done, earlier = done + skipped, earlier - skipped
             while done < end:
                 size = min(end - done, self._affordable(step.size))
-                last = step.last and done + size == end
-                yield replace(step, done=done, size=size, last=last)
+                yield replace(step, done=done, size=size)
                 done += size
 
     def _affordable(self, size: int) -> int:
@@ -317,9 +316,9 @@ class Render:
 
     def _is_exact_enough(self) -> bool:
         """Return whether a full group of replicates reaches ``target_error``."""
-        if not self.settings.target_error or not self.accumulator.ends_replicates():
-            return False
-        if self.accumulator.replicates.count % REPLICATES:
+        replicates = self.accumulator.replicates
+        whole = replicates.spp == sum(self.passes) > 0 and not replicates.count % REPLICATES
+        if not self.settings.target_error or not whole:
             return False
         self._error = self.accumulator.error()
         return self._error <= self.settings.target_error
@@ -347,10 +346,7 @@ class Render:
         """
         state = self._state
         if state is None or len(state[0]) != reported:
-            raise UsageError(
-                f"snapshot() of the report after {reported} passes came too late; only the newest "
-                "report has one"
-            )
+            raise _too_late("snapshot", reported)
         passes, progress, arrays = state
         arrays = {name: np.array(a, dtype=np.float64) for name, a in arrays.items()}
         return Snapshot(self._identity(), passes, progress, arrays)
@@ -358,9 +354,7 @@ class Render:
     def _image(self, reported: int):
         """Return the image of the report after ``reported`` passes; see `_snapshot`."""
         if len(self.passes) != reported:
-            raise UsageError(
-                f"image() of the report after {reported} passes came too late; only the newest report has one"
-            )
+            raise _too_late("image", reported)
         self.accumulator.finish()
         image = self.sensor.film().develop()
         dr.eval(image)
@@ -430,7 +424,7 @@ class Render:
         """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
         spp = -(-LEAST_OF_MEAN // int(self.prepared.camera.region.size.prod()))
         other = self._like(self.settings, 0, spp)
-        other._pass(Step(0, 0, spp, spp, True))
+        other._pass(Step(0, 0, spp, spp))
         return number(other.accumulator.mean())
 
     def _samples(self) -> int:
@@ -446,6 +440,11 @@ class Render:
             return max(self.spp, done)
         predicted = max(self.meter.rate(done) * timeout, done, 1)
         return min(self.spp, 2 ** round(math.log2(predicted)))
+
+
+def _too_late(call: str, reported: int) -> UsageError:
+    about = f"{call}() of the report after {reported} passes came too late"
+    return UsageError(f"{about}; only the newest report has one")
 
 
 @contextmanager

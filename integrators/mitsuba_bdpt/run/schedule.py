@@ -59,15 +59,18 @@ def pass_sizes(spp: int, longest: int, small_first: bool) -> list[int]:
 class Step:
     """A pass: ``size`` samples per pixel, after ``done`` of its replicate's ``of``.
 
-    ``last``: whether it ends the replicate; ``replicate``: index of the independent image, 0 without
-    `variance`.
+    ``replicate``: index of the independent image, 0 without `variance`.
     """
 
     replicate: int
     done: int
     size: int
     of: int
-    last: bool
+
+    @property
+    def last(self) -> bool:
+        """Whether it ends the replicate."""
+        return self.done + self.size == self.of
 
 
 def schedule(spp: int, longest: int, settings: Settings, small_first: bool) -> list[Step]:
@@ -79,7 +82,7 @@ def schedule(spp: int, longest: int, settings: Settings, small_first: bool) -> l
     for replicate, part in enumerate(parts):
         done = 0
         for size in pass_sizes(part, longest, small_first and replicate == 0):
-            steps.append(Step(replicate, done, size, part, done + size == part))
+            steps.append(Step(replicate, done, size, part))
             done += size
     return steps
 
