@@ -58,17 +58,10 @@ class Parameter:
 Value = bool | int | float | str
 
 
-def _parameter(default: Value, what: str, meaning: str, **bounds: Any) -> Any:
-    """A field of `Settings` that holds the value as it is given."""
-    return _converted(default, default, what, meaning, **bounds)
-
-
-def _converted(
-    default: Value, value: Value | tuple[str, ...] | None, what: str, meaning: str, **bounds: Any
-) -> Any:
-    """A field of `Settings` that holds ``value`` for the parameter's ``default``."""
-    text = " ".join(meaning.split())
-    return field(default=value, metadata={"parameter": Parameter(default, what, text, **bounds)})
+def _parameter(default: Value, what: str, meaning: str, value: Any = None, **bounds: Any) -> Any:
+    """A field of `Settings` that holds ``value`` (None: the same) for the parameter's ``default``."""
+    parameter = Parameter(default, what, " ".join(meaning.split()), **bounds)
+    return field(default=default if value is None else value, metadata={"parameter": parameter})
 
 
 @dataclass(frozen=True)
@@ -90,12 +83,12 @@ class Settings:
     ``max_depth`` is `UNLIMITED` for -1, ``layers`` in the order of `LAYERS`.
     """
 
-    max_depth: int = _converted(
+    max_depth: int = _parameter(
         -1,
-        UNLIMITED,
         "the longest path in edges, -1 for unlimited",
         """Longest path in edges, as in ``path`` (with media as in ``volpath``): 1 is directly visible
         emitters, -1 unlimited.""",
+        UNLIMITED,
         low=-1,
         high=UNLIMITED,
     )
@@ -164,12 +157,12 @@ class Settings:
         """Adds feature layers by pairs ``name:kind`` as Mitsuba's ``aov``, for example
         ``albedo:albedo,nn:sh_normal``.""",
     )
-    layers: tuple[str, ...] = _converted(
+    layers: tuple[str, ...] = _parameter(
         "",
-        (),
         "a text with commas between, such as 'variance,denoised'",
         """Adds layers to the image, separated by commas: ``variance`` (of each pixel), ``denoised`` (by
         Intel's Open Image Denoise), ``stokes`` (Stokes vectors), ``strategies`` (an image of each).""",
+        (),
     )
     light_groups: str = _parameter(
         "",
@@ -217,17 +210,14 @@ class Settings:
 
     @property
     def denoise(self) -> bool:
-        """Whether there are layers of the denoised image."""
         return "denoised" in self.layers
 
     @property
     def stokes(self) -> bool:
-        """Whether there are layers of the Stokes vector."""
         return "stokes" in self.layers
 
     @property
     def strategy_images(self) -> bool:
-        """Whether there are layers of each strategy."""
         return "strategies" in self.layers
 
     @property

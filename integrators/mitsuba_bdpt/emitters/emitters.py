@@ -21,7 +21,7 @@ from ..host.introspection import named, number
 from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context, Group
 from .infinite import contrast
-from .kinds import GROUPS, group_of, is_third_party
+from .kinds import GROUPS, MITSUBAS, group_of
 from .order import in_order
 from .radiance import BlackEmitters
 from .records import Chosen, Direct, Emission, Factor, Place
@@ -108,7 +108,7 @@ class Emitters:
 
     def _lacks_sample_position(self, registered: list[str]) -> bool:
         """Whether `sample_position` fails: classes in the process may lack it."""
-        if not any(map(is_third_party, registered)):
+        if MITSUBAS.issuperset(registered):
             return False
         try:
             self._pointers.sample_position(mi.Float(0), mi.Point2f(0.5), mi.Bool(True))

@@ -88,7 +88,3 @@ def group_of(emitter) -> type[Group]:
     kind = KINDS.get(emitter.class_name(), ThirdPartyEmitters)
     group = kind.of(emitter)
     return BlackEmitters if kind is not ThirdPartyEmitters and is_black(emitter) else group
-
-
-def is_third_party(class_name: str) -> bool:
-    return class_name not in MITSUBAS

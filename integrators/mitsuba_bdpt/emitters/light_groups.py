@@ -84,11 +84,6 @@ def is_pattern(name: str) -> bool:
     return "*" in name or "?" in name
 
 
-def matches(name: str, pattern: str) -> bool:
-    """Return whether ``name`` is the text ``pattern``, or fits it as in `is_pattern`."""
-    return name == pattern or fnmatchcase(name, pattern.replace("[", "[[]"))
-
-
 def _layer_name(emitter_id: str) -> str:
     """Return the name of a layer for an id: other characters than letters, digits, _, - become _."""
     return re.sub("[^A-Za-z0-9_-]", "_", emitter_id)
@@ -202,7 +197,8 @@ def _matched(
     for name, pattern in [(name, pattern) for name, patterns in groups.items() for pattern in patterns]:
         own = [i for i, ids in enumerate(real) if pattern in ids]
         own = own or [i for i, made in enumerate(names) if made == pattern]
-        own = own or [i for i, of_one in enumerate(known) if any(matches(n, pattern) for n in of_one)]
+        fits = pattern.replace("[", "[[]")
+        own = own or [i for i, of_one in enumerate(known) if any(fnmatchcase(n, fits) for n in of_one)]
         if not own and is_pattern(pattern):
             unmatched.append((name, pattern))
         elif not own:

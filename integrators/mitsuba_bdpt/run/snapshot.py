@@ -37,14 +37,6 @@ class Progress:
     whole: bool = True
     scene: str | None = None
 
-    def joined(self, other: Progress) -> Progress:
-        """Return the progress of two merged renders, with the decisions of the first."""
-        return replace(self, work=self.work.joined(other.work)).image_only()
-
-    def image_only(self) -> Progress:
-        """Return a copy without the state that only a continued render needs."""
-        return replace(self, whole=False)
-
     def stored(self) -> dict:
         """Return the fields of all parts as JSON values."""
         values = {}
@@ -126,7 +118,7 @@ class Snapshot:
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
-        """Merge two renders: sums and counts are added.
+        """Merge two renders: sums and counts are added; decisions are of the first.
 
         Raises `UsageError` if they differ in more than seed, samples per pixel and part, or share a seed.
         """
@@ -136,7 +128,10 @@ class Snapshot:
             raise UsageError(
                 f"seed={min(common)} is in both snapshots; joined renders need seeds of their own"
             )
-        spp = self.identity["spp"] + other.identity["spp"]
+        spp, work = (
+            self.identity["spp"] + other.identity["spp"],
+            self.progress.work.joined(other.progress.work),
+        )
         arrays = {
             name: self.arrays[name] + other.arrays[name]
             for name in ("camera", "light", "strategies")
@@ -147,14 +142,14 @@ class Snapshot:
         return Snapshot(
             identity=self.identity | {"seed": seeds + others, "spp": spp},
             passes=self.passes + other.passes,
-            progress=self.progress.joined(other.progress),
+            progress=replace(self.progress, work=work, whole=False),
             arrays=arrays,
         )
 
     def image_only(self) -> Snapshot:
         """Return a smaller snapshot from which a render cannot continue."""
         kept = {n: a for n, a in self.arrays.items() if not n.startswith(LAST)}
-        return replace(self, progress=self.progress.image_only(), arrays=kept)
+        return replace(self, progress=replace(self.progress, whole=False), arrays=kept)
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an ``npz`` file (NumPy), without pickled objects."""

@@ -83,22 +83,14 @@ class Meter:
             counts = {name: counts[name] + n for name, n in zip(counts, batch, strict=True)}
             self._noted = replace(self._noted, counts=counts)
         for entry in dr.kernel_history():
-            if entry["type"] == dr.KernelType.JIT:
-                self._note_kernel(entry)
-
-    def _note_kernel(self, entry: dict):
-        """Add an entry of Dr.Jit's kernel history.
-
-        Kernels from the cache are still assembled; that is not counted as compilation.
-        """
-        work = self._noted
-        if entry["cache_hit"]:
-            self._noted = replace(work, cached=work.cached + 1)
-            return
-        seconds = (entry["codegen_time"] + entry["backend_time"]) / 1000
-        self._noted = replace(
-            work, compiled=work.compiled + 1, compile_seconds=work.compile_seconds + seconds
-        )
+            if entry["type"] != dr.KernelType.JIT:
+                continue
+            work = self._noted
+            if entry["cache_hit"]:  # it is still assembled, which is not counted as compilation
+                self._noted = replace(work, cached=work.cached + 1)
+                continue
+            seconds = work.compile_seconds + (entry["codegen_time"] + entry["backend_time"]) / 1000
+            self._noted = replace(work, compiled=work.compiled + 1, compile_seconds=seconds)
 
     @contextmanager
     def pilot(self):
