@@ -1,6 +1,5 @@
 """Error bars: the layers `variance.R` … and `statistics["error"]`."""
 
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -131,16 +130,6 @@ def test_schedule_of_replicates():
     assert (steps[0].size, steps[0].done, steps[1].size, steps[1].done) == (1, 0, 2, 1)
     assert all(s.done == 0 and s.size == s.of for s in steps[2:])
     assert [s.replicate for s in schedule.schedule(19, 19, bdpt(layers="").settings, True)] == [0, 0]
-
-
-def test_launches_on_a_gpu(monkeypatch):
-    """A GPU traces a pass of 2^21 camera subpaths in less time than Python records it. Expected: the passes
-    of a large image have eight times as many samples there."""
-    settings = bdpt(layers="").settings
-    camera = SimpleNamespace(region=SimpleNamespace(size=(1024, 1024)))
-    assert schedule.pass_sizes(64, schedule.longest_pass(camera, settings), False) == [2] * 32
-    monkeypatch.setattr(schedule.dr, "backend_v", lambda _: schedule.dr.JitBackend.CUDA)
-    assert schedule.pass_sizes(64, schedule.longest_pass(camera, settings), False) == [16] * 4
 
 
 def test_interrupted_before_there_is_a_spread():

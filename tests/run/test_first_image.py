@@ -170,15 +170,6 @@ def test_light_subpaths_without_a_decision(more, size, served, joined):
         assert (plan.camera_paths_per_light_path, plan.joined) == (served, joined)
 
 
-def test_rooms_of_many_bsdfs_ask_a_pilot():
-    """Expected: one of 256 x 144 pixels and 32 samples each does, in a room of 40 materials, the most
-    that `room` makes, of all its kinds."""
-    scene = mi.load_dict(room(40, 16))
-    prepared = PreparedScene(scene, scene.sensors()[0])
-    assert prepared.traits.dispatch.kinds == len(KINDS) + 1  # and that of the lamp, which is not two-sided
-    assert budget.least_samples(prepared) <= 256 * 144 * 64 / 2
-
-
 def test_lanes_take_turns_by_kinds_of_bsdfs():
     """Lanes whose BSDFs have different functions take turns, those of one kind do not. Expected: with 16
     further diffuse BSDFs `cornell_box` is rendered as without them, and the pilot's costs are the same to 5 %

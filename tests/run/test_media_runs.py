@@ -56,19 +56,6 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
     assert bool(whole.statistics["decisions"]) == ("skip" not in parameters)
 
 
-def test_variance_and_target_error():
-    """Expected: the stated variances of pixels are those over 10 seeds, in the mean over the image within a
-    fifth (2,000 degrees of freedom, but of pixels that differ), and a render until an error ends at it."""
-    target = misty()
-    images = [np.array(bdpt(layers="variance").render(target, seed=seed, spp=64)) for seed in range(10)]
-    found = np.var([image[..., :3] for image in images], axis=0, ddof=1).mean()
-    stated = np.mean([image[..., 3:] for image in images])
-    assert stated == pytest.approx(found, rel=0.2)
-    integrator = bdpt(target_error=0.05)
-    integrator.render(target, seed=2, spp=1 << 14, develop=False)
-    assert integrator.statistics["error"] <= 0.05 and sum(integrator.statistics["passes"]) < 1 << 14
-
-
 def test_features_are_those_of_aov():
     """Expected: depth, position and albedo behind fog and null boundaries are what Mitsuba's ``aov`` gives
     with as many samples, to 2 % of their range in six pixels of seven (its samples are others, which tells at
