@@ -25,7 +25,7 @@ MOST = {
     "": 1440,  # top files
 }
 OUTSIDE = {"scripts": 2930, "tests": 38704}
-MOST_WORDS = 29063
+MOST_WORDS = 29047
 
 
 def _lines(files):
