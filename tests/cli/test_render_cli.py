@@ -480,7 +480,7 @@ def test_a_variant_without_its_hardware_is_reported(scene, capsys, monkeypatch):
 
 def test_no_time_at_all_is_one_pass(scene, capsys):
     assert main(["render", str(scene), "--integrator", "bdpt", "--time", "0", "-o", "a.exr"]) == 0
-    assert " 1 spp (24 samples); stopped by --time 0 after 1 spp" in capsys.readouterr().out
+    assert " 1 spp (24 samples); stopped by the time limit of 0 s after 1 spp" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("kind", ["prb", "prbvolpath"])
@@ -579,7 +579,7 @@ def test_other_integrators_keep_to_the_time_too(scene, capsys, kind):
     assert statistics["spp"] >= 16 and statistics["spp"] % 16 == 0
     if kind == "path":
         np.testing.assert_allclose(read("a.exr")[0], 2.0, rtol=1e-5)
-    assert "; stopped by --time 0.3 after " in capsys.readouterr().out
+    assert "; stopped by the time limit of 0.3 s after " in capsys.readouterr().out
     arguments = ["--integrator", kind, "--time", "60", "--spp", "24", "-o", "b.exr"]
     assert main(["render", str(scene), *arguments]) == 0
     out = capsys.readouterr().out

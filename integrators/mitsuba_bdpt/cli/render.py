@@ -417,16 +417,13 @@ def stopped_by(job: Namespace, integrator: mi.Integrator, outcome: Outcome, spp:
     parameters = integrator.settings if is_ours(integrator) else None
     target = parameters.target_error if parameters else 0
     if 0 < target and outcome.statistics.get("error", math.inf) <= target:
-        option = "target_error=" if job.target_error is None else "--target-error "
-        return f"stopped by {option}{target:g} after {done}"
-    option, limit = "--time ", job.time
-    if limit is None:
-        option, limit = "timeout=", parameters.timeout if parameters else -1
+        return f"stopped by target_error={target:g} after {done}"
+    limit = job.time if job.time is not None else parameters.timeout if parameters else -1
     if limit < 0:
         return ""
     compiling = outcome.statistics.get("seconds", {}).get("compile", 0)
     spent = f", compiling took {compiling:.0f} s" if compiling > max(limit / 4, 1) else ""
-    return f"stopped by {option}{limit:g} after {done}{spent}"
+    return f"stopped by the time limit of {limit:g} s after {done}{spent}"
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float, stopped: str) -> str:
@@ -437,21 +434,18 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
         f"{outcome.spp} spp ({readable(outcome.spp * width * height)} samples)",
         *([stopped] if stopped else []),
     ]
-    rays = outcome.statistics.get("rays")
-    if rays:
+    if rays := outcome.statistics.get("rays"):
         kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
-        missed = 0 < target_error < error
         text = f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known"
-        if missed:
+        if 0 < target_error < error:
             text += f", not the {target_error:g} asked for: that takes more samples (--spp, --time)"
         parts.append(text)
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
-    if outcome.statistics.get("non_finite"):
-        invalid = outcome.statistics["non_finite"]
+    if invalid := outcome.statistics.get("non_finite"):
         parts.append(f"{invalid} invalid samples (NaN or infinite) count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     if outcome.interrupted:
