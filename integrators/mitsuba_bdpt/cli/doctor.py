@@ -72,7 +72,6 @@ def run(variant: str) -> int:
 
 
 def versions() -> list[Finding]:
-    """Report versions of Python, the platform, this package and its dependencies."""
     findings = [
         Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
         Finding("ok", "platform", f"{platform.system()} {platform.machine()}"),
@@ -90,7 +89,6 @@ def versions() -> list[Finding]:
 
 
 def llvm_library() -> Finding:
-    """Report the LLVM library and the reason for it, or why the import failed."""
     failure, choice = mitsuba_bdpt.failure, mitsuba_bdpt.llvm_choice
     if failure is not None or choice is None:
         subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
@@ -103,7 +101,6 @@ def llvm_library() -> Finding:
 
 
 def kernel_cache() -> Finding:
-    """Report whether Dr.Jit can store compiled kernels."""
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -185,7 +182,6 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> tup
 
 
 def crash_remedy() -> str:
-    """Return the remedy after a crash: another LLVM."""
     choice = mitsuba_bdpt.llvm_choice
     if choice is not None and choice.why == llvm.NAMED:
         return f"Unset {llvm.VARIABLE}; it names {str(choice.path)!r}."

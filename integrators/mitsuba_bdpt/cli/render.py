@@ -62,7 +62,6 @@ class Outcome:
 
 
 def run(options: Namespace) -> int | None:
-    """Render as the command-line `options` request; returns the exit status."""
     return _ended(lambda ending: _run(options, ending))
 
 
@@ -73,7 +72,6 @@ def _ended(command: Callable[[Ending], int]) -> int | None:
 
 
 def _run(options: Namespace, ending: Ending) -> int:
-    """Like `run`, but raises errors."""
     check_file(options.scene)  # before creating the image's folder
     jobs = jobs_of(options)
     for job in jobs:
@@ -218,7 +216,6 @@ def say(line: str) -> None:
 
 
 def explain(options: Namespace) -> int | None:
-    """Print what such a render would do; returns the exit status."""
 
     def explained(ending: Ending) -> int:
         scene, integrator, _ = loaded(options, ending)
@@ -230,7 +227,6 @@ def explain(options: Namespace) -> int | None:
 
 
 def check_options(options: Namespace) -> None:
-    """Raise ``CommandError`` for contradictory options."""
     if options.resume and options.checkpoint is None:
         raise CommandError("resume needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
@@ -266,7 +262,6 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
-    """Render into the sensor's film, with progress."""
     film = choose_sensor(scene, options.sensor).film()
     if not is_ours(integrator):
         return render_foreign(scene, integrator, options, spp)
@@ -344,7 +339,6 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
 
 
 def is_ours(integrator: mi.Integrator) -> bool:
-    """Return whether this is `bdpt`."""
     return hasattr(integrator, "assemble")
 
 
@@ -378,7 +372,6 @@ def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
 
 
 def settings(options: Namespace, spp: int) -> dict:
-    """Return the command line as JSON values."""
     pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
     return {key: plain(value) for key, value in (vars(options) | {"spp": spp} | pairs).items()}
 
