@@ -9,11 +9,11 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6526,
+    "measure": 6490,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2277,
-    "cli": 1729,
+    "cli": 1695,
     "media": 1349,
     "geometry": 1518,
     "image": 1483,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1440,  # top files
 }
-OUTSIDE = {"scripts": 2930, "tests": 38704}
+OUTSIDE = {"scripts": 2930, "tests": 38598}
 MOST_WORDS = 29047
 
 
