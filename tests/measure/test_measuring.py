@@ -97,13 +97,13 @@ def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
     assert "reference" not in said and ": 30 rows" in said
     command("report", "mine", "--project", "project")
     text = (results / "README.md").read_text()
-    assert "| scene | over path, trimmed | over path, raw | over power, trimmed | over power, raw |" in text
-    assert re.search(r"\| `room` \|.*passed, p = ", text)
+    assert re.search("over path, trimmed .* over path, raw .* over power, trimmed .* over power, raw", text)
+    assert re.search(r"\| `room` .*passed, p = ", text)
     for name in re.findall(r"\((\w+\.png)\)", text):
         assert (results / name).stat().st_size > 5000
     command("page", "mine", "--project", "project")
     page = (results / "page.html").read_text()
-    assert 'href="#scene-room"' in page and "@DATA@" not in page
+    assert 'href="#scene-room"' in page and "{{" not in page.partition("<script>")[0]
     assert not (here / "references").exists() and not (here / "results").exists()
 
 
@@ -113,7 +113,7 @@ def test_other_commands_take_the_users_scene(here, capsys):
     words = ["compare", "bdpt skip=none", "path sampler=stratified", "--scenes", room, "--spp", "4"]
     assert main([*words, "--pairs", "1", *common]) == 0
     out = capsys.readouterr().out
-    assert "making one" in out and "| `room` | 4 |" in out
+    assert "making one" in out and re.search(r"\| `room` +\| 4 +\|", out)
     named = "bdpt skip=none divided by those of path sampler=stratified; efficiency, 1 / (time · error), of "
     assert f"Time and errors of {named}bdpt skip=none over path sampler=stratified." in out
     assert main(["equal-time", room, "--spp", "4", *common]) == 0
@@ -132,7 +132,7 @@ def test_the_first_integrator_may_be_any(here):
     for words in (["sweep", "alone"], ["report", "alone"], ["page", "alone"]):
         assert main([*words, "--project", "project"]) == 0
     text = (here / "project" / "results" / "alone" / "README.md").read_text()
-    assert "| `room` |" in text and "efficiency.png" not in text
+    assert "| `room` " in text and "efficiency.png" not in text
 
 
 def test_commands_in_messages_can_be_pasted(here, capsys):
@@ -223,7 +223,7 @@ def test_samples_are_those_that_a_sampler_takes(here, capfd):
     assert making.AccuracyTarget(given, given.scene.load(8, "multijitter"), "path").images
     said = capfd.readouterr()
     assert "rounded" not in said.out + said.err
-    assert "| `room` | 32 / 35 |" in said.out and "bdpt, 32 spp" in said.out
+    assert re.search(r"\| `room` +\| 32 / 35 +\|", said.out) and "bdpt, 32 spp" in said.out
 
 
 def test_a_sample_is_timed_where_a_sampler_rounds_up(here, monkeypatch):

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6490,
+    "measure": 6396,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2277,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1440,  # top files
 }
-OUTSIDE = {"scripts": 2930, "tests": 38598}
+OUTSIDE = {"scripts": 2930, "tests": 38567}
 MOST_WORDS = 29047
 
 
