@@ -27,7 +27,7 @@ def write(rows: dict[str, dict]) -> None:
     """Put ``rows`` by name into the record, with the version of the plugin's source."""
     source = reference.source_digest()
     known = {row["name"]: row for row in json.loads(RECORD.read_text())}
-    known |= {name: row | {"source": source} for name, row in rows.items()}
+    known |= {name: known.get(name, {}) | row | {"source": source} for name, row in rows.items()}
     record = sorted(known.values(), key=lambda row: (row["section"], row["name"]))
     write_text(RECORD, json.dumps(record, indent=1, ensure_ascii=False) + "\n")
 

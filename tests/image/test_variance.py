@@ -1,6 +1,5 @@
 """Error bars: the layers `variance.R` … and `statistics["error"]`."""
 
-
 import mitsuba as mi
 import numpy as np
 import pytest

@@ -15,8 +15,7 @@ from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
-
-from stress_cases.warned import Warned
+from warned import Warned
 
 GROUPS = "low: globe, b*; high: panel"
 OF_GROUPS = {"low": ("globe", "bulb"), "high": ("panel",), "rest": ("sky",)}

@@ -44,10 +44,9 @@ from sds_scenes import (
     under_glass,
 )
 from snapshots import ROUNDING, stopped
+from warned import Warned
 
 import scenes
-
-from stress_cases.warned import Warned
 
 import drjit as dr  # isort: skip
 

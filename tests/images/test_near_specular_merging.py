@@ -27,8 +27,7 @@ from sds_scenes import (
     under_glass,
 )
 from snapshots import ROUNDING
-
-from stress_cases.warned import Warned
+from warned import Warned
 
 import drjit as dr  # isort: skip
 

@@ -12,8 +12,7 @@ from mitsuba_bdpt.planning.budget import PROVISIONAL_SAMPLES
 from mitsuba_bdpt.planning.configuration import PATH_TRACING
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons import aim
-
-from stress_cases.warned import Warned
+from warned import Warned
 
 T = mi.ScalarTransform4f
 

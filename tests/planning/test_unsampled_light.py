@@ -12,8 +12,7 @@ import scene_parts as parts
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import messages, rendering
 from mitsuba_bdpt.run.rendering import Render
-
-from stress_cases.warned import Warned
+from warned import Warned
 
 T = mi.ScalarTransform4f
 

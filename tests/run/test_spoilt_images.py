@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.scene import diagnostics
 from support import variants
-
-from stress_cases.warned import Warned
+from warned import Warned
 
 T = mi.ScalarTransform4f
 SKY = {"sky": {"type": "constant"}}

@@ -29,14 +29,15 @@ def pytest_collection_modifyitems(items):
 
 def pytest_runtest_logreport(report):
     """Collect outcomes in the main process: what cases print happened, or the error."""
-    case = dict(report.user_properties).get("case")
-    if case and (report.when == "call" or not report.passed):
+    name = report.nodeid.rpartition("::test_")[2]
+    case = dict(report.user_properties).get("case", {"name": name})  # of a process that died the name alone
+    if f"{HERE.name}/" in report.nodeid and (report.when == "call" or not report.passed):
         error = getattr(report.longrepr, "reprcrash", None)
-        text = getattr(error, "message", None) or str(report.longrepr)
-        text = MITSUBAS_LOG.sub("", report.capstdout) if report.passed else text
+        said = "" if report.passed else getattr(error, "message", None) or str(report.longrepr)
+        printed = MITSUBAS_LOG.sub("", report.capstdout).strip().split("\n")
         _rows[case["name"]] = case | {
             "ok": None if report.skipped else report.passed,
-            "happened": "; ".join(text.strip().split("\n")[:20]),
+            "happened": "; ".join(filter(None, [said.partition("\n")[0], *printed[:20]])),
             "seconds": round(report.duration, 1),
         }
 

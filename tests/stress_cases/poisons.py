@@ -1,18 +1,14 @@
-"""Plugins and textures with numbers that are not finite, and rooms to put them in."""
-
-from __future__ import annotations
+"""Plugins and textures with numbers that are not finite, and rooms with them."""
 
 from functools import cache
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-import mitsuba as mi  # isort: skip
+from .rooms import filled, room
 
 NAN, INF = float("nan"), float("inf")
-
-# Of the film, along each side.
-SIZE = 16
 
 
 class Scales:
@@ -26,8 +22,9 @@ class Scales:
         return dr.select(where, self._factors[name], 1)
 
 
-def poison():
-    """The class of the BSDF ``poison``. (Mitsuba's classes exist once a variant is chosen.)"""
+@cache
+def register(variant: str):
+    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter) for a variant."""
 
     class Poison(mi.BSDF):
         """Diffuse; where u > 0.5, the scales multiply what it answers.
@@ -64,12 +61,6 @@ def poison():
         def to_string(self):
             return "Poison[]"
 
-    return Poison
-
-
-def poison_lamp():
-    """The class of the emitter ``poison_lamp``."""
-
     class PoisonLamp(mi.Emitter):
         """Surroundings of radiance 1; in half of all directions the scales multiply radiance and density.
 
@@ -89,7 +80,7 @@ def poison_lamp():
             ds = dr.zeros(mi.DirectionSample3f)
             ds.dist = mi.Float(100)
             ds.p, ds.d, ds.n, ds.uv, ds.time = it.p + d * ds.dist, d, -d, mi.Point2f(sample), it.time
-            ds.pdf = dr.select(active, dr.inv_four_pi * self.scale("pdf", d), 0)
+            ds.pdf = self.pdf_direction(it, ds, active)
             ds.delta, ds.emitter = mi.Bool(False), mi.EmitterPtr(self)
             return ds, dr.select(active, mi.Spectrum(4 * dr.pi * self.scale("eval", d)), 0)
 
@@ -108,18 +99,44 @@ def poison_lamp():
         def to_string(self):
             return "PoisonLamp[]"
 
-    return PoisonLamp
+    mi.register_bsdf("poison", Poison)
+    mi.register_emitter("poison_lamp", PoisonLamp)
 
 
-def register():
-    """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter) for the variant in use."""
-    _register(mi.variant())
+def poisoned(name, *zero, **more):
+    """Rooms by a value: of a plate on half of which that ``name`` of its BSDF has it, or ``zero`` are 0."""
+
+    def make(value):
+        register(mi.variant())
+        names = [name] if value != 0 else zero
+        return room({"type": "poison"} | dict.fromkeys(names, value), **more)
+
+    return make
 
 
-@cache
-def _register(variant: str):
-    mi.register_bsdf("poison", poison())
-    mi.register_emitter("poison_lamp", poison_lamp())
+# Nobody asks for the index of refraction in a scene that refracts nothing.
+GLASS = {"type": "sphere", "radius": 0.1, "bsdf": {"type": "dielectric"}}
+BSDFS = {
+    "weight": poisoned("weight", "weight"),
+    "direction": poisoned("direction", "weight"),
+    "eta": poisoned("eta", "weight", other=GLASS),
+    "eval": poisoned("eval", "eval"),
+    "pdf": poisoned("pdf", "weight", "eval"),
+}
+
+
+def sky_of(name):
+    """Rooms by a value: under a user's environment, half of whose values of that ``name`` have it."""
+
+    def make(value):
+        register(mi.variant())
+        # Where the density is 0, so is what is sampled there: the twin's other half is black.
+        return room(wall=None, sky={"type": "poison_lamp", (name if value != 0 else "eval"): value})
+
+    return make
+
+
+BAD_TEXELS = 3 / 16
 
 
 def texture(bad, base=0.6):
@@ -130,82 +147,15 @@ def texture(bad, base=0.6):
     return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": not mi.is_spectral, "filter_type": "nearest"}
 
 
-BAD_TEXELS, TEXELS = 3, 16
-
-
 def brightness(value):
     """Of a lamp. (A spectral variant scales a number by daylight, and refuses such a spectrum that is 0.)"""
     return {"type": "uniform", "value": value} if mi.is_spectral else value
 
 
-def to_world():
-    """The plate of `room` in its place."""
-    return mi.ScalarTransform4f().translate([0, -0.3, -0.2]).rotate([1, 0, 0], -50).scale(0.45)
-
-
-def down():
-    """From above onto the plate of `room`."""
-    return mi.ScalarTransform4f().look_at([0, 0.5, 0.3], [0, -0.3, -0.2], [0, 0, 1])
-
-
-def diffuse(reflectance: float):
-    """A number may be above 1, which a colour may not."""
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}
-
-
-def area(radiance):
-    return {"type": "area", "radiance": radiance}
-
-
-def camera(**keys):
-    film = {
-        "type": "hdrfilm",
-        "width": SIZE,
-        "height": SIZE,
-        "pixel_format": "rgb",
-        "component_format": "float32",
-    }
-    placed = mi.ScalarTransform4f().look_at([0, 0.1, 0.8], [0, -0.1, -1], [0, 1, 0])
-    return {
-        "type": "perspective",
-        "fov": 70,
-        "near_clip": 1e-3,
-        "to_world": placed,
-        "film": film | {"rfilter": {"type": "box"}},
-    } | keys
-
-
-def room(bsdf=None, **parts):
-    """A closed sphere with a plate of the ``bsdf`` that fills a part of the view, and a lamp.
-
-    Or other ``parts`` in their place.
-    """
-    grey = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": 0.5}}
-    lamp_at = mi.ScalarTransform4f().translate([0.3, 0.8, 0]).rotate([1, 0, 0], 90).scale(0.2)
-    inside = {
-        "wall": {"type": "sphere", "bsdf": grey},
-        "plate": {"type": "rectangle", "to_world": to_world(), "bsdf": bsdf or grey},
-        "lamp": {"type": "rectangle", "to_world": lamp_at, "emitter": {"type": "area", "radiance": 4.0}},
-    }
-    parts = {name: part for name, part in (inside | parts).items() if part is not None}
-    return mi.load_dict({"type": "scene", "sensor": camera(), **parts})
-
-
-def filled(bsdf, **parts):
-    """A plate that fills the film, lit by a point above all of it, which each of its points sees.
-
-    Each texel covers 4 x 4 pixels.
-    """
-    fov = float(np.rad2deg(2 * np.arctan(0.25)))
-    facing = mi.ScalarTransform4f().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
-    scene = {
-        "type": "scene",
-        "sensor": camera(fov=fov, to_world=facing),
-        "plate": {"type": "rectangle", "bsdf": bsdf},
-        "lamp": {"type": "point", "position": [0, 0, 3.0], "intensity": 5.0},
-    }
-    return mi.load_dict({name: part for name, part in (scene | parts).items() if part is not None})
-
-
 def painted(bad):
     return {"type": "diffuse", "reflectance": texture(bad)}
+
+
+def reflecting(bad):
+    """A plate that fills the film, with bad texels."""
+    return filled(painted(bad))

@@ -3,9 +3,8 @@
 `Generator` writes XML; what that refers to is written by `write_assets`.
 """
 
-from __future__ import annotations
-
 import random
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,14 +43,14 @@ def flag(name: str, value: bool = True) -> str:
 
 
 class Generator:
-    """Draws from one seed.
+    """Draws from ``rng``.
 
     ``plain``: nothing of which `path` is known to be wrong or blind: no masks, blends, nor what is beyond
     its reach (delta emitters beside delta BSDFs, or seen by a lens).
     """
 
-    def __init__(self, seed: int, folder: Path, plain: bool = False):
-        self.rng, self.folder, self.plain = random.Random(seed), folder, plain
+    def __init__(self, rng: random.Random, folder: Path, plain: bool = False):
+        self.rng, self.folder, self.plain = rng, folder, plain
         self.ids: list[str] = []
         self.has_sky = False
         self.delta = self.rng.random() < 0.5
@@ -90,9 +89,19 @@ class Generator:
             kinds += ["twosided", *(["bumpmap", "normalmap"] if maps else [])]
             kinds += [] if self.plain else ["mask", "blendbsdf"]
         kind = self.rng.choice(kinds)
-        make = getattr(self, f"_{kind}", None)
-        inside = make(depth + 1, maps) if make else self._leaf(kind)
-        return el("bsdf", *inside, type=kind, **attributes)
+        inner = partial(self.bsdf, depth + 1, maps)
+        nested = {
+            "twosided": lambda: [self._opaque(depth + 1, maps)],
+            "mask": lambda: [self._share("opacity"), inner()],
+            "blendbsdf": lambda: [self._share("weight"), inner(), inner()],
+            "bumpmap": lambda: [
+                self.bitmap("heights", "gray.png"),
+                number("scale", self.rng.choice([0.02, 0.2])),
+                inner(),
+            ],
+            "normalmap": lambda: [self.bitmap("normalmap", "normal.png"), inner()],
+        }
+        return el("bsdf", *(nested[kind]() if kind in nested else self._leaf(kind)), type=kind, **attributes)
 
     def _leaf(self, kind) -> list[str]:
         rng = self.rng
@@ -112,9 +121,6 @@ class Generator:
         alpha = number("alpha", rng.choice([0.1, 0.2, 0.5]))
         return [alpha, string("distribution", rng.choice(["beckmann", "ggx"]))]
 
-    def _twosided(self, depth, maps) -> list[str]:
-        return [self._opaque(depth, maps)]
-
     def _opaque(self, depth=0, maps=True) -> str:
         """A BSDF that a ``twosided`` takes."""
         found = self.bsdf(depth, maps)
@@ -127,19 +133,6 @@ class Generator:
             return number(name, self.rng.uniform(0.2, 0.8))
         return self.bitmap(name, "gray.png")
 
-    def _mask(self, depth, maps) -> list[str]:
-        return [self._share("opacity"), self.bsdf(depth, maps)]
-
-    def _blendbsdf(self, depth, maps) -> list[str]:
-        return [self._share("weight"), *(self.bsdf(depth, maps) for _ in range(2))]
-
-    def _bumpmap(self, depth, maps) -> list[str]:
-        scale = number("scale", self.rng.choice([0.02, 0.2]))
-        return [self.bitmap("heights", "gray.png"), scale, self.bsdf(depth, maps)]
-
-    def _normalmap(self, depth, maps) -> list[str]:
-        return [self.bitmap("normalmap", "normal.png"), self.bsdf(depth, maps)]
-
     def material(self) -> str:
         """A BSDF in place, or one that has an id."""
         if self.ids and self.rng.random() < 0.6:
@@ -150,21 +143,12 @@ class Generator:
 
     def to_world(self, scale, spread, low, high, stretched=False) -> str:
         rng = self.rng
-        axis = np.array([rng.gauss(0, 1) for _ in range(3)])
-        axis = axis / np.linalg.norm(axis)
+        axis = np.array([rng.gauss(0, 1) for _ in "xyz"])
+        turn = {k: f"{v:.8f}" for k, v in zip("xyz", axis / np.linalg.norm(axis), strict=True)}
         sizes = {k: scale * (rng.uniform(0.6, 1.5) if stretched else 1.0) for k in "xyz"}
-        turn = {k: f"{v:.8f}" for k, v in zip("xyz", axis, strict=True)}
-        place = {
-            "x": rng.uniform(-spread, spread),
-            "y": rng.uniform(low, high),
-            "z": rng.uniform(-spread, spread),
-        }
-        steps = (
-            el("scale", **sizes),
-            el("rotate", angle=rng.uniform(0, 360), **turn),
-            el("translate", **place),
-        )
-        return el("transform", *steps, name="to_world")
+        steps = el("scale", **sizes), el("rotate", angle=rng.uniform(0, 360), **turn)
+        x, y, z = rng.uniform(-spread, spread), rng.uniform(low, high), rng.uniform(-spread, spread)
+        return el("transform", *steps, el("translate", x=x, y=y, z=z), name="to_world")
 
     def shape(self, kinds, size, surface, spread=1.3, heights=(0.5, 1.6)) -> str:
         """A shape of one of the ``kinds`` with this ``surface`` (XML), about as large as ``size``."""
@@ -198,59 +182,41 @@ class Generator:
 
     def lamp(self) -> str:
         """An emitter, or a shape that is one."""
-        kinds = ["area", "area", "textured", *([] if self.has_sky else ["constant", "envmap"])]
+        kinds = ["area", "area", "area", *([] if self.has_sky else ["constant", "envmap"])]
         kinds += [] if self.delta else ["point", "spot", "projector", "directional"]
         kind = self.rng.choice(kinds)
         self.has_sky |= kind in ("constant", "envmap")
-        return getattr(self, f"_{kind}")()
+        return self.shining() if kind == "area" else self.emitter(kind)
 
-    def _area(self) -> str:
+    def shining(self) -> str:
+        """A shape that is a lamp, sometimes textured."""
+        rng = self.rng
+        if rng.random() < 1 / 3:  # not on cubes and turned spheres, where `path` is wrong
+            emitter = el("emitter", self.bitmap("radiance", "sky.exr", raw=False), type="area")
+            return self.shape(["ball", "rectangle", "disk"], 0.4, emitter, 1.2, (2.2, 3.2))
         emitter = el("emitter", self.rgb("radiance", 1, 6), type="area")
-        surface = self._opaque() if self.rng.random() < 0.5 else ""
+        surface = self._opaque() if rng.random() < 0.5 else ""
         # Convex ones: what other lamps light of themselves `path` weighs otherwise.
         kinds = ["sphere", "cube", "rectangle", "disk", "cylinder", "ball"]
-        return self.shape(kinds, self.rng.uniform(0.2, 0.6), emitter + surface, 1.2, (2.2, 3.2))
+        return self.shape(kinds, rng.uniform(0.2, 0.6), emitter + surface, 1.2, (2.2, 3.2))
 
-    def _textured(self) -> str:
-        # Not on cubes and turned spheres, where `path` is wrong.
-        emitter = el("emitter", self.bitmap("radiance", "sky.exr", raw=False), type="area")
-        return self.shape(["ball", "rectangle", "disk"], 0.4, emitter, 1.2, (2.2, 3.2))
-
-    def _constant(self) -> str:
-        return el("emitter", self.rgb("radiance"), type="constant")
-
-    def _envmap(self) -> str:
-        turn = el("transform", el("rotate", y="1", angle=self.rng.uniform(0, 360)), name="to_world")
-        return el("emitter", string("filename", self.folder / "sky.exr"), turn, type="envmap")
-
-    def _point(self) -> str:
-        x, z = self.rng.uniform(-1, 1), self.rng.uniform(-1, 1)
-        return el(
-            "emitter",
-            el("point", name="position", x=x, y=2.8, z=z),
-            self.rgb("intensity", 1, 6),
-            type="point",
-        )
-
-    def _downwards(self) -> str:
+    def emitter(self, kind) -> str:
         rng = self.rng
+        x, z = rng.uniform(-0.7, 0.7), rng.uniform(-0.7, 0.7)
         origin = f"{rng.uniform(-1.5, 1.5):.2f},3,{rng.uniform(-1.5, 2):.2f}"
         look = el("lookat", origin=origin, target=f"{rng.uniform(-0.5, 0.5):.2f},0.3,0", up="0,0,1")
-        return el("transform", look, name="to_world")
-
-    def _spot(self) -> str:
-        angle = number("cutoff_angle", self.rng.choice([20, 45]))
-        return el("emitter", self.rgb("intensity", 3, 9), angle, self._downwards(), type="spot")
-
-    def _projector(self) -> str:
-        image = self.bitmap("irradiance", "rgb.png", raw=False)
-        inside = image, number("fov", 40), number("scale", 20), self._downwards()
-        return el("emitter", *inside, type="projector")
-
-    def _directional(self) -> str:
-        x, z = self.rng.uniform(-0.7, 0.7), self.rng.uniform(-0.7, 0.7)
-        inside = el("vector", name="direction", x=x, y=-1.0, z=z), self.rgb("irradiance", 1, 4)
-        return el("emitter", *inside, type="directional")
+        turn = el("rotate", y="1", angle=rng.uniform(0, 360))
+        down, turn = (el("transform", step, name="to_world") for step in (look, turn))
+        slide = self.bitmap("irradiance", "rgb.png", raw=False)
+        inside = {
+            "constant": [self.rgb("radiance")],
+            "envmap": [string("filename", self.folder / "sky.exr"), turn],
+            "point": [el("point", name="position", x=x, y=2.8, z=z), self.rgb("intensity", 1, 6)],
+            "spot": [self.rgb("intensity", 3, 9), number("cutoff_angle", rng.choice([20, 45])), down],
+            "projector": [slide, number("fov", 40), number("scale", 20), down],
+            "directional": [el("vector", name="direction", x=x, y=-1.0, z=z), self.rgb("irradiance", 1, 4)],
+        }
+        return el("emitter", *inside[kind], type=kind)
 
     # -- media --------------------------------------------------------------------------------------------
 

@@ -1,16 +1,11 @@
 """Random scenes, drawn by hypothesis: shapes, BSDFs, emitters, sensors, and which strategies are in use."""
 
-from __future__ import annotations
-
+import mitsuba as mi
 import numpy as np
 from hypothesis import strategies as st
+from scene_parts import T, film, grey
 
-import mitsuba as mi  # isort: skip
-
-
-def T():  # noqa: N802 (as formulas name a transform)
-    """The identity; there is no such type before a variant is set."""
-    return mi.ScalarTransform4f()
+from .rooms import area
 
 
 def bitmap(pixels):
@@ -31,10 +26,6 @@ def tilts():
     return (n / np.linalg.norm(n, axis=-1, keepdims=True) + 1) / 2
 
 
-def diffuse(value=0.6):
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value, value, value]}}
-
-
 def sides(bsdf):
     return {"type": "twosided", "bsdf": bsdf}
 
@@ -43,9 +34,11 @@ def rough(kind, alpha):
     return {"type": kind, "alpha": alpha}
 
 
+MATTE = {"type": "diffuse", "reflectance": 0.6}
+
 # By name, of a roughness.
 BSDFS = {
-    "diffuse": lambda a: sides(diffuse()),
+    "diffuse": lambda a: grey(0.6),
     "conductor": lambda a: sides({"type": "conductor"}),
     "dielectric": lambda a: {"type": "dielectric"},
     "thindielectric": lambda a: {"type": "thindielectric"},
@@ -54,11 +47,11 @@ BSDFS = {
     "roughdielectric": lambda a: rough("roughdielectric", a),
     "roughplastic": lambda a: sides(rough("roughplastic", a)),
     "principled": lambda a: {"type": "principled", "roughness": a, "metallic": 0.3, "spec_trans": 0.3},
-    "mask": lambda a: {"type": "mask", "opacity": 0.6, "bsdf": sides(diffuse())},
+    "mask": lambda a: {"type": "mask", "opacity": 0.6, "bsdf": grey(0.6)},
     "blend": lambda a: sides(
-        {"type": "blendbsdf", "weight": 0.4, "one": diffuse(), "two": rough("roughconductor", a)}
+        {"type": "blendbsdf", "weight": 0.4, "one": MATTE, "two": rough("roughconductor", a)}
     ),
-    "bumpmap": lambda a: sides({"type": "bumpmap", "height": bitmap(waves()), "bsdf": diffuse()}),
+    "bumpmap": lambda a: sides({"type": "bumpmap", "height": bitmap(waves()), "bsdf": MATTE}),
     "normalmap": lambda a: sides(
         {"type": "normalmap", "normalmap": bitmap(tilts()), "bsdf": rough("roughconductor", a)}
     ),
@@ -76,7 +69,7 @@ SHAPES = {
 
 
 def shining(shape):
-    return shape | {"bsdf": diffuse(0.3), "emitter": {"type": "area", "radiance": 4.0}}
+    return shape | {"bsdf": {"type": "diffuse", "reflectance": 0.3}, "emitter": area(4.0)}
 
 
 # By name, of a place, an angle and a size.
@@ -148,7 +141,7 @@ def sensors(draw):
         "near_clip": 0.125,
         "far_clip": 100.0,
         "to_world": T().look_at([x, y, 4], [0, 0, 0], [0, 1, 0]),
-        "film": {"type": "hdrfilm", "width": 16, "height": 12, "rfilter": {"type": "box"}},
+        "film": film(16, height=12),
     }
     lens = {"aperture_radius": draw(between(0.0625, 0.5)), "focus_distance": 4.0}
     return sensor | (lens if sensor["type"] == "thinlens" else {})

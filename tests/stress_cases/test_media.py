@@ -4,10 +4,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from scene_parts import T
+from warned import Warned
 
 from .compare import WAYS, agree, tiles
-from .poisons import area, camera, diffuse
-from .warned import Warned
+from .rooms import area, camera, diffuse
 
 SEEDS, SPP, DEPTH = range(8), 64, 5
 
@@ -58,7 +58,7 @@ def like(scene, other, reach=0.01, light=True, **integrator) -> None:
 def test_empty_grid():
     """A grid of density 0.
 
-    Expected: as without it: Welch's test over tiles (level 1e-3, 8 seeds each), which sees errors of 1 %.
+    Expected: as without it: Welch's test of tiles (1e-3), which sees errors of 1 %.
     """
     like(room(cloud=box(interior=cloud(np.zeros((4, 4, 4))))), room())
 
@@ -66,8 +66,8 @@ def test_empty_grid():
 def test_nested_boxes():
     """32 empty boxes with null boundaries, one in the other.
 
-    Expected: as without them: Welch's test over tiles (level 1e-3, 8 seeds each), which sees errors of 1 %.
-    (`volpath` loses 3 % of what next-event estimation finds behind them.)
+    Expected: as without them: Welch's test of tiles (1e-3), which sees errors of 1 %. (`volpath` loses 3 % of
+    what next-event estimation finds behind them.)
     """
     sides = [{"interior": fog(0)} | ({"exterior": fog(0)} if i else {}) for i in range(32)]
     like(room(**{f"box{i}": box(0.3 * (1 - i / 33), **side) for i, side in enumerate(sides)}), room())
@@ -108,7 +108,7 @@ def test_camera_on_a_boundary():
     """A pinhole in the face of a box of fog: half of what surrounds it is fog.
 
     Expected: as `volpath`, by camera subpaths alone (whatever the sensor declares contradicts a side):
-    Welch's test over tiles (level 1e-3, 8 seeds each), which sees errors of 2 %.
+    Welch's test of tiles (1e-3), which sees errors of 2 %.
     """
     at = np.array(camera()["to_world"].matrix).reshape(4, 4)[:3, 3]
     place = T().translate([*(at - [0, 0, 0.2])]).scale(0.2)

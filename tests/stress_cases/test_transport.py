@@ -8,10 +8,10 @@ from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.scene import diagnostics
 from mitsuba_bdpt.transport.inputs import Shared
 from scene_parts import T
+from warned import Warned
 
 from .compare import WAYS, agree, tiles
-from .poisons import area, camera, diffuse
-from .warned import Warned
+from .rooms import area, camera, diffuse, view
 
 SEEDS = range(8)
 
@@ -22,8 +22,7 @@ def scene(sensor=None, **found):
 
 
 def look(origin, target, fov):
-    """A camera from another point of view."""
-    return camera(fov=fov, to_world=T().look_at(list(origin), list(target), [0, 1, 0]))
+    return view(origin, target, fov, (0, 1, 0))
 
 
 # -- closed rooms ---------------------------------------------------------------------------------
@@ -38,8 +37,8 @@ def test_closed_rooms(room, albedo, depth, spp):
     """A point light in a closed sphere, a closed cube that glows everywhere; albedo 1 to 40 edges, 0.99
     without limit, 1.5 to 7 edges; all strategies, and defaults.
 
-    Expected: the sum of albedo^m over all reflections; Student's test over tiles (level 1e-3, 8 seeds), which
-    sees errors of 3 % of the image's mean (roulette makes long paths noisy).
+    Expected: the sum of albedo^m over all reflections; Student's test of tiles (1e-3), which sees errors of 3
+    % (roulette makes long paths noisy).
     """
     if room == "point":
         target = scene(
@@ -152,8 +151,7 @@ def glass(sensor, **inside):
 def test_nested_dielectrics(index, way):
     """A ball of water, air or diamond in a ball of glass in a white world; all strategies, and defaults.
 
-    Expected: radiance 1, as nothing is absorbed: Student's test over tiles (level 1e-3, 8 seeds), which sees
-    errors of 2 %.
+    Expected: radiance 1, as nothing is absorbed: Student's test of tiles (1e-3), which sees errors of 2 %.
     """
     bsdf = {"type": "dielectric", "int_ior": index, "ext_ior": 1.5}
     inner = {"type": "sphere", "center": [0.2, 0.1, 0.0], "radius": 0.6, "bsdf": bsdf}
@@ -164,8 +162,7 @@ def test_nested_dielectrics(index, way):
 def test_from_within_glass():
     """A white world from the centre of a ball of glass.
 
-    Expected: the square of its index: Student's test over tiles (level 1e-3, 8 seeds), which sees errors of 2
-    %.
+    Expected: the square of its index: Student's test of tiles (1e-3), which sees errors of 2 %.
     """
     target = glass(look((0, 0, 0), (0.3, 0.1, -1), 60))
     agree(tiles(target, {"rr_depth": 200}, SEEDS, 64), 1.5**2, 0.02)
@@ -174,8 +171,7 @@ def test_from_within_glass():
 def test_total_reflection():
     """A lamp in a glass cube of index 1.8: most of its light is reflected totally.
 
-    Expected: as `path`: Welch's test over tiles (level 1e-3, 8 seeds each), which sees errors of 3 % (few
-    paths leave the cube).
+    Expected: as `path`: Welch's test of tiles (1e-3), which sees errors of 3 % (few paths leave the cube).
     """
     target = scene(
         look((0, 1, 3.5), (0, -0.2, 0), 40),
@@ -234,8 +230,7 @@ def test_surface(name):
     """A ball and a plate of rough metal, glass and plastic of roughness 1e-4 to 1, of blends and a mask with
     such sharp lobes, and of `principled`, in a room with a wide lamp; sharp ones also with all strategies.
 
-    Expected: as `path`, every value finite: Welch's test over tiles (level 1e-3, 8 seeds each), which sees
-    errors of 2 % of the image's mean.
+    Expected: as `path`, every value finite: Welch's test of tiles (1e-3), which sees errors of 2 %.
     """
     bsdf = SURFACES[name]
     target = scene(

@@ -12,10 +12,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.transport import bsdf, draws, spectra
 from scipy import stats
-
-from stress_cases.light_side import evaluate_adjoint, sample_adjoint
 
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.8]}}
 ROUGH = {"type": "roughconductor", "alpha": 0.3}

@@ -9,9 +9,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
+from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.transport import bsdf
-
-from stress_cases.light_side import evaluate_adjoint, sample_adjoint
 
 COUNT = 4096
 

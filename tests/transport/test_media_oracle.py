@@ -23,8 +23,8 @@ from mitsuba_bdpt.transport import kernel
 from mitsuba_bdpt.transport.batch import Batch
 
 from instruments import endpoints, oracle, recording
+from instruments.chains import COEFFICIENTS, random_paths, recursion
 from instruments.oracle import AREA, POSITION
-from stress_cases.chains import COEFFICIENTS, random_paths, recursion
 
 
 def in_media(rng, paths, decades):

@@ -49,8 +49,8 @@ from mitsuba_bdpt.transport.photons import guided_hits, photon_guide, photon_pas
 from mitsuba_bdpt.transport.vacuum import Vacuum
 
 from instruments import oracle
+from instruments.chains import COEFFICIENTS, columns, random_paths, recursion
 from instruments.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
-from stress_cases.chains import COEFFICIENTS, columns, random_paths, recursion
 
 # -- layer 1: arithmetic ---------------------------------------------------------------------------
 
@@ -118,6 +118,17 @@ def test_recursion_with_merges(name, classes, least, monkeypatch):
         total, plain = total + (explicit.merged & sure).sum(), plain + easy.sum()
         assert explicit.near.mean() < 0.05
     assert total > 200 and plain > 200
+
+
+def test_sums_of_guiding_pass_delta_events():
+    """Expected: at a delta event ``d_vm``, here of a guided technique, changes as ``d_vc`` does."""
+    step = SimpleNamespace(
+        pdf_fwd_w=mi.Float(0), pdf_rev_w=mi.Float(0), cos_out=mi.Float(0.5), delta=mi.Bool(True)
+    )
+    before = mis.Partial(mi.Float(1), mi.Float(3), mi.Float(3))
+    h, guided = mis.Heuristic("balance"), mi.Float(7)
+    d_vm = mis.scattered_guided(h, before, step, guided, mi.Bool(True))
+    assert d_vm[0] == mis.scatter(h, before, 1, step).d_vc[0] == 1.5
 
 
 @pytest.mark.parametrize("name", settings.HEURISTICS)
@@ -938,8 +949,7 @@ def guided_estimates(world: World, weights) -> np.ndarray:
         ("balance", "n1c0-half", True, near_specular.SPECULAR),
         ("balance", "n0c0", False, near_specular.SPECULAR),
         ("balance", "odd", False, np.inf),
-        ("balance", "odd", True, np.inf),
-        ("power", "quarter", True, np.inf),
+        ("power", "n1c0-half", True, np.inf),
     ],
 )
 def test_kernel_guides_through_specular_events(name, classes, lens, least, monkeypatch):

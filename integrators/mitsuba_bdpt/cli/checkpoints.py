@@ -26,6 +26,7 @@ IDENTITY = "bdptIdentity"
 
 
 def path_of(output: Path) -> Path:
+    """Return the path of an image's checkpoint, beside the image."""
     return output.with_suffix(".checkpoint.npz")
 
 
@@ -97,6 +98,7 @@ class Checkpoints:
         self._last, self._report = time.monotonic(), None
 
     def after_pass(self, report) -> None:
+        """Called with every ``PassReport``."""
         self._report = report
         if time.monotonic() - self._last >= self._seconds:
             self.write()
@@ -139,4 +141,5 @@ class Checkpoints:
             )
 
     def remove(self) -> None:
+        """Remove the checkpoint, after the finished image has been written."""
         self.path.unlink(missing_ok=True)

@@ -29,9 +29,10 @@ from mitsuba_bdpt.transport import connections
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer
 
-from instruments.endpoints import Camera, disks_of, dot, lamps_of, length2
-from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Paths
-from instruments.recording import float64, stepwise
+from .chains import recursion
+from .endpoints import Camera, disks_of, dot, lamps_of, length2
+from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Explicit, Paths
+from .recording import float64, stepwise
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.
@@ -391,3 +392,41 @@ class Capture(Observer):
 
     def _wide(self, array):
         return np.broadcast_to(array, (self.lanes, 3))
+
+
+# Of the weight of a strategy, and of the sum of all of a path: float32 alone is off by 1e-6, some ten
+# roundings of 6e-8 per vertex; edges may be turned by 1e-3 of a cosine, and densities by as much.
+TOLERANCE = 1e-3
+
+
+@dataclass
+class Weighed:
+    """What the weights of ``paths`` of the kernel are, with those of other strategies by the recursion.
+
+    ``bad`` paths have a weight that is negative, above 1 or not finite, ``off`` ones a sum that is not 1;
+    ``wrong``: weights by the kernel that differ from those by explicit densities, ``differ`` the largest
+    difference; ``unsure`` see `Made`.
+    """
+
+    paths: int = 0
+    bad: int = 0
+    off: int = 0
+    wrong: int = 0
+    unsure: int = 0
+    differ: float = 0.0
+
+    def add(self, capture: Capture, heuristic: str) -> None:
+        """Add the paths of a run."""
+        for m in capture.made():
+            if not len(m.weights):
+                continue
+            explicit = Explicit(m.paths, capture.coefficients)
+            weights, used = recursion(m.paths, capture.coefficients, heuristic), explicit.used.copy()
+            weights[:, m.s], used[:, m.s] = m.weights, True
+            gap = np.abs(m.weights - explicit.weights(heuristic)[:, m.s])
+            self.paths += len(m.weights)
+            self.bad += int((used & ~((weights >= 0) & (weights <= 1))).any(1).sum())
+            self.off += int((~(np.abs(np.where(used, weights, 0).sum(1) - 1) <= TOLERANCE)).sum())
+            self.wrong += int((~(gap <= TOLERANCE)).sum())
+            self.unsure += m.unsure
+            self.differ = max(self.differ, float(np.nan_to_num(gap, nan=np.inf).max()))

@@ -14,7 +14,7 @@ from mitsuba_bdpt.transport import mis
 
 import mitsuba as mi  # isort: skip
 
-from instruments.oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
+from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION, Coefficients, Paths
 
 # n c: all classes, kappa different from every count, and classes left out.
 COEFFICIENTS = {
