@@ -199,19 +199,6 @@ def test_encodings_of_a_scene_file(encoding):
     assert [path.name for path in found] == ["names.xml", name]
 
 
-def test_a_render_does_not_go_on_with_an_edited_include(monkeypatch, capsys):
-    Path("a.xml").write_text('<scene version="3.0.0"><include filename="part.xml"/></scene>')
-    Path("part.xml").write_text(SCENE.read_text())
-    command = [ARGUMENTS[0], "a.xml", *ARGUMENTS[2:]]
-    arguments = [*command, "--spp", "32", "-o", "a.exr", "--checkpoint", "60"]
-    interrupt(monkeypatch, arguments)
-    Path("part.xml").write_text(SCENE.read_text().replace("</scene>", "<!-- other --></scene>"))
-    assert main([*arguments, "--resume"]) == 2
-    assert "is of another scene" in capsys.readouterr().err
-    Path("part.xml").write_text(SCENE.read_text())
-    assert main([*arguments, "--resume"]) == 0
-
-
 def test_an_interruption_inside_a_pass(monkeypatch):
     arguments = [*ARGUMENTS, "--spp", "63", "-P", "layers=variance"]  # too few for a pilot
     assert main([*arguments, "-o", "whole.exr"]) == 0

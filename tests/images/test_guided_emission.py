@@ -18,6 +18,8 @@ from mitsuba_bdpt.run import rendering
 from snapshots import ROUNDING, stopped
 from test_same_mean import decided, random_tables, scene_of
 
+from scenes import DOWNWARDS, area, camera, floor, load, matte, square
+
 from instruments.capture import Capture, Weighed
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -109,19 +111,11 @@ def test_what_a_pilot_accumulates():
     """Of the second moments of light tracing and of camera subpaths each counts once per sample: for the
     floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the number of light
     subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves)."""
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": parts.perspective(origin=[0, 2, 0.01], target=[0, 0, 0], fov=40)
-            | {"film": parts.film(32)},
-            "floor": {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90), "bsdf": parts.grey(0.6)},
-            "lamp": {
-                "type": "spot",
-                "to_world": T().look_at([0, 1.5, 0], [0, 0, 0], [0, 0, 1]),
-                "cutoff_angle": 20,
-                "beam_width": 19,
-            },
-        }
+    scene = load(
+        sensor=camera(origin=(0, 2, 0.01), target=(0, 0, 0), fov=40, size=32),
+        floor=floor(0, 1, parts.grey(0.6)),
+        lamp={"type": "spot", "cutoff_angle": 20, "beam_width": 19}
+        | {"to_world": T().look_at([0, 1.5, 0], [0, 0, 0], [0, 0, 1])},
     )
     render = rendering.Render(scene, scene.sensors()[0], mi.load_dict({"type": "bdpt"}).settings, 0, 64)
     statistics = []
@@ -213,26 +207,11 @@ def test_tables_count_in_the_choice():
 
 def spotlit(size=32):
     """A box with a hole in its lid about a lamp: most of what it emits stays inside."""
-    lamp = {
-        "type": "rectangle",
-        "to_world": T().translate([0, 1.2, 0]).rotate([1, 0, 0], -90).scale(0.1),
-        "emitter": {"type": "area", "radiance": 100.0},
-        "bsdf": parts.grey(0.0),
-    }
-    dark = {"type": "diffuse", "reflectance": 0.02}
-    hood = {
-        "type": "cylinder",
-        "p0": [0, 1.1, 0],
-        "p1": [0, 2.0, 0],
-        "radius": 0.2,
-        "bsdf": {"type": "twosided", "bsdf": dark},
-    }
-    ceiling = {
-        "type": "rectangle",
-        "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(2),
-        "bsdf": parts.grey(0.8),
-    }
-    eye = parts.perspective(origin=[0, 1.0, 4], target=[0, 0.8, 0]) | {"film": parts.film(size)}
+    dark = {"type": "twosided", "bsdf": matte(0.02)}
+    lamp = floor(1.2, 0.1, parts.grey(0.0), emitter=area(100.0))
+    hood = {"type": "cylinder", "p0": [0, 1.1, 0], "p1": [0, 2.0, 0], "radius": 0.2, "bsdf": dark}
+    ceiling = square((0, 2.5, 0), DOWNWARDS, 2, parts.grey(0.8))
+    eye = camera(origin=(0, 1.0, 4), target=(0, 0.8, 0), fov=40, size=size)
     return mi.load_dict(parts.room(eye, lamp=lamp, hood=hood, ceiling=ceiling))
 
 

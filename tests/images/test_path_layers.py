@@ -20,6 +20,8 @@ from mitsuba_bdpt.transport.path_layers import NAMES
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 
+from scenes import camera, load, square, transform
+
 ROUGH_GLASS = {"type": "roughdielectric", "alpha": 0.1}
 POLISHED = {"type": "roughconductor", "alpha": 0.05}
 # Scenes by their surfaces: delta lobes, near-specular ones, and null events.
@@ -119,22 +121,13 @@ def test_light_of_a_mirror_beside_a_floor(light_paths):
     ``caustic`` is albedo F, ``direct`` albedo (1 - F), the others 0. Tolerance: five standard errors of 2^18
     samples of a variance below 1/4, and the pixels' extent, 1e-4 of c."""
     a, b, c, albedo = 1.0, 2.0, 0.5, 0.5
-    mirror = mi.ScalarTransform4f().translate([-c, 0, 0]).rotate([0, 1, 0], 90)
-    eye = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
-    film |= {"rfilter": {"type": "box"}, "pixel_format": "rgb"}
-    target = mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {"type": "perspective", "fov": 0.01, "to_world": eye, "film": film},
-            "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)},
-            "mirror": {
-                "type": "rectangle",
-                "to_world": mirror.scale([a, b, 1]),
-                "bsdf": {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}},
-            },
-            "sky": {"type": "constant"},
-        }
+    upright = transform().translate([-c, 0, 0]).rotate([0, 1, 0], 90).scale([a, b, 1])
+    mirror = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
+    target = load(
+        sensor=camera(origin=(0, 0, 5), target=(0, 0, 0), fov=0.01, size=4),
+        floor=square(size=20),
+        mirror={"type": "rectangle", "to_world": upright, "bsdf": mirror},
+        sky={"type": "constant"},
     )
     method = integrator(skip="none", light_paths=light_paths)
     _, found = divided(method, target, spp=2**14)
@@ -238,11 +231,9 @@ def test_roughness_of_near_specular_lobes(kind):
 def test_other_objects_do_not_change_layers():
     """Whether metal of alpha .07 could be near-specular depended on what else was in the scene. A floor seen
     at grazing angles has the same layers, two of them, beside an unseen polished ball and without."""
-    eye = mi.ScalarTransform4f().look_at([-3, 0, 0.4], [0, 0, 0], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
+    eye = camera(origin=(-3, 0, 0.4), target=(0, 0, 0), up=(0, 0, 1), fov=1, size=4)
     metal = {"type": "roughconductor", "alpha": 0.07}
-    room = {"floor": {"type": "rectangle", "bsdf": metal}, "sky": {"type": "constant"}}
-    room |= {"type": "scene", "sensor": {"type": "perspective", "fov": 1, "to_world": eye, "film": film}}
+    room = {"type": "scene", "sensor": eye, "floor": square(bsdf=metal), "sky": {"type": "constant"}}
     ball = {"type": "sphere", "center": [0, 0, -50], "bsdf": metal | {"alpha": 0.01}}
     alone, beside = (
         divided(integrator(light_paths=0), mi.load_dict(objects, optimize=False))[1]

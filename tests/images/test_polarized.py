@@ -6,11 +6,11 @@ use in another.
 
 from dataclasses import replace
 
-import drjit as dr
 import media_parts as parts
 import mitsuba as mi
 import numpy as np
 import pytest
+import scene_parts
 import variants
 import welch as st
 from mitsuba_bdpt.geometry import polarization
@@ -429,54 +429,9 @@ def test_isolated_paths_are_polarized():
     assert (np.abs(mine.mean(0) - theirs.mean(0)) < 4 * error + 1e-7).all()
 
 
-def register_sky():
-    """Register the emitter ``rayleigh_sky``: light that air scatters once, polarized across the sun's
-    plane."""
-
-    class Sky(mi.Emitter):
-        def __init__(self, props):
-            super().__init__(props)
-            self.m_flags = int(mi.EmitterFlags.Infinite)
-            self.sun = dr.normalize(mi.Vector3f(0.5, 0.7, 0.4))
-
-        def seen(self, d, active):
-            cos = dr.dot(d, self.sun)
-            across = dr.normalize(dr.cross(d, self.sun))
-            turned = mi.mueller.rotate_stokes_basis(-d, across, mi.mueller.stokes_basis(-d))
-            vector = 1 + dr.square(cos), 1 - dr.square(cos), 0, 0  # in the frame whose x axis is ``across``
-            value = dr.zeros(mi.Spectrum)
-            for i in range(4):
-                value[i, 0] = mi.UnpolarizedSpectrum(sum(turned[i, j] * vector[j] for j in range(4)))
-            return dr.select(active, value, 0)
-
-        def sample_direction(self, it, sample, active=True):
-            ds = dr.zeros(mi.DirectionSample3f)
-            ds.d = mi.warp.square_to_uniform_sphere(sample)
-            ds.n, ds.uv, ds.time, ds.dist = -ds.d, mi.Point2f(sample), it.time, mi.Float(100)
-            ds.p = it.p + ds.d * ds.dist
-            ds.pdf = dr.select(active, mi.Float(dr.inv_four_pi), 0)
-            ds.delta = mi.Bool(False)
-            ds.emitter = mi.EmitterPtr(self)
-            return ds, self.seen(ds.d, active) * (4 * dr.pi)
-
-        def pdf_direction(self, it, ds, active=True):
-            return dr.select(active, mi.Float(dr.inv_four_pi), 0)
-
-        def eval(self, si, active=True):
-            return self.seen(-si.wi, active)
-
-        def traverse(self, callback):
-            pass
-
-        def bbox(self):
-            return mi.ScalarBoundingBox3f()
-
-    mi.register_emitter("rayleigh_sky", Sky)
-
-
 def test_a_sky_of_the_users_may_be_polarized():
     """As of ``stokes`` around ``path``, seen directly, mirrored in rough metal and through glass."""
-    register_sky()
+    scene_parts.register_plugins()
     other = ball(PLASTIC) | {"center": [0.5, -0.3, 0.3]}
     eye, sky = camera(origin=(0, 0.5, 3), target=(0, -0.1, 0)), {"type": "rayleigh_sky"}
     scene = load(sensor=eye, sky=sky, floor=floor(ROUGH), ball=ball(GLASS), other=other)

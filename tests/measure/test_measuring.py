@@ -97,13 +97,13 @@ def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
     assert "reference" not in said and ": 30 rows" in said
     command("report", "mine", "--project", "project")
     text = (results / "README.md").read_text()
-    assert "| scene | over path, trimmed | over path, raw | over power, trimmed | over power, raw |" in text
-    assert re.search(r"\| `room` \|.*passed, p = ", text)
+    assert re.search("over path, trimmed .* over path, raw .* over power, trimmed .* over power, raw", text)
+    assert re.search(r"\| `room` .*passed, p = ", text)
     for name in re.findall(r"\((\w+\.png)\)", text):
         assert (results / name).stat().st_size > 5000
     command("page", "mine", "--project", "project")
     page = (results / "page.html").read_text()
-    assert 'href="#scene-room"' in page and "@DATA@" not in page
+    assert 'href="#scene-room"' in page and "{{" not in page.partition("<script>")[0]
     assert not (here / "references").exists() and not (here / "results").exists()
 
 
@@ -113,7 +113,7 @@ def test_other_commands_take_the_users_scene(here, capsys):
     words = ["compare", "bdpt skip=none", "path sampler=stratified", "--scenes", room, "--spp", "4"]
     assert main([*words, "--pairs", "1", *common]) == 0
     out = capsys.readouterr().out
-    assert "making one" in out and "| `room` | 4 |" in out
+    assert "making one" in out and re.search(r"\| `room` +\| 4 +\|", out)
     named = "bdpt skip=none divided by those of path sampler=stratified; efficiency, 1 / (time · error), of "
     assert f"Time and errors of {named}bdpt skip=none over path sampler=stratified." in out
     assert main(["equal-time", room, "--spp", "4", *common]) == 0
@@ -132,7 +132,7 @@ def test_the_first_integrator_may_be_any(here):
     for words in (["sweep", "alone"], ["report", "alone"], ["page", "alone"]):
         assert main([*words, "--project", "project"]) == 0
     text = (here / "project" / "results" / "alone" / "README.md").read_text()
-    assert "| `room` |" in text and "efficiency.png" not in text
+    assert "| `room` " in text and "efficiency.png" not in text
 
 
 def test_commands_in_messages_can_be_pasted(here, capsys):
@@ -181,18 +181,6 @@ def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
     assert message in line
 
 
-def test_a_width_that_fits_is_named(here):
-    file = here / "elsewhere" / "room.xml"
-    file.write_text(ROOM.format(height=36, sampler=""))
-    scene = SceneFile("room", file)
-    for resolution in (12, 20, 44):
-        with pytest.raises(CommandError, match="take resolution=") as refused:
-            making.check(making.Job(Project(here), scene, resolution))
-        making.check(
-            making.Job(Project(here), scene, int(str(refused.value).partition("take resolution=")[2]))
-        )
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -235,7 +223,7 @@ def test_samples_are_those_that_a_sampler_takes(here, capfd):
     assert making.AccuracyTarget(given, given.scene.load(8, "multijitter"), "path").images
     said = capfd.readouterr()
     assert "rounded" not in said.out + said.err
-    assert "| `room` | 32 / 35 |" in said.out and "bdpt, 32 spp" in said.out
+    assert re.search(r"\| `room` +\| 32 / 35 +\|", said.out) and "bdpt, 32 spp" in said.out
 
 
 def test_a_sample_is_timed_where_a_sampler_rounds_up(here, monkeypatch):
@@ -314,24 +302,18 @@ def test_recipes_say_what_makes_a_reference(here):
     words = ["reference", "elsewhere/room.xml", "--resolution", "8", "--spp", "1", "--seconds", "0"]
     words += ["--project", "project"]
 
-    def maker(*more):
+    def maker(text, *more):
+        recipe.write_text(f"[room]\n{text}\n")
+        (references / "room_8_4.exr").unlink(missing_ok=True)
         main([*words, *more])
         return reference.read_reference(references / "room_8_4.exr").provenance["integrator"]
 
-    assert maker()["type"] == "bdpt"
-    recipe.write_text('[room]\nby = "path"\n')
-    (references / "room_8_4.exr").unlink()
-    assert maker()["type"] == "path"
-    (references / "room_8_4.exr").unlink()
-    assert maker("--by", "bdpt")["type"] == "bdpt"
-    (references / "room_8_4.exr").unlink()
-    recipe.write_text('[room]\nby = "merging"\n')
-    assert maker()["merging_radius"] == 0.25
-    (references / "room_8_4.exr").unlink()
-    recipe.write_text('[room]\nby = "merging"\nmerging_radius = 0.5\n')
-    assert maker()["merging_radius"] == 0.5
-    recipe.write_text("[room]\nradiance = { limit = 1.0, lacks = 2.0 }\n")
-    assert maker() == "known answer"
+    assert maker("")["type"] == "bdpt"
+    assert maker('by = "path"')["type"] == "path"
+    assert maker('by = "path"', "--by", "bdpt")["type"] == "bdpt"
+    assert maker('by = "merging"')["merging_radius"] == 0.25
+    assert maker('by = "merging"\nmerging_radius = 0.5')["merging_radius"] == 0.5
+    assert maker("radiance = { limit = 1.0, lacks = 2.0 }") == "known answer"
     assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
     for wrong, message in (
         ("windows = [[0, 0, 2, 1]]", r"\[room\]: windows.0.2=2: .* less than or equal to 1"),

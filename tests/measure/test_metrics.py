@@ -178,17 +178,6 @@ def test_hdr_flip():
     assert there == pytest.approx(0.232887, abs=1e-4) and back == pytest.approx(0.144833, abs=1e-4)
 
 
-@pytest.mark.parametrize("metric", ["delta_e_itp", "hdr_flip"])
-def test_metrics_of_the_extra_say_so(metric, monkeypatch):
-    """Expected: without the extra's packages an error that names the module and what installs it."""
-    monkeypatch.setitem(sys.modules, "colour", None)
-    monkeypatch.setitem(sys.modules, "flip_evaluator", None)
-    metrics._of_the_extra.cache_clear()
-    gray = np.full((8, 8, 3), 0.5)
-    with pytest.raises(CommandError, match=rf"^{metric} needs the module \w+: pip install '.*\[measure\]'$"):
-        getattr(metrics, metric)(gray, gray)
-
-
 def test_hdr_flip_sees_light_in_black():
     """A reference that is black for more than half: flip-evaluator 1.6 reports 0 for any image."""
     reference = np.zeros((16, 16, 3))
@@ -233,36 +222,22 @@ def test_bad_images_are_refused(measure):
     """Each measure names the parameter, its value and the remedy, on either side."""
     good, bad = np.ones((2, 4, 3)), np.ones((2, 4, 3))
     bad[1, 2, 0] = np.nan
-    with pytest.raises(
-        ValueError, match=r"image holds 1 values that are NaN.*nan at index \(1, 2, 0\); find"
+    for pair, why in (
+        ((bad, good), r"image holds 1 values that are NaN or infinite, the first at index \[1, 2, 0\]; find"),
+        ((good, -np.inf * good), "reference holds 24 values that are NaN or infinite"),
+        ((np.ones((4, 2, 3)), good), r"image has shape \(4, 2, 3\) and reference \(2, 4, 3\); render"),
+        ((np.ones((2, 4, 4)), good), r"image has shape \(2, 4, 4\).*drop other channels"),
+        ((good, np.ones((4, 3))), r"reference has shape \(4, 3\)"),
+        ((np.ones((2, 4, 3), dtype=np.uint8), good), "image has values of type uint8; give linear radiance"),
     ):
-        measure(bad, good)
-    bad[1, 3, 0] = np.inf
-    with pytest.raises(ValueError, match="reference holds 2 values that are NaN or infinite"):
-        measure(good, bad)
-    with pytest.raises(ValueError, match=r"image has shape \(4, 2, 3\) and reference \(2, 4, 3\); render"):
-        measure(np.ones((4, 2, 3)), good)
-    with pytest.raises(ValueError, match=r"image has shape \(2, 4, 4\).*drop other channels"):
-        measure(np.ones((2, 4, 4)), good)
-    with pytest.raises(ValueError, match=r"reference has shape \(4, 3\)"):
-        measure(good, np.ones((4, 3)))
-    with pytest.raises(TypeError, match="image has values of type uint8; give linear radiance"):
-        measure(np.ones((2, 4, 3), dtype=np.uint8), good)
-    with pytest.raises(ValueError, match="image holds arrays of unlike shapes"):
-        measure([[[1.0, 2.0, 3.0]], [[1.0]]], good)
+        with pytest.raises((ValueError, TypeError), match=why):
+            measure(*pair)
 
 
 @pytest.mark.parametrize("measure", [metrics.rel_mse, metrics.mape])
 def test_black_references_are_refused(measure):
     with pytest.raises(ValueError, match="reference has mean 0.*use mse"):
         measure(np.ones((2, 2, 3)), np.zeros((2, 2, 3)))
-
-
-@pytest.mark.parametrize("trim", [-0.1, 1, np.nan, 0.99])
-def test_bad_trims_are_refused(trim):
-    """0.99 of 6 values rounds to all of them."""
-    with pytest.raises(ValueError, match="trim="):
-        metrics.rel_mse(row(1, 2), row(1, 2), trim)
 
 
 def test_what_the_reference_adds():
@@ -273,12 +248,6 @@ def test_what_the_reference_adds():
     difference = row(0.1, -0.2, 0.3, 0.4)
     assert metrics.reference_rel_mse(difference, image, reference) == pytest.approx(0.075 / 1.01)
     assert metrics.reference_rel_mse(difference, image, reference, 0.25) == pytest.approx(0.07 / 1.01)
-
-
-@pytest.mark.parametrize("value", ["1", None, True])
-def test_what_is_no_number_is_refused(value):
-    with pytest.raises(TypeError, match="exposure=.* must be a number"):
-        metrics.tone_map(row(1), value)
 
 
 def test_tile_means():
@@ -324,15 +293,14 @@ def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
     return mean * np.random.default_rng(seed).uniform(0.5, 1.5, (count, *shape))
 
 
-def means_of(runs, tiles=agreement.TILES, name="images"):
+def means_of(runs, tiles=agreement.TILES):
     """Means for a bias check of renders."""
-    return agreement.Means.of([agreement.tile_columns(run, tiles) for run in runs], name)
+    return agreement.Means.of([agreement.tile_columns(run, tiles) for run in runs])
 
 
 def bias_check(images, references, tiles=agreement.TILES, significance=agreement.SIGNIFICANCE):
     """The check of two sets of renders."""
-    sides = means_of(images, tiles), means_of(references, tiles, "references")
-    return agreement.compare_means(*sides, significance)
+    return agreement.compare_means(means_of(images, tiles), means_of(references, tiles), significance)
 
 
 def test_bias_check_passes_what_agrees():
@@ -432,18 +400,12 @@ def test_bias_check_keeps_its_level():
 
 
 def test_bias_check_refuses():
-    """Too few renders, other tiles, a black reference."""
+    """Too few renders, a black reference."""
     good = renders(1)
-    with pytest.raises(ValueError, match="references has 7 renders, too few.*give 8 or more"):
+    with pytest.raises(ValueError, match="7 renders are too few.*give 8 or more"):
         bias_check(good, good[:7])
-    with pytest.raises(ValueError, match="ours has 4 tiles along an edge and theirs 2"):
-        agreement.compare_means(means_of(good), means_of(good, 2))
     with pytest.raises(ValueError, match="references have mean 0"):
         bias_check(good, 0 * good)
-    with pytest.raises(ValueError, match="significance=1 must be"):
-        bias_check(good, good, significance=1)
-    with pytest.raises(ValueError, match="tiles=5"):
-        bias_check(good, good, 5)
 
 
 def test_an_exact_reference_has_no_error():

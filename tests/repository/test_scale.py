@@ -1,5 +1,7 @@
 """scripts/scale.py: its scenes, its edits, and what its tables say."""
 
+import re
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -57,9 +59,12 @@ def test_figures_are_ratios_over_path():
     assert scale.slope(rows, rows[1], "alone") == 0
     assert scale.cells(rows, rows[0])[7] == "–" and scale.cells(rows, rows[1])[5] == "4.5x"
     filters = [row("filters", "box", 1, 2), row("filters", "gaussian", 2, 5)]
-    text = scale.goals({"rows": filters})
+    text, again = (
+        re.sub(" +", " ", scale.goals({"rows": rows}))
+        for rows in (filters, [filters[0], row("filters", "gaussian", 2, 4)])
+    )
     assert "| filters, gaussian, ratio over that of the box filter | 1.1 | 1.25 | **no** |" in text
-    assert "| 1.1 | 1 | yes |" in scale.goals({"rows": [filters[0], row("filters", "gaussian", 2, 4)]})
+    assert "| 1.1 | 1 | yes |" in again
     assert "| lamps, 1,000, warm render | 1.5 | not measured | – |" in text
 
 

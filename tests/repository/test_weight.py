@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1440,  # top files
 }
-OUTSIDE = {"scripts": 2930, "tests": 36430}
+OUTSIDE = {"scripts": 2930, "tests": 36222}
 MOST_WORDS = 29047
 
 

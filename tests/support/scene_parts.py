@@ -47,7 +47,7 @@ _registered = set()
 
 
 def register_plugins():
-    """Register the plugins ``own_lamp``, ``own_sky`` and ``own_fisheye`` for the current variant."""
+    """Register the plugins for the current variant."""
     if mi.variant() in _registered:
         return
     _registered.add(mi.variant())
@@ -124,6 +124,19 @@ def register_plugins():
         def eval(self, si, active=True):
             return self.seen(-si.wi, active)
 
+    class RayleighSky(OwnSky):
+        """Light that air scatters once, polarized across the sun's plane (in polarized variants)."""
+
+        def seen(self, d, active):
+            sun = dr.normalize(mi.Vector3f(0.5, 0.7, 0.4))
+            cos, across = dr.dot(d, sun), dr.normalize(dr.cross(d, sun))
+            turned = mi.mueller.rotate_stokes_basis(-d, across, mi.mueller.stokes_basis(-d))
+            vector = 1 + dr.square(cos), 1 - dr.square(cos), 0, 0  # in the frame whose x axis is ``across``
+            value = dr.zeros(mi.Spectrum)
+            for i in range(4):
+                value[i, 0] = mi.UnpolarizedSpectrum(sum(turned[i, j] * vector[j] for j in range(4)))
+            return dr.select(active, value, 0)
+
     class OwnFisheye(mi.Sensor):
         """A camera whose directions bend outwards."""
 
@@ -150,6 +163,7 @@ def register_plugins():
 
     mi.register_emitter("own_lamp", OwnLamp)
     mi.register_emitter("own_sky", OwnSky)
+    mi.register_emitter("rayleigh_sky", RayleighSky)
     mi.register_sensor("own_fisheye", OwnFisheye)
 
 

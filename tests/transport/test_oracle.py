@@ -120,17 +120,6 @@ def test_recursion_with_merges(name, classes, least, monkeypatch):
     assert total > 200 and plain > 200
 
 
-def test_sums_of_guiding_pass_delta_events():
-    """Expected: at a delta event ``d_vm``, here of a guided technique, changes as ``d_vc`` does."""
-    step = SimpleNamespace(
-        pdf_fwd_w=mi.Float(0), pdf_rev_w=mi.Float(0), cos_out=mi.Float(0.5), delta=mi.Bool(True)
-    )
-    before = mis.Partial(mi.Float(1), mi.Float(3), mi.Float(3))
-    h, guided = mis.Heuristic("balance"), mi.Float(7)
-    d_vm = mis.scattered_guided(h, before, step, guided, mi.Bool(True))
-    assert d_vm[0] == mis.scatter(h, before, 1, step).d_vc[0] == 1.5
-
-
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", ["n1c1", "odd", "n0c0"])
 def test_recursion_extreme_densities(name, classes):
@@ -949,7 +938,8 @@ def guided_estimates(world: World, weights) -> np.ndarray:
         ("balance", "n1c0-half", True, near_specular.SPECULAR),
         ("balance", "n0c0", False, near_specular.SPECULAR),
         ("balance", "odd", False, np.inf),
-        ("power", "n1c0-half", True, np.inf),
+        ("balance", "odd", True, np.inf),
+        ("power", "quarter", True, np.inf),
     ],
 )
 def test_kernel_guides_through_specular_events(name, classes, lens, least, monkeypatch):

@@ -70,7 +70,6 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **settings)
 
     def add_argument(self, *names, **settings):
-        """Declare an argument, like argparse."""
         self.known.extend(name for name in names if name.startswith("-"))
         return super().add_argument(*names, **settings)
 
@@ -141,7 +140,6 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _versions() -> str:
-    """Return the installed versions of this package, Mitsuba and Dr.Jit."""
     found = []
     for name in ("mitsuba", "drjit"):
         with contextlib.suppress(metadata.PackageNotFoundError):
@@ -150,7 +148,6 @@ def _versions() -> str:
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the scene arguments; ``-D``, ``-m`` and ``-s`` as in Mitsuba."""
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")

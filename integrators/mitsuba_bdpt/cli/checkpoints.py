@@ -26,7 +26,6 @@ IDENTITY = "bdptIdentity"
 
 
 def path_of(output: Path) -> Path:
-    """Return the path of an image's checkpoint, beside the image."""
     return output.with_suffix(".checkpoint.npz")
 
 
@@ -98,7 +97,6 @@ class Checkpoints:
         self._last, self._report = time.monotonic(), None
 
     def after_pass(self, report) -> None:
-        """Called with every ``PassReport``."""
         self._report = report
         if time.monotonic() - self._last >= self._seconds:
             self.write()
@@ -141,5 +139,4 @@ class Checkpoints:
             )
 
     def remove(self) -> None:
-        """Remove the checkpoint, after the finished image has been written."""
         self.path.unlink(missing_ok=True)

@@ -82,7 +82,6 @@ class Merged:
 
     @property
     def count(self) -> int:
-        """Number of parts that have arrived."""
         return self._next + len(self._waiting)
 
 

@@ -72,39 +72,35 @@ def run(variant: str) -> int:
 
 
 def versions() -> list[Finding]:
-    """Report versions of Python, the platform, this package and its dependencies."""
-    system = f"{platform.system()} {platform.machine()}"
     findings = [
         Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
-        Finding("ok", "platform", system),
+        Finding("ok", "platform", f"{platform.system()} {platform.machine()}"),
         Finding("ok", "mitsuba-bdpt", mitsuba_bdpt.__version__),
     ]
     for package in PACKAGES:
         try:
             findings.append(Finding("ok", package, importlib.metadata.version(package)))
         except importlib.metadata.PackageNotFoundError:
-            # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
-            needed = package != llvm.WHEEL
             text = f"not installed; mend it with: python -m pip install {package}"
-            state = "FAIL" if needed else "note"
-            findings.append(Finding(state, package, text if needed else "not installed"))
+            # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
+            found = ("note", package, "not installed") if package == llvm.WHEEL else ("FAIL", package, text)
+            findings.append(Finding(*found))
     return findings
 
 
 def llvm_library() -> Finding:
-    """Report the LLVM library and the reason for it, or why the import failed."""
     failure, choice = mitsuba_bdpt.failure, mitsuba_bdpt.llvm_choice
     if failure is not None or choice is None:
         subject = "LLVM" if isinstance(failure, llvm.LLVMNotFoundError) else "import"
         return Finding("FAIL", subject, str(failure))
     if choice.version in llvm.KNOWN_GOOD or not (choice.path or choice.version):
         return Finding("ok", "LLVM", str(choice))
-    known = ", ".join(map(str, llvm.KNOWN_GOOD))
-    return Finding("note", "LLVM", f"{choice}; versions known to work: {known}")
+    return Finding(
+        "note", "LLVM", f"{choice}; versions known to work: {', '.join(map(str, llvm.KNOWN_GOOD))}"
+    )
 
 
 def kernel_cache() -> Finding:
-    """Report whether Dr.Jit can store compiled kernels."""
     folder = Path(os.environ.get("DRJIT_CACHE_DIR") or Path.home() / ".drjit")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -126,12 +122,11 @@ def render_in_child(
         return [Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")]
     report: dict = {}
     for line in child.stdout.splitlines():
-        if line.startswith("{"):
-            report.update(json.loads(line))
+        report |= json.loads(line) if line.startswith("{") else {}
     findings = [threads(report["threads"])] if "threads" in report else []
     if "variants" in report:
         findings.append(variants(report["variants"], report.get("backends", [])))
-    return [*findings, judge(child, report, variant)]
+    return [*findings, Finding(*judge(child, report, variant))]
 
 
 def threads(count: int) -> Finding:
@@ -166,29 +161,27 @@ def why_not(variant: str, backends: list[str]) -> str:
     return reasons[variant.partition("_")[0]]
 
 
-def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Finding:
-    """Report the outcome of the `child`, which printed `report`."""
+def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> tuple[str, str, str]:
+    """Return the finding about the `child`, which printed `report`."""
     last = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
+    mean = report.get("mean", float("nan"))
     if child.returncode < 0:
-        name = signal.Signals(-child.returncode).name
-        text = f"the process rendering it was killed by {name} ({last})."
+        text = f"the process rendering it was killed by {signal.Signals(-child.returncode).name} ({last})."
         if variant.startswith("llvm"):
             text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {crash_remedy()}"
-        return Finding("FAIL", "test image", text)
-    if child.returncode > 0:
+    elif child.returncode > 0:
         reason = why_not(variant, report["backends"]) if "backends" in report else ""
         text = f"{variant} cannot render here: {reason}" if reason else last
-        return Finding("FAIL", "test image", text)
-    mean = report.get("mean", float("nan"))
-    # Bounds: the box reflects less than its lamp emits, and no part of it is black.
-    if not 0.01 < mean < 10:
-        return Finding("FAIL", "test image", f"rendered with {variant}, but its mean is {mean:g}")
-    with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
-    return Finding("ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}")
+    # The box reflects less than its lamp emits, and no part of it is black.
+    elif not 0.01 < mean < 10:
+        text = f"rendered with {variant}, but its mean is {mean:g}"
+    else:
+        with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
+        return "ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}"
+    return "FAIL", "test image", text
 
 
 def crash_remedy() -> str:
-    """Return the remedy after a crash: another LLVM."""
     choice = mitsuba_bdpt.llvm_choice
     if choice is not None and choice.why == llvm.NAMED:
         return f"Unset {llvm.VARIABLE}; it names {str(choice.path)!r}."

@@ -22,7 +22,6 @@ NEEDED = "colour flip_evaluator jinja2 markdown_it matplotlib pandas pyarrow pyd
 
 
 def run(arguments: Namespace) -> int | None:
-    """Run a subcommand and return its exit status."""
 
     def measured() -> int:
         check_installed(arguments.command)
@@ -33,7 +32,6 @@ def run(arguments: Namespace) -> int | None:
 
 
 def check_installed(command: str) -> None:
-    """Raise ``CommandError`` if the extra ``[measure]`` is not installed."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise CommandError(
@@ -62,7 +60,6 @@ def integrator(text: str) -> tuple[str, dict]:
 
 
 def declare(parser: argparse.ArgumentParser, kind: type) -> None:
-    """Declare the options of a measurement, a dataclass of `measure.options`."""
     for field in options.options_of(kind):
         given, kind = dict(field.metadata["declared"]), field.metadata["kind"]
         names = [given.pop("short")] if "short" in given else []

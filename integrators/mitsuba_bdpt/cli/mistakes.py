@@ -111,7 +111,6 @@ OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNOREC
 
 
 def of_memory(error: BaseException) -> BaseException | None:
-    """Return the exception about lack of memory that ``error`` is or wraps, else None."""
 
     def is_lack(found: BaseException) -> bool:
         drjits = isinstance(found, RuntimeError) and OUT_OF_MEMORY.search(str(found))
@@ -135,7 +134,6 @@ def status_of(error: BaseException) -> int | None:
 
 
 def is_mistake(error: BaseException) -> bool:
-    """Return whether ``error`` is a usage error, see above."""
     if isinstance(error, OSError):
         return error.errno in PATHS
     if isinstance(error, argparse.ArgumentTypeError):

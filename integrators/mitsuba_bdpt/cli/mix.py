@@ -18,7 +18,6 @@ from .mistakes import answered
 
 
 def run(options: Namespace) -> int | None:
-    """Mix as the command-line `options` request; returns the exit status."""
     return answered(lambda: _run(options))
 
 

@@ -62,7 +62,6 @@ class Outcome:
 
 
 def run(options: Namespace) -> int | None:
-    """Render as the command-line `options` request; returns the exit status."""
     return _ended(lambda ending: _run(options, ending))
 
 
@@ -73,7 +72,6 @@ def _ended(command: Callable[[Ending], int]) -> int | None:
 
 
 def _run(options: Namespace, ending: Ending) -> int:
-    """Like `run`, but raises errors."""
     check_file(options.scene)  # before creating the image's folder
     jobs = jobs_of(options)
     for job in jobs:
@@ -218,7 +216,6 @@ def say(line: str) -> None:
 
 
 def explain(options: Namespace) -> int | None:
-    """Print what such a render would do; returns the exit status."""
 
     def explained(ending: Ending) -> int:
         scene, integrator, _ = loaded(options, ending)
@@ -230,7 +227,6 @@ def explain(options: Namespace) -> int | None:
 
 
 def check_options(options: Namespace) -> None:
-    """Raise ``CommandError`` for contradictory options."""
     if options.resume and options.checkpoint is None:
         raise CommandError("resume needs --checkpoint MINUTES: how often to write them.")
     if options.parts is not None and options.scheduler is None:
@@ -266,7 +262,6 @@ def check_integrator(options: Namespace, integrator: mi.Integrator) -> None:
 
 
 def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: int) -> Outcome:
-    """Render into the sensor's film, with progress."""
     film = choose_sensor(scene, options.sensor).film()
     if not is_ours(integrator):
         return render_foreign(scene, integrator, options, spp)
@@ -344,7 +339,6 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
 
 
 def is_ours(integrator: mi.Integrator) -> bool:
-    """Return whether this is `bdpt`."""
     return hasattr(integrator, "assemble")
 
 
@@ -378,7 +372,6 @@ def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
 
 
 def settings(options: Namespace, spp: int) -> dict:
-    """Return the command line as JSON values."""
     pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
     return {key: plain(value) for key, value in (vars(options) | {"spp": spp} | pairs).items()}
 
@@ -417,16 +410,13 @@ def stopped_by(job: Namespace, integrator: mi.Integrator, outcome: Outcome, spp:
     parameters = integrator.settings if is_ours(integrator) else None
     target = parameters.target_error if parameters else 0
     if 0 < target and outcome.statistics.get("error", math.inf) <= target:
-        option = "target_error=" if job.target_error is None else "--target-error "
-        return f"stopped by {option}{target:g} after {done}"
-    option, limit = "--time ", job.time
-    if limit is None:
-        option, limit = "timeout=", parameters.timeout if parameters else -1
+        return f"stopped by target_error={target:g} after {done}"
+    limit = job.time if job.time is not None else parameters.timeout if parameters else -1
     if limit < 0:
         return ""
     compiling = outcome.statistics.get("seconds", {}).get("compile", 0)
     spent = f", compiling took {compiling:.0f} s" if compiling > max(limit / 4, 1) else ""
-    return f"stopped by {option}{limit:g} after {done}{spent}"
+    return f"stopped by the time limit of {limit:g} s after {done}{spent}"
 
 
 def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float, stopped: str) -> str:
@@ -437,21 +427,18 @@ def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: f
         f"{outcome.spp} spp ({readable(outcome.spp * width * height)} samples)",
         *([stopped] if stopped else []),
     ]
-    rays = outcome.statistics.get("rays")
-    if rays:
+    if rays := outcome.statistics.get("rays"):
         kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
     if "error" in outcome.statistics:
         error = outcome.statistics["error"]
-        missed = 0 < target_error < error
         text = f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known"
-        if missed:
+        if 0 < target_error < error:
             text += f", not the {target_error:g} asked for: that takes more samples (--spp, --time)"
         parts.append(text)
     if outcome.statistics.get("no_pilot"):
         parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
-    if outcome.statistics.get("non_finite"):
-        invalid = outcome.statistics["non_finite"]
+    if invalid := outcome.statistics.get("non_finite"):
         parts.append(f"{invalid} invalid samples (NaN or infinite) count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     if outcome.interrupted:

@@ -65,7 +65,6 @@ def frames(text: str) -> list[int]:
 
 
 def definition(text: str) -> tuple[str, str]:
-    """Parse ``KEY=VALUE``."""
     text = _utf8(text)
     key, equals, value = text.partition("=")
     if not key or not equals:

@@ -7,7 +7,6 @@ normal samples; means of many pixels are nearly normal, single pixels are not.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import NamedTuple
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from ..errors import CommandError
-from .metrics import CONFIDENCE, Estimate, number_of
+from .metrics import CONFIDENCE, Estimate
 
 # Relative differences of tile means up to this are attributed to float32 rounding.
 ROUNDING = 2e-5
@@ -164,15 +163,11 @@ class Means:
     whole: Sample
 
     @staticmethod
-    def of(
-        columns: Sequence[Sequence[float] | np.ndarray], name: str = "columns", fewest: int = FEWEST_RUNS
-    ) -> Means:
+    def of(columns: ArrayLike, fewest: int = FEWEST_RUNS) -> Means:
         """Return the means of at least ``fewest`` ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
         values = np.asarray(columns, dtype=np.float64)
         if len(values) < fewest:
-            raise CommandError(
-                f"{name} has {len(values)} renders, too few for the test's level; give {fewest} or more."
-            )
+            raise CommandError(f"{len(values)} renders are too few for the test; give {fewest} or more.")
         return Means(Sample.of(values), Sample.of(values[:, -3:].mean(1, keepdims=True)))
 
     def joined(self, other: Means) -> Means:
@@ -184,11 +179,6 @@ class Means:
         """Return the means of an exact image."""
         columns = tile_columns(image, tiles)
         return Means(Sample.known(columns), Sample.known(columns[-3:].mean(keepdims=True)))
-
-    @property
-    def tiles(self) -> int:
-        """Tiles along each side of the image."""
-        return math.isqrt(len(self.columns.mean) // 3 - 1)
 
 
 def missing_energy(image: Sample, reference: Sample) -> Estimate:
@@ -218,13 +208,7 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
     It detects bias of a few standard errors of a tile; noise may hide smaller bias (see the intervals). It
     cannot distinguish bias from energy in events that are rarer than the samples.
     """
-    significance = number_of("significance", significance, 0, 1)
-    if ours.tiles != theirs.tiles:
-        raise CommandError(
-            f"ours has {ours.tiles} tiles along an edge and theirs {theirs.tiles}; take the same."
-        )
-    tiles = ours.tiles
-    found = welch(ours.columns, theirs.columns)
+    found, tiles = welch(ours.columns, theirs.columns), math.isqrt(len(ours.columns.mean) // 3 - 1)
     worst = int(np.lexsort((-np.abs(found.value), found.p))[0])
     tile, channel = divmod(worst, 3)
     family, each = sidak(found.p), (1 - significance) ** (1 / len(found.p))

@@ -155,7 +155,6 @@ def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[
 
 
 def _options(kind: type[OptionsT], given: dict) -> OptionsT:
-    """Return the options of a measurement; raises ``CommandError`` for others."""
     known = {field.name: field for field in available.options_of(kind)}
     for name in given:
         if name not in known:

@@ -68,7 +68,6 @@ class Subject:
 
 
 def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace) -> Subject:
-    """Return what the ``options`` ask for."""
     if options.reference is None:
         seconds = options.reference_seconds
         width = fitted(file, options.resolution or RESOLUTION)
@@ -139,7 +138,6 @@ def shots(given: Subject, ways: dict[str, dict], spp: int) -> list[Shot]:
 def pictured(
     project: Project, scene: str, integrators: Mapping[str, dict], options: EqualTime | Namespace
 ) -> tuple[Path, list[Shot]]:
-    """Draw a scene rendered by these integrators; returns the file and the renders."""
     file = project.scene(scene)
     output = options.output or project.renders / f"equal_time_{file.name}.png"
     check_figure(output)
@@ -156,7 +154,6 @@ def pictured(
 
 
 def run(options: Namespace) -> int:
-    """Draw the images that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
     integrators = dict(options.integrators)
     output, found = pictured(Project(options.project), options.scene, integrators, options)

@@ -30,12 +30,10 @@ class Pending:
 
     @property
     def late(self) -> list[Cell]:
-        """The cells that are still missing."""
         return [cell for group in self._groups for cell in group]
 
     @property
     def needed(self) -> float:
-        """The predicted seconds of these cells."""
         return sum(map(self._predicted, self._groups))
 
     @property

@@ -83,7 +83,6 @@ MARGIN = 0.9  # of that share
 
 
 def recipe_of(project: Project, name: str) -> Recipe:
-    """Read the recipe of a scene; raises ``CommandError`` for an invalid one."""
     return read_table(Recipe, project.references / "scenes.toml", name)
 
 
@@ -200,7 +199,6 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def _announced(job: Job) -> str:
-    """Return the message before a new reference is rendered."""
     where = f"{job.resolution} and depth {job.depth}"
     if job.is_outdated:
         why = f"the scene has changed since its reference at {where} was made; making one anew"
@@ -236,7 +234,6 @@ def resized(scene: MeasuredScene, wanted: int, width: int) -> list[str]:
 
 
 def fitted(scene: MeasuredScene, wanted: int) -> int:
-    """Return `fitting_width`; prints a message if that is another width."""
     width = fitting_width(scene, wanted)
     for told in resized(scene, wanted, width):
         print(told, flush=True)
@@ -310,7 +307,6 @@ class Halves:
         return (a + b) / 2, (a - b) / 2
 
     def reference(self, provenance: dict) -> Reference:
-        """Return the reference; needs at least one round."""
         image, difference = self.mean()
         return Reference(image, difference, self.means(), provenance)
 
@@ -327,7 +323,6 @@ class AccuracyTarget:
 
     @cached_property
     def images(self) -> list[np.ndarray]:
-        """Renders of them, with a few seeds."""
         found: list[np.ndarray] = []
         ours = {"type": "bdpt", "merging": self.by == "merging"}
         rivals = [(ours, self.job.spp)]
@@ -392,7 +387,6 @@ def provenance_of(job: Job, **more: Any) -> dict[str, Any]:
 
 
 def _known(job: Job, radiance: Radiance) -> Reference:
-    """Return a constant reference without error."""
     width, height = job.scene.size(job.resolution)
     value = radiance.limit - (radiance.lacks * 2.0**-job.depth if job.depth > 0 else 0.0)
     image = np.full((height, width, 3), value)
@@ -499,7 +493,6 @@ def _refined(
 
 
 def _pair(scene, integrator, halves: Halves, spp: int):
-    """Render two images with different seeds."""
     seed = FIRST_SEED + 2 * halves.rounds
     return [_pixels(mi.render(scene, integrator=integrator, spp=spp, seed=seed + i)) for i in (0, 1)]
 
@@ -531,7 +524,6 @@ class Window:
 
 
 def said(job: Job, made: Reference, reached: bool) -> str:
-    """Describe in a line what was made."""
     text = f"{job.scene.name}: {made.provenance.get('spp', 'known answer')} spp, own relMSE {made.error:.1e}"
     if reached:
         return text

@@ -40,7 +40,6 @@ def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> Model
 
 
 def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
-    """Describe an error of pydantic."""
     key, value, text = ".".join(map(str, found["loc"])), found["input"], found["msg"]
     if found["type"] == "extra_forbidden":
         schema = kind.model_json_schema()
@@ -216,6 +215,5 @@ class Recipe(Model):
 
 
 def read_table(kind: type[ModelT], file: Path, name: str) -> ModelT:
-    """Return the table of this name in a TOML file; the defaults without file or table."""
     tables = read_toml(file) if file.is_file() else {}
     return checked(kind, tables.get(name, {}), f"{file}: [{name}]")

@@ -146,7 +146,6 @@ class Options:
 
 
 def takes_several(found: Field[Any]) -> bool:
-    """Return whether an option has several values."""
     return isinstance(found.default, tuple) or "nargs" in found.metadata["declared"]
 
 

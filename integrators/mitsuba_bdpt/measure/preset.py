@@ -105,7 +105,6 @@ def preset_of(
 
 
 def _check_names(path: Path, file: PresetFile, names: list[str]) -> None:
-    """Raise ``CommandError`` if a table names a scene that is not among the ``names``."""
     tables: dict[str, Sequence[str]] = {f"[scene.{name}]": [name] for name in file.scene}
     tables |= {f"scenes of integrator {one.name!r}": one.scenes for one in file.integrator if one.scenes}
     tables |= {"scenes of [more]": file.more.scenes} if file.more else {}
@@ -160,7 +159,6 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Name of the cell's files."""
         return hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -170,7 +168,6 @@ def software() -> dict:
 
 
 def machine() -> str:
-    """Return processor and number of cores."""
     file = Path("/proc/cpuinfo")
     text = file.read_text(encoding="utf-8") if file.exists() else ""
     names = re.findall(r"^model name\s*: (.*)", text, re.MULTILINE)

@@ -40,7 +40,6 @@ print(time.perf_counter() - wall, time.process_time() - processor, memory.peak()
 
 
 def numbers(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> list[float]:
-    """Return the numbers that a new process prints."""
     command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace")
     if done.returncode:

@@ -29,8 +29,6 @@ PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Project:
-    """The folder ``root``, see above."""
-
     root: Path
     given: Mapping[str, DictionaryScene] = field(default_factory=dict[str, DictionaryScene], compare=False)
     """Scenes that are given as dictionaries, by their names."""
@@ -87,7 +85,6 @@ class Project:
         return str(scene.file) if isinstance(scene, SceneFile) and scene.file != named else scene.name
 
     def command(self, *words: str | Path) -> str:
-        """Return a command line of this project, quoted for a shell."""
         there = [] if self.root == Path() else ["--project", str(self.root)]
         return shlex.join(["mitsuba-bdpt", *map(str, words), *there])
 
@@ -97,7 +94,6 @@ class Project:
         return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
 
     def _names_for(self, name: str) -> str:
-        """Return the end of a message about an unknown ``name``."""
         known = self.scene_names()
         if not known:
             return f", or put it into {str(self.scenes)!r} and give its name"

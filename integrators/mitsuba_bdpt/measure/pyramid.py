@@ -121,7 +121,6 @@ def draw(found: dict, path: Path, exposure: float, columns: int = 2):
 def pictured(
     project: Project, scene: str, options: Pyramid | Namespace
 ) -> tuple[dict[str, Path], dict[str, dict]]:
-    """Render and write a scene's pyramids; returns files, and images by kind."""
     if options.max_depth < SHORTEST:
         raise CommandError(f"max_depth={options.max_depth} has no strategies to show; use {SHORTEST} or more")
     file = project.scene(scene)
@@ -141,7 +140,6 @@ def pictured(
 
 
 def run(options: Namespace) -> int:
-    """Render and write the pyramids that the command-line ``options`` request."""
     mi.set_variant(VARIANT)
     pictures, _ = pictured(Project(options.project), options.scene, options)
     print(*pictures.values(), sep="\n")

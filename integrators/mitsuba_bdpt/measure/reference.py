@@ -119,7 +119,6 @@ def read_reference(path: Path) -> Reference:
 
 
 def write(path: Path, reference: Reference):
-    """Write a reference atomically."""
     brightest = float(reference.image.max())
     if brightest > HALF_MAX:
         raise CommandError(

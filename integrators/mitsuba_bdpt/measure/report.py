@@ -12,11 +12,10 @@ import json
 import re
 from argparse import Namespace
 from collections import Counter, defaultdict
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -64,14 +63,6 @@ def by_scene(scenes: Sequence[str], columns: Mapping[str, Figure]) -> str:
     return markdown(pd.DataFrame({"scene": [f"`{scene}`" for scene in scenes], **cells}))
 
 
-def _grouped(scenes: Sequence[str], key: Callable[[str], Hashable]) -> dict[Any, list[str]]:
-    """Return the scenes by key, those without left out."""
-    found: dict[Any, list[str]] = defaultdict(list)
-    for scene in scenes:
-        found[key(scene)].append(scene)
-    return found
-
-
 def efficiency_table(results: Results) -> str:
     """Efficiency per scene and rival, trimmed and raw, and the energy that rivals lack.
 
@@ -79,7 +70,9 @@ def efficiency_table(results: Results) -> str:
     """
     if not results.rivals:
         return f"There is no integrator to compare {results.methods[0]} with; add one to the preset.\n"
-    groups = _grouped(results.scenes, lambda scene: tuple(results.present(scene, results.rivals)))
+    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for scene in results.scenes:
+        groups[tuple(results.present(scene, results.rivals))].append(scene)
     return "\n".join(by_scene(scenes, _efficiencies(results, rivals)) for rivals, scenes in groups.items())
 
 
@@ -136,34 +129,20 @@ def _energy(results: Results, scene: str, method: str) -> str:
 
 
 def budgets_table(results: Results) -> str:
-    """Efficiency over the strongest of `Results.standard`, by budget: a table per set of budgets."""
+    """Efficiency over the strongest of `Results.standard`, by budget; "–" where there is none."""
 
-    def figure(error: Error, budget: int, scene: str) -> Summary:
-        return results.against_path(scene, error, budget)
+    def figure(error: Error, budget: int, scene: str) -> str:
+        try:
+            return str(results.against_path(scene, error, budget))
+        except Unavailable:
+            return "–"
 
-    def budgets(scene: str) -> tuple[int, ...]:
-        """Return the budgets with a figure: not of a single render, or none, or an exact one."""
-        found: list[int] = []
-        for budget in sorted(results.of(scene, results.methods[0])["budget"].unique()):
-            try:
-                figure("rel_mse", budget, scene)
-            except Unavailable:
-                continue
-            found.append(budget)
-        return tuple(found)
-
-    return "\n".join(
-        by_scene(
-            scenes,
-            {
-                f"{budget} spp, {kind}": partial(figure, error, budget)
-                for budget in found
-                for error, kind in KINDS.items()
-            },
-        )
-        for found, scenes in _grouped(results.scenes, budgets).items()
-        if found
-    )
+    columns: dict[str, Figure] = {
+        f"{budget} spp, {kind}": partial(figure, error, budget)
+        for budget in sorted(results.rows["budget"].unique())
+        for error, kind in KINDS.items()
+    }
+    return by_scene(results.scenes, columns)
 
 
 def first_images_table(results: Results) -> str:

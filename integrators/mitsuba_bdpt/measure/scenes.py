@@ -221,7 +221,6 @@ def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
 
 
 def digest(*paths: Path) -> str:
-    """Return the SHA-256 of concatenated files."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
@@ -271,7 +270,6 @@ def samples_taken(scene: mi.Scene, integrator: mi.Integrator, spp: int) -> int:
 
 
 def check_plugins(name: str, parameters: Mapping[str, Any], sampler: str | None, depth: int) -> None:
-    """Raise ``CommandError`` if the plugin ``name`` or its ``sampler`` is invalid."""
     for what, make in (
         (f"integrator {name!r}", lambda: integrator_of(parameters, depth)),
         (f"sampler of {name!r}", lambda: mi.load_dict({"type": sampler}) if sampler else None),

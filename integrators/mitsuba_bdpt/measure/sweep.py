@@ -88,7 +88,6 @@ class Bench:
         return self._loaded(cell.parameters)
 
     def timed(self, cell: Cell, spp: int, seed: int) -> Timed:
-        """Render with the integrator of a cell."""
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
     def first_seconds(self, cell: Cell, spp: int) -> tuple[float, float]:
@@ -149,7 +148,6 @@ class Bench:
         return float(np.median([a / ours / (b / theirs) for a, b in seconds]))
 
     def _calibration_budget(self, first: Cell, cell: Cell) -> int:
-        """Return the budget at which equal time is measured."""
         budgets = sorted(self.cells.subject.spp)
         if self.seconds is None:
             return budgets[-1]
@@ -166,7 +164,6 @@ class Bench:
         return at
 
     def _taken(self, cell: Cell, spp: int) -> int:
-        """Return the samples that a cell's render takes: stratified samplers may round up."""
         return samples_taken(self.scene(cell.sampler), self.integrator(cell), spp)
 
 
@@ -403,7 +400,6 @@ class Sweep:
         store(self.output, cell, *result, self._judges[cells.where()])
 
     def _remote(self, client):
-        """Render the missing cells, and those that follow, on a cluster."""
         todo = self._todo
         while any((todo := {cells: todo[cells] or self._more(cells) for cells in todo}).values()):
             groups = [
@@ -580,7 +576,6 @@ def _tell(sweep: Sweep, table: pd.DataFrame) -> None:
 
 
 def run(options: Namespace) -> int:
-    """Sweep as the command-line ``options`` request; returns 1 if anything failed."""
     mi.set_variant(VARIANT)
     _, failed = swept(Project(options.project), options.preset, options)
     return 1 if failed else 0

@@ -27,7 +27,6 @@ Render = Callable[[int], Timed]
 
 
 def timed(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> Timed:
-    """Render, and return the image with the time that it took."""
     dr.sync_thread()
     started, cpu_started = time.perf_counter(), time.process_time()
     image = mi.render(scene, integrator=integrator, spp=spp, seed=seed)

@@ -199,7 +199,7 @@ def _begun(kernel: TraceContext, guiding: Guiding, z: Vertex, numbers: Stream, s
     broken = not_finite(active, throughput)
     active &= (spectra.brightest(throughput) > 0) & ~broken
     no, unit = mi.Bool(False), mi.Float(1)
-    step = bsdf.Step(local, f.value, pdf, f.pdf_rev_w, z.cosine(d), no, no, unit)
+    step = bsdf.Step(local, f.value, f.pdf_fwd_w, f.pdf_rev_w, z.cosine(d), no, no, unit)
     partial = mis.scatter(h, z.partial, newest, step)
     ray = rays.spawn(z.anchor, d, shared)
     pi = kernel.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
