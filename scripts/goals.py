@@ -20,7 +20,6 @@ from mitsuba_bdpt.measure.analysis import (
     Summary,
     Unavailable,
     cost,
-    efficiency,
     summary,
 )
 from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL, KINDS, Error
@@ -142,8 +141,8 @@ def merged(results: Results, scene: str) -> Measured:
 def alone(results: Results, scene: str) -> Measured:
     """Efficiency of path tracing alone over `path` with its best sampler."""
     budgets = (results.deciding, 4 * results.deciding)
-    sides = {n: [results.of(scene, way, n) for way in (ALONE, RIVALS[1])] for n in budgets}
-    return _measured({f"at {n} spp": partial(efficiency, *rows) for n, rows in sides.items()})
+    over = partial(results.efficiency, scene, RIVALS[1], first=ALONE)
+    return _measured({f"at {n} spp": partial(over, budget=n) for n in budgets})
 
 
 def costs(results: Results, scene: str) -> Measured:

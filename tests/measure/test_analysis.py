@@ -137,14 +137,6 @@ def test_scenes_with_the_largest_gap_come_first():
     assert cells(text, "`alone`") == ["fewer than two renders: seeds = 2 or more"] * 2
 
 
-def test_widths_are_those_of_the_interval_of_the_median():
-    """Ratios 1, 1, 1 have an interval of width 0; of 1, 2, 3 the bootstrap's goes from 1 to 3."""
-    rows = runs("bdpt", 3) + runs("path", 3)
-    rows += [row("other", seed, rel_mse_trimmed=0.02 * seed) for seed in (1, 2, 3)]
-    found = analysis.widths(pd.DataFrame(rows), ("bdpt", "path", "other"))
-    assert found == pytest.approx({"path": 0.0, "other": 2.0})
-
-
 def test_cost_is_per_sample():
     """1 s for 64 samples against 2 s for 256: 2x."""
     sides = runs("bdpt", 2), runs("path", 2, seconds=2.0, spp=256)
@@ -214,9 +206,8 @@ def test_the_stronger_path_decides(results):
 
 
 def test_the_report_says_which_source_measured_what():
-    """Expected: one machine and version for all rows; a scene that was measured anew names its source, and
-    rows of one scene by two sources are refused, as those of two machines are.
-    """
+    """One machine and version for all rows; a scene that was measured anew names its source, and rows of one
+    scene by two sources are refused, as those of two machines are."""
 
     def said(*rows):
         keys = ("scene", "machine", "source")
@@ -240,8 +231,8 @@ def cells(text, first, place=0):
 
 
 def test_scenes_with_media_have_a_table_of_their_own(results):
-    """Expected: `fog`, rendered by `volpath` and `volpathmis`, stands in a table with their columns, and is
-    judged by the stronger of them; the other scenes' table is as without it."""
+    """`fog`, rendered by `volpath` and `volpathmis`, stands in a table with their columns, and is judged by
+    the stronger of them; the other scenes' table is as without it."""
     fog = (
         runs("bdpt", 3)
         + runs("volpath", 3, rel_mse_trimmed=0.1)
@@ -283,9 +274,8 @@ def test_tables_say_what_the_rows_say(results):
 
 
 def test_goals_stand_beside_what_is_measured(results):
-    """Expected: a row per goal: its bound, its aim, the figure, and whether all numbers meet the bound,
-    of several each its own; without a number, no verdict. Every goal of the project gives a text for any
-    data."""
+    """A row per goal: its bound, its aim, the figure, and whether all numbers meet the bound, of several each
+    its own; without a number, no verdict. Every goal of the project gives a text for any data."""
     near = "0.800x, interval 0.800–0.800, 16 pairs"
     dark = goals.Goal("dark", (1,), goals.over_path, ("dark",)).row(results)[3]
     assert dark.startswith("≥ 0.8x (0.8–0.8); `path`: ") and "% of the energy is missing" in dark
@@ -325,7 +315,7 @@ def test_slopes_need_an_explanation():
 
 
 def test_slopes_between_decisions():
-    """Rationale: budgets at which something else is skipped are not one method. Expected: said so."""
+    """Said so."""
     rows = runs("bdpt", 5, budget=4, spp=4, decisions="[]") + runs("bdpt", 5, rel_mse=0.02 / 256)
     text = report.checks_table(results_of(rows), MADE, {})
     assert cells(text, "`box`")[1].endswith("(-2.00 to -2.00), between decisions")
@@ -352,7 +342,7 @@ def test_choices_and_the_cost_of_the_pilot():
 
 
 def test_a_bar_in_a_name_ends_no_cell():
-    """Expected: escaped, as GitHub's Markdown has it, in code too; a line stays a line."""
+    """Escaped, as GitHub's Markdown has it, in code too; a line stays a line."""
     head, _, line = tables.table(["a|b", "c"], [["`d|e`", "f\ng"]]).splitlines()
     assert [cell.strip() for cell in re.split(r"(?<!\\)\|", head + line)] == [
         *("", "a\\|b", "c", "", "`d\\|e`", "f g", ""),
@@ -360,8 +350,7 @@ def test_a_bar_in_a_name_ends_no_cell():
 
 
 def test_integrators_are_in_the_order_of_the_preset():
-    """Rationale: an integrator of media alone came after all others. Expected: in the table of errors of a
-    scene with media the order of its rows, those of the preset."""
+    """In the table of errors of a scene with media the order of its rows, those of the preset."""
     plain = [row for name in ("bdpt", "path", "merging", "all") for row in runs(name, 3)]
     fog = [row | {"scene": "fog"} for name in ("bdpt", "volpath", "all") for row in runs(name, 3)]
     found = results_of(plain + fog, {"box": KNOWN, "fog": KNOWN}, {})
@@ -389,7 +378,7 @@ def test_what_a_biased_integrator_lacks_is_said():
 
 
 def test_names_are_those_of_the_preset():
-    """Expected: every integrator that the report looks for is one of presets/benchmark.toml."""
+    """Every integrator that the report looks for is one of presets/benchmark.toml."""
     names = {m.name for m in read_preset(ROOT / "presets" / "benchmark.toml", Project(ROOT)).methods}
     assert names >= {
         *analysis.RIVALS,
@@ -403,8 +392,7 @@ def test_names_are_those_of_the_preset():
 
 
 def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
-    """Rationale: `bdpt merging` and `ptracer` of somebody's preset were in no table and no figure, since the
-    benchmark has integrators of these names. Expected: all are compared, but those that notes.toml names."""
+    """All are compared, but those that notes.toml names."""
     every = replace(results, aside=())
     assert every.rivals[:2] == ["path", "path multijitter"]
     assert set(every.rivals) == {*every.methods[1:]} and "ptracer" in every.rivals
@@ -417,9 +405,8 @@ def test_integrators_of_a_preset_are_compared_unless_they_stand_aside(results):
 
 
 def test_a_sweep_that_was_cut_has_figures():
-    """Rationale: a sweep without time for a second render of the largest budget reported "fewer than two
-    renders" in every cell. Expected: figures are of the largest budget of two renders of each integrator,
-    also where one integrator has a single render at any budget; of all where there are no pairs."""
+    """Figures are of the largest budget of two renders of each integrator, also where one integrator has a
+    single render at any budget; of all where there are no pairs."""
     small, large = ([*runs("bdpt", 2, budget=n), *runs("path", 2, budget=n)] for n in (16, 64))
     assert results_of([*small, *large[:3]], {}).deciding == 16
     assert results_of([*small, *large], {}).deciding == 64
@@ -431,9 +418,8 @@ def test_a_sweep_that_was_cut_has_figures():
 
 
 def test_cells_are_numbers_where_nothing_is_wrong():
-    """Rationale: cells of errors, energy and bias were dashes, or said "fewer than 8 renders". Expected: of
-    three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % / sqrt(3);
-    no verdict of so few, or by a reference of few renders, or of a single render."""
+    """Of three renders 1, 2 and 3 % too bright, +2 % with Student's interval of their mean, 4.30 * 1 % /
+    sqrt(3); no verdict of so few, or by a reference of few renders, or of a single render."""
     rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), variance=0.02) for i in (1, 2, 3)]
     found = results_of(rows)
     energy = found.surplus("box", "bdpt")
@@ -447,8 +433,7 @@ def test_cells_are_numbers_where_nothing_is_wrong():
 
 
 def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
-    """Rationale: a report of eight scenes was refused since the reference of one had six renders. Expected:
-    its rows are there, without a reference for bias checks."""
+    """Its rows are there, without a reference for bias checks."""
     provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 64, "scene_sha256": "the scene"}
     kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), None, provenance)
     file = reference.reference_path(Project(tmp_path), "box", 8, 3)
@@ -472,8 +457,7 @@ def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
     ],
 )
 def test_other_programs_are_noticed(wall, processor, is_busy):
-    """Rationale: wall seconds of 1.6 to 4.6 s, of the same work, were reported without a word. Expected: the
-    report names what to set, before its figures; not where the work differs, or by little; nor for the
+    """The report names what to set, before its figures; not where the work differs, or by little; nor for the
     integrators that are not compared."""
     rows = [
         row("path", i, seconds=w, cpu_seconds=c) for i, (w, c) in enumerate(zip(wall, processor, strict=True))
@@ -490,7 +474,7 @@ def test_other_programs_are_noticed(wall, processor, is_busy):
 
 
 def test_a_report_of_one_integrator_compares_none(capsys):
-    """Expected: a sentence in place of a table without columns; the sweep says so too."""
+    """A sentence in place of a table without columns; the sweep says so too."""
     found = results_of(runs("bdpt", 2))
     assert "no integrator to compare bdpt with" in report.efficiency_table(found)
     table = found.rows.assign(parameters="{}")
@@ -499,8 +483,7 @@ def test_a_report_of_one_integrator_compares_none(capsys):
 
 
 def test_a_path_tracer_is_known_by_its_type():
-    """Rationale: "over the stronger `path`" left out `path` under another name. Expected: both, the stronger
-    first among the words; `bdpt` under a name that begins with "path" is none."""
+    """Both, the stronger first among the words; `bdpt` under a name that begins with "path" is none."""
     ways = {"path": "path", "my tracer": "path", "path of mine": "bdpt", "bdpt": "bdpt"}
     errors = {"path": 0.04, "my tracer": 0.03}
     found = [
@@ -520,8 +503,8 @@ def image_of_two():
 
 
 def test_a_report_is_written(results, tmp_path):
-    """Expected: from the data of a folder the page, the plots, and the project's README's parts; a page of
-    the user's own is not overwritten, one that a report has written is."""
+    """From the data of a folder the page, the plots, and the project's README's parts; a page of the user's
+    own is not overwritten, one that a report has written is."""
     provenance = {"integrator": {"type": "path"}, "max_depth": 3, "spp": 4096, "scene_sha256": "the scene"}
     kept = Reference(np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3)), KNOWN, provenance)
     file = reference.reference_path(Project(tmp_path), "box", 8, 3)

@@ -87,9 +87,8 @@ def saved(monkeypatch, module):
 
 
 def test_windows_lie_where_errors_differ():
-    """Expected: the first of two disjoint windows within the window of fireflies, the second at least a side
-    apart, also where the largest errors fill more than one window; without room for that they only touch.
-    """
+    """The first of two disjoint windows within the window of fireflies, the second at least a side apart,
+    also where the largest errors fill more than one window; without room for that they only touch."""
     made = block(2)
     (left, top, side), (left2, top2, _) = crops.windows(made.columns[0].errors, made.columns[1].errors)
     assert side == 5 and left >= 20 - 1 and top >= 36 - 1
@@ -104,10 +103,9 @@ def test_windows_lie_where_errors_differ():
 
 
 def test_crops_are_of_the_sweep(tmp_path):
-    """Rationale: captions had the measured error of the image, with the reference's, up to 1.7 times that of
-    the tables. Expected: the images of the median seed at the deciding budget, rivals first, with their
-    samples, seconds and the trimmed relMSE of the tables, less the reference's own; integrators without
-    images are left out, and a scene without any is an error."""
+    """The images of the median seed at the deciding budget, rivals first, with their samples, seconds and the
+    trimmed relMSE of the tables, less the reference's own; integrators without images are left out, and a
+    scene without any is an error."""
     rows = results(("b",)).rows
     rows = rows.assign(reference_rel_mse_trimmed=0.004, key=rows["method"] + rows["seed"].astype(str))
     found = Results(rows, {"b": KNOWN}, {}, compared=64)
@@ -135,8 +133,8 @@ def test_crops_are_of_the_sweep(tmp_path):
 
 
 def test_curves_are_raw_and_trimmed(monkeypatch):
-    """Expected: of each integrator the means of raw errors, solid with markers, and of trimmed ones, half of
-    them, dashed; hollow markers where the error is a lower bound; a line of slope -1."""
+    """Of each integrator the means of raw errors, solid with markers, and of trimmed ones, half of them,
+    dashed; hollow markers where the error is a lower bound; a line of slope -1."""
     figure = drawn(monkeypatch, "samples", 1, ("b",))
     (axis,) = figure.axes
     expected = results(("b",)).of("b", "bdpt", 16)["rel_mse"].mean()
@@ -156,8 +154,8 @@ ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}
 
 
 def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
-    """Rationale: both windows of a picture lay on the floor, none on its caustic. Expected: the integrators
-    that are named, and the first; windows about the places, within the image; what is wrong is named."""
+    """The integrators that are named, and the first; windows about the places, within the image; what is
+    wrong is named."""
     kept = replace(results(("b",)), aside=(METHODS[1],))
     assert METHODS[1] not in figures._among(kept, None).methods
     assert figures._among(kept, METHODS[1:2]).rivals == [METHODS[1]]
@@ -173,8 +171,8 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
         crops.centres(["0.5,0.5"])
     words = ALL | {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "columns": 1}
     for more, text in (
-        ({"plot": "rays", "windows": ["0,0", "1,1"]}, "--windows is for --plot crops, not for rays"),
-        ({"plot": "samples", "spp": 16}, "--spp is not for --plot samples, which has all budgets"),
+        ({"plot": "rays", "windows": ["0,0", "1,1"]}, "--windows is not for --plot rays; leave it out"),
+        ({"plot": "samples", "spp": 16}, "--spp is not for --plot samples; leave it out"),
     ):
         with pytest.raises(CommandError, match=text):
             figures.run(Namespace(**words | more))
@@ -185,8 +183,7 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
 
 
 def test_single_renders_among_several_have_no_point():
-    """Rationale: a budget whose second render was cut looked as certain as the others. Expected: points of
-    two renders or more; where all are single, all."""
+    """Points of two renders or more; where all are single, all."""
     kept = results(("b",))
     few = replace(kept, rows=kept.rows.query("budget < 256 or seed == 0"))
     assert figures._points(few, "b", "bdpt", "spp", "rel_mse")["x"].tolist() == [4, 16, 64]
@@ -195,7 +192,7 @@ def test_single_renders_among_several_have_no_point():
 
 
 def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
-    """Rationale: an empty plot, and status 0. Expected: what is missing, and the key that mends it."""
+    """What is missing, and the key that mends it."""
     kept = results(("b",))
     one = replace(kept, rows=kept.rows.query("seed == 0"))
     monkeypatch.setattr(figures, "load", lambda *_: (one, {}))
@@ -205,7 +202,7 @@ def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
 
 
 def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
-    """Expected: a warning with the height and the option that mends it; none for one scene."""
+    """A warning with the height and the option that mends it; none for one scene."""
     kept, found = results(("a", "b")), saved(monkeypatch, crops)
     monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab")))
     monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
@@ -221,7 +218,7 @@ def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.parametrize("ending", ["pdf", "svg", "png"])
 def test_the_format_is_that_of_the_ending(tmp_path, ending):
-    """Expected: a file of that format, the same bytes each time, of exactly 8.5 cm."""
+    """A file of that format, the same bytes each time, of exactly 8.5 cm."""
     files = [tmp_path / f"{i}.{ending}" for i in (1, 2)]
     for file in files:
         figures.PLOTS["efficiency"](results(("b",)), file, 1, ("b",))
@@ -238,7 +235,7 @@ def test_the_format_is_that_of_the_ending(tmp_path, ending):
 
 
 def test_other_endings_are_refused(tmp_path):
-    """Expected: before the sweep is read, with the endings that there are."""
+    """Before the sweep is read, with the endings that there are."""
     options = Namespace(project=tmp_path, folder="x", output=tmp_path / "a.jpg", plot="samples", scenes=None)
     with pytest.raises(CommandError, match="a.jpg' must end in .pdf, .svg, .png"):
         figures.run(options)

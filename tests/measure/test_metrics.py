@@ -97,8 +97,8 @@ def test_trimming_only_lowers(image, reference, trim):
 
 
 def test_the_spread_of_renders():
-    """Expected: without bias the mean relMSE, within three standard errors of 2 / sqrt(values); with an error
-    that all have, such as light that none finds, that of before."""
+    """Without bias the mean relMSE, within three standard errors of 2 / sqrt(values); with an error that all
+    have, such as light that none finds, that of before."""
     rng = np.random.default_rng(3)
     truth = rng.uniform(0.5, 2, (40, 40, 3))
     images = [truth * (1 + 0.1 * rng.standard_normal(truth.shape)) for _ in range(6)]
@@ -132,8 +132,7 @@ def pq(luminance):
 def test_delta_e_itp():
     """For grays L = M = S, so C_T = C_P = 0 and dE = 720 |PQ(Y) - PQ(Y')|.
 
-    PQ(100) = 0.508078, PQ(0) = 7e-7: black and white are 365.816 apart. Red against green by the matrices
-    of BT.2087 (sRGB to BT.2020), BT.2100 (to LMS, and L'M'S' to I, C_T / 2, C_P).
+    PQ(100) = 0.508078, PQ(0) = 7e-7: black and white are 365.816 apart.
     """
     assert pq(100.0) == pytest.approx(0.508078, abs=1e-6)
     assert metrics.delta_e_itp(pixel(0, 0, 0), pixel(1, 1, 1)) == pytest.approx(365.816, abs=0.01)
@@ -141,13 +140,6 @@ def test_delta_e_itp():
     assert metrics.delta_e_itp(row(0.25), row(0.5)) == pytest.approx(expected, rel=1e-3)
     assert metrics.delta_e_itp(row(0.5), row(1), -1) == pytest.approx(expected, rel=1e-3)
     assert metrics.delta_e_itp(row(0.25), row(0.5), white=200) == pytest.approx(720 * (pq(100.0) - pq(50.0)))
-
-    to_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
-    to_lms = np.array([[1688, 2146, 262], [683, 2951, 462], [99, 309, 3688]]) / 4096
-    to_itp = np.array([[2048, 2048, 0], [3305, -6806.5, 3501.5], [17933, -17390, -543]]) / 4096
-    red, green = (to_itp @ pq(100 * to_lms @ to_2020 @ np.array(rgb)) for rgb in ([1, 0, 0], [0, 1, 0]))
-    itp = 720 * np.linalg.norm(red - green)
-    assert metrics.delta_e_itp(pixel(1, 0, 0), pixel(0, 1, 0)) == pytest.approx(itp, rel=1e-3)
 
 
 def test_colour_differences_are_of_what_is_shown():
@@ -157,33 +149,16 @@ def test_colour_differences_are_of_what_is_shown():
 
 
 def test_hdr_flip():
-    """HDR-FLIP is 0 for equal images, grows with the difference, and is local.
-
-    A change in a corner of 96 x 64 pixels is not felt at the opposite one: the filters of 67 pixels per
-    degree reach 10 or so. Scaling both images moves the exposures and changes nothing. The value of a
-    fixed pair is that of the package's own command `flip` 1.7.
-    """
-    reference = np.random.default_rng(1).random((64, 96, 3)) * 4
-    mean, error = metrics.hdr_flip(reference, reference)
+    """The values of a fixed pair are those of the package's own command `flip` 1.7; the reference decides the
+    exposures, so the order matters, and scaling both images changes nothing."""
+    for factor in (1, 1e3):
+        there, back = (
+            metrics.hdr_flip(row(0.5 * factor), row(factor)),
+            metrics.hdr_flip(row(factor), row(0.5 * factor)),
+        )
+        assert there[0] == pytest.approx(0.232887, abs=1e-4) and back[0] == pytest.approx(0.144833, abs=1e-4)
+    mean, error = metrics.hdr_flip(np.ones((64, 96, 3)), np.ones((64, 96, 3)))
     assert mean == 0 and error.shape == (64, 96) and not error.any()
-    changed = reference.copy()
-    changed[:8, :8] *= 2
-    mean, error = metrics.hdr_flip(changed, reference)
-    assert mean == pytest.approx(error.mean(), rel=1e-4)
-    assert error[:8, :8].min() > 0.05 and error[32:, 48:].max() < 1e-4
-    assert metrics.hdr_flip(2 * reference, reference)[0] > mean
-    assert metrics.hdr_flip(1e3 * changed, 1e3 * reference)[0] == pytest.approx(mean, rel=1e-3)
-    # The reference decides the exposures, so the order matters.
-    there, back = metrics.hdr_flip(row(0.5), row(1))[0], metrics.hdr_flip(row(1), row(0.5))[0]
-    assert there == pytest.approx(0.232887, abs=1e-4) and back == pytest.approx(0.144833, abs=1e-4)
-
-
-def test_hdr_flip_sees_light_in_black():
-    """A reference that is black for more than half: flip-evaluator 1.6 reports 0 for any image."""
-    reference = np.zeros((16, 16, 3))
-    reference[:4] = 1
-    mean, error = metrics.hdr_flip(reference + 0.1, reference)
-    assert mean > 0.5 and error[8:].min() > 0.5
 
 
 def test_hdr_flip_refuses_what_ends_the_process():
@@ -344,9 +319,8 @@ def test_bias_check_finds_what_is_common_to_all_tiles():
 @pytest.mark.parametrize("count", [2, 3, 8])
 @pytest.mark.parametrize("ratio", [0.1, 10.0, 100.0])
 def test_the_interval_of_the_energy(count, ratio):
-    """Rationale: Welch's interval of the energy held it in 88 % of cases for two renders, called 95 %.
-    Expected: 95 % or more, for few renders whose mean has from a tenth to 100 times the variance of that of
-    8 renders of the reference. 2000 cases: to 4 standard errors."""
+    """95 % or more, for few renders whose mean has from a tenth to 100 times the variance of that of 8
+    renders of the reference. 2000 cases: to 4 standard errors."""
     rng, cases = np.random.default_rng(1), 2000
     spread = 0.01 * math.sqrt(count / 8 * ratio)
     ours, theirs = (
@@ -387,11 +361,9 @@ def test_missing_energy():
 
 
 def test_bias_check_keeps_its_level():
-    """False alarms at a significance of 5 %, 300 families of 16 renders and 16 references with no bias.
-
-    Expected: 15; Welch's test in the far tail allows twice that. More than 40 have a binomial chance of
-    4 % if the level is 10 %, and fewer than 4 one of 2e-4 if it is 5 %.
-    """
+    """False alarms at a significance of 5 %, 300 families of 16 renders and 16 references with no bias. 15;
+    Welch's test in the far tail allows twice that. More than 40 have a binomial chance of 4 % if the level is
+    10 %, and fewer than 4 one of 2e-4 if it is 5 %."""
     failed = 0
     for seed in range(300):
         runs = renders(seed, 32, (4, 4, 3))
@@ -409,7 +381,7 @@ def test_bias_check_refuses():
 
 
 def test_an_exact_reference_has_no_error():
-    """Expected: Student's test of a tile's means against the value that is known."""
+    """Student's test of a tile's means against the value that is known."""
     images = renders(1, 32)
     images[:, :2, :2, 0] *= 0.7
     exact = agreement.compare_means(means_of(images), agreement.Means.known(np.ones((8, 8, 3))))

@@ -109,10 +109,9 @@ def opened(file) -> dict:
 
 @needs_browser
 def test_the_page_in_a_browser(tmp_path):
-    """Expected: no script error and no request; the divider shows one image or the other, exposure darkens
-    (by 4 stops: a linear 0.25 from 137 to 34 of 255 in sRGB), the error map is dark where an image is the
-    reference; headings sort, bounds as numbers, the filter filters; every input has a label.
-    """
+    """No script error and no request; the divider shows one image or the other, exposure darkens (by 4 stops:
+    a linear 0.25 from 137 to 34 of 255 in sRGB), the error map is dark where an image is the reference;
+    headings sort, bounds as numbers, the filter filters; every input has a label."""
     grey, half, noise = (np.full((8, 16, 3), x) for x in (0.25, 0.0, 0.0))
     noise[::2] = 1.0
     scenes = [fake_scene("cornell_box", bdpt=grey, path=half, reference=grey + noise)]
@@ -143,7 +142,7 @@ def test_the_page_in_a_browser(tmp_path):
 
 
 def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):
-    """Expected: refused before the sweep is read; the title of each page says what has made it."""
+    """Refused before the sweep is read; the title of each page says what has made it."""
     (tmp_path / "page.html").write_text("<title>mine</title>")
     assert main(["page", str(tmp_path)]) == 2
     assert "page.html' exists and was made by something else; move it away, or" in capsys.readouterr().err
@@ -151,7 +150,7 @@ def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):
 
 
 def test_images_are_half_precision():
-    """Expected: 16-bit floats, row by row, values beyond their range at its end."""
+    """16-bit floats, row by row, values beyond their range at its end."""
     image = np.arange(12).reshape(2, 2, 3) / 7
     image[1, 1, 2] = 1e6
     back = np.frombuffer(base64.b64decode(page.encoded(image)), dtype="<f2").reshape(2, 2, 3)
@@ -160,8 +159,8 @@ def test_images_are_half_precision():
 
 
 def test_the_page_holds_the_report():
-    """Expected: the report's tables and text as HTML, escaped, without its title; its plots are in the page,
-    not beside it."""
+    """The report's tables and text as HTML, escaped, without its title; its plots are in the page, not beside
+    it."""
 
     def draw(folder):
         (folder / "seconds.png").write_bytes(b"a plot")

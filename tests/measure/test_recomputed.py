@@ -78,9 +78,8 @@ def errors(rows, kind, is_marked):
 
 @pytest.mark.parametrize("own", [0.01, 0.2])
 def test_efficiencies_follow_from_the_table_of_renders(tmp_path, own):
-    """Rationale: readers of rows.csv came close to the raw efficiencies, not to them. Expected: by the
-    formulas of the page the table of efficiencies, to each digit, from the columns of rows.csv and the marks
-    of the table of errors; with a reference noisier than the renders too."""
+    """By the formulas of the page the table of efficiencies, to each digit, from the columns of rows.csv and
+    the marks of the table of errors; with a reference noisier than the renders too."""
     rows, means = rendered(own)
     write_tables(rows, tmp_path)
     found = Results(rows, {"box": means}, {})
@@ -103,7 +102,7 @@ def test_efficiencies_follow_from_the_table_of_renders(tmp_path, own):
 
 
 def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
-    """Expected: variance, raw relMSE and squared bias with their intervals by the formulas of the page."""
+    """Variance, raw relMSE and squared bias with their intervals by the formulas of the page."""
     rows, means = rendered(0.01)
     write_tables(rows, tmp_path)
     renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
@@ -121,8 +120,8 @@ def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
 
 @pytest.mark.parametrize("error", ["rel_mse", "rel_mse_trimmed"])
 def test_points_of_figures_are_the_errors_of_the_table(error):
-    """Rationale: the report had means, 0.0040, and the figure medians, 0.0032. Expected: of each integrator
-    the cell of the table of errors, with its interval and bound: value and ends; no ends of two renders."""
+    """Of each integrator the cell of the table of errors, with its interval and bound: value and ends; no
+    ends of two renders."""
     rows, means = rendered(0.01)
     found = Results(rows, {"box": means}, {})
     column = {"rel_mse_trimmed": 6, "rel_mse": 7}[error]
@@ -135,9 +134,9 @@ def test_points_of_figures_are_the_errors_of_the_table(error):
 
 
 def test_energies_follow_from_the_table_and_the_header_of_the_reference(tmp_path):
-    """Expected: the energy of each integrator with its interval, of two renders too, by the formula of the
-    page, from rows.csv and what the reference's file has, which Mitsuba reads as the page says; the image of
-    a reference likewise."""
+    """The energy of each integrator with its interval, of two renders too, by the formula of the page, from
+    rows.csv and what the reference's file has, which Mitsuba reads as the page says; the image of a reference
+    likewise."""
     rows, means = rendered(0.02)
     write_tables(rows, tmp_path)
     renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
@@ -159,8 +158,7 @@ def test_energies_follow_from_the_table_and_the_header_of_the_reference(tmp_path
 
 
 def test_pages_have_the_errors_of_the_table():
-    """Rationale: the page had the measured error of the first seed, with the reference's in it. Expected: in
-    its table of renders the errors of the report, with their bounds."""
+    """In its table of renders the errors of the report, with their bounds."""
     rows, means = rendered(0.1)
     others = dict.fromkeys(("mape", "flip", "delta_e_itp"))
     found = Results(rows.assign(**others), {"box": means}, {})
@@ -172,7 +170,7 @@ def test_pages_have_the_errors_of_the_table():
 
 
 def test_the_columns_of_the_table_are_described():
-    """Expected: each column of rows.csv has a line on the page about measuring, with each kind of rays."""
+    """Each column of rows.csv has a line on the page about measuring, with each kind of rays."""
     text = (Path(__file__).resolve().parents[2] / "docs" / "user" / "measuring_scenes.md").read_text()
     rays = [f"rays_{kind}" for kind in (*RAYS, "photon", "guided", "features")]
     for name in (*COLUMNS, *rays, "image"):

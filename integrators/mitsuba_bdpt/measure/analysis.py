@@ -131,31 +131,6 @@ def _errors(
     return errors.set_axis(rows["seed"]), bound
 
 
-def efficiency(
-    ours: pd.DataFrame,
-    theirs: pd.DataFrame,
-    error: Error = "rel_mse_trimmed",
-    differ: tuple[bool, bool] = (False, False),
-) -> Summary:
-    """Return the ratios of efficiencies 1 / (seconds * error), ours over theirs, of pairs of seeds.
-
-    Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time, which
-    `slope` tests. ``differ``: whose means differ from the reference, see `estimates.seed_errors`. Raises
-    `Unavailable` for fewer than two pairs, and for errors of 0.
-    """
-    sides = [_errors(rows, error, differs) for rows, differs in zip((ours, theirs), differ, strict=True)]
-    (own, under), (other, over) = sides
-    first, second = (rows.set_index("seed")["seconds"] for rows in (ours, theirs))
-    return replace(summary(_ratios(other * second, own * first)), bound=bound_of_ratio(over, under))
-
-
-def widths(rows: pd.DataFrame, methods: Sequence[str]) -> dict[str, float]:
-    """Return the interval widths of median efficiency ratios (trimmed) of the first method, by rival."""
-    ours, *others = (rows[rows["method"] == name] for name in methods)
-    found = [efficiency(ours, theirs) for theirs in others]
-    return {name: one.high - one.low for name, one in zip(methods[1:], found, strict=True)}
-
-
 def cost(ours: pd.DataFrame, theirs: pd.DataFrame) -> Summary:
     """Return the summary of the ratio of seconds per sample, over pairs of seeds."""
     sides = ((rows["seconds"] / rows["spp"]).set_axis(rows["seed"]) for rows in (ours, theirs))
@@ -396,18 +371,23 @@ class Results:
         budget: int | None = None,
         first: str | None = None,
     ) -> Summary:
-        """Return the efficiency of ``first`` over ``rival``, at the deciding budget by default.
+        """Return the ratios of efficiencies 1 / (seconds * error), ``first`` over ``rival``, by seed.
 
-        Where both means differ from the reference but not from each other, raw errors are variances: what
-        both lack is no difference between them.
+        Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time. At the
+        deciding budget by default. Where both means differ from the reference but not from each other, raw
+        errors are variances: what both lack is no difference between them.
         """
         first, budget = first or self.methods[0], budget or self.deciding
         ours, theirs = self.of(scene, first, budget), self.of(scene, rival, budget)
-        differ = self.differs(scene, first, budget), self.differs(scene, rival, budget)
+        differ = [self.differs(scene, name, budget) for name in (first, rival)]
         if error == "rel_mse" and all(differ) and min(len(ours), len(theirs)) >= FEWEST_TESTED:
-            are_unlike = compared(ours, means_of(theirs))
-            differ = are_unlike, are_unlike
-        return efficiency(ours, theirs, error, differ)
+            differ = [compared(ours, means_of(theirs))] * 2
+        (own, under), (other, over) = (
+            _errors(rows, error, one) for rows, one in zip((ours, theirs), differ, strict=True)
+        )
+        seconds, their_seconds = (rows.set_index("seed")["seconds"] for rows in (ours, theirs))
+        found = summary(_ratios(other * their_seconds, own * seconds))
+        return replace(found, bound=bound_of_ratio(over, under))
 
     def against_path(
         self, scene: str, error: Error = "rel_mse_trimmed", budget: int | None = None

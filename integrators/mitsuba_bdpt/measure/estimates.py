@@ -1,21 +1,9 @@
 """The relMSE of an integrator at one budget, from the renders of several seeds and a noisy reference.
 
-Of K independent renders x_i of one budget, with expected image u, the truth I, and independent halves A and B
-of the reference R = (A + B) / 2; all means are over pixels and channels with the weights 1 / (R^2 + eps) of
-`metrics.rel_mse`. The weights come from the reference alone, the same for all integrators, never from the
-renders that are judged: these divide their own fireflies by themselves.
-
-* Variance, E (x_i - u)^2: `metrics.spread`, the sample variance. No reference is in it.
-* Variance + squared bias, E (x_i - I)^2: the products (x_i - A)(x_i - B) = (x_i - R)^2 - ((A - B) / 2)^2, the
-  measured error less the reference's own. Its expectation is free of the reference's noise.
-* Squared bias, (u - I)^2: their difference, which is the mean of (x_i - A)(x_j - B) over pairs i != j.
-
-The raw relMSE is the variance where the mean of the renders agrees with the reference. Where it differs, it
-is variance + squared bias and a lower bound: the integrator is biased, or has not met rare light, whose
-variance the renders do not show. Of fewer than `FEWEST_TESTED` renders the mean cannot be tested: the raw
-relMSE is variance + squared bias, or, where the reference is too noisy, the variance as a lower bound. The
-trimmed relMSE is of the products, of the values that the trimmed measured error keeps. Intervals are
-Student's over seeds; the noise of the reference's image in the weights is not in them.
+The estimators, and when an error is a bound: docs/development/measuring.md, *How errors are estimated*. The
+raw relMSE is the variance (`metrics.spread`) where the mean of the renders agrees with the reference, else
+variance + squared bias, the measured error less the reference's own. Weights come from the reference alone.
+Intervals are Student's over seeds; the noise of the reference's image in the weights is not in them.
 """
 
 from __future__ import annotations

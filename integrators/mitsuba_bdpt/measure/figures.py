@@ -272,6 +272,9 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 }
 """What the command `figure` draws, beside the images of ``crops``."""
 
+NOT_FOR = {"windows": tuple(PLOTS), "integrators": ("rays",), "spp": ("samples", "seconds")}
+"""Options that plots lack."""
+
 
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
     """Return images of a scene at the deciding budget, rivals first, and the reference.
@@ -314,12 +317,9 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     output = options.output or folder / f"{options.plot}.pdf"
     check_figure(output)
-    if options.windows and options.plot != "crops":
-        raise CommandError(f"--windows is for --plot crops, not for {options.plot}; leave it out")
-    if options.integrators and options.plot == "rays":
-        raise CommandError("--integrators is not for --plot rays, which is of the first one; leave it out")
-    if options.spp and options.plot in ("samples", "seconds"):
-        raise CommandError(f"--spp is not for --plot {options.plot}, which has all budgets; leave it out")
+    for name, plots in NOT_FOR.items():
+        if options.plot in plots and getattr(options, name):
+            raise CommandError(f"--{name} is not for --plot {options.plot}; leave it out")
     results, made = load(project, folder)
     results = replace(_among(results, options.integrators), compared=options.spp)
     _ = results.deciding  # raises for a budget that is not there

@@ -104,19 +104,7 @@ def read_rows(output: Path, cells: Cells, wanted: Sequence[Cell]) -> pd.DataFram
             row |= errors(_image(output, cell), *judge_of(*cells.where()), cell.seed == FIRST_SEED)
             write_json(file, row)
         found.append(row)
-    return _with_points(pd.DataFrame(found))
-
-
-def _with_points(rows: pd.DataFrame) -> pd.DataFrame:
-    """Set the ``sampler`` of rows to what made their random numbers, of `bdpt` its ``points``.
-
-    Files of cells and older tables have the sensor's, which `bdpt` does not use.
-    """
-    if "parameters" not in rows:
-        return rows
-    given = rows["parameters"].map(json.loads)
-    points = [one.get("points", "sobol") if one.get("type") == "bdpt" else None for one in given]
-    return rows.assign(sampler=pd.Series(points, rows.index, str).fillna(rows["sampler"]))
+    return pd.DataFrame(found)
 
 
 def _image(output: Path, render: Any) -> np.ndarray:
@@ -168,7 +156,7 @@ def _variances(output: Path, cells: Cells, table: pd.DataFrame) -> pd.Series:
 
 def _stored(file: Path) -> pd.DataFrame:
     """Return the rows of a file; older sweeps have the variance as ``spread``."""
-    return _with_points(pd.read_parquet(file).rename(columns={"spread": "variance"}))
+    return pd.read_parquet(file).rename(columns={"spread": "variance"})
 
 
 def beside(table: pd.DataFrame, order: Sequence[str] | None, output: Path) -> pd.DataFrame:
@@ -205,7 +193,7 @@ def lost(table: pd.DataFrame, output: Path) -> list[str]:
         "again if it is reverted"
         for name, count in before["scene"][is_edited].value_counts(sort=False).items()
     ]
-    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters", "sampler"]
+    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters"]
     is_kept = pd.MultiIndex.from_frame(before[keys]).isin(pd.MultiIndex.from_frame(table[keys]))
     gone = before[~is_edited & ~is_kept]
     if gone.empty:

@@ -174,11 +174,14 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     image, seconds, cpu_seconds = bench.timed(cell, spp, cell.seed)
     statistics = getattr(bench.integrator(cell), "statistics", {})
+    parameters = dict(cell.parameters)
+    is_bdpt = parameters["type"] == "bdpt"  # which does not use the sensor's sampler
     row = {
         "key": cell.key,
         **{k: v for k, v in asdict(cell).items() if k not in ("parameters", "versions", "against")},
+        "sampler": parameters.get("points", "sobol") if is_bdpt else cell.sampler,
         "machine": machine(),
-        "parameters": json.dumps(dict(cell.parameters)),
+        "parameters": json.dumps(parameters),
         "versions": json.dumps(dict(cell.versions)),
         "started": started,
         # A target error or timeout may end a render early.
@@ -428,12 +431,14 @@ class Sweep:
         if not self._are_there(found):
             return []  # a failed cell
         try:
-            names = dict.fromkeys(cell.method for cell in cells.of(more.spp, FIRST_SEED, more.integrators))
-            widths = analysis.widths(decisive(read_rows(self.output, cells, found)), list(names))
+            ours, *others = (cell.method for cell in cells.of(more.spp, FIRST_SEED, more.integrators))
+            rows = decisive(read_rows(self.output, cells, found)).assign(first=ours)
+            results = analysis.Results(rows, {}, {})
+            ratios = [results.efficiency(cells.subject.name, name) for name in others]
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
             return []
-        is_narrow = seeds >= FEWEST_WITH_INTERVAL and max(widths.values()) < more.width
+        is_narrow = seeds >= FEWEST_WITH_INTERVAL and max(one.high - one.low for one in ratios) < more.width
         if is_narrow or seeds == more.seeds[1]:
             return []
         missing = [c for c in cells.further(seeds) if not self._is_there(c)]
