@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6396,
+    "measure": 6357,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2277,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 912,
     "": 1440,  # top files
 }
-OUTSIDE = {"scripts": 2930, "tests": 36222}
+OUTSIDE = {"scripts": 2929, "tests": 36152}
 MOST_WORDS = 29047
 
 

@@ -373,9 +373,9 @@ class Results:
     ) -> Summary:
         """Return the ratios of efficiencies 1 / (seconds * error), ``first`` over ``rival``, by seed.
 
-        Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time. At the
-        deciding budget by default. Where both means differ from the reference but not from each other, raw
-        errors are variances: what both lack is no difference between them.
+        Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time. At
+        the deciding budget by default. Where both means differ from the reference but not from each other,
+        raw errors are variances: what both lack is no difference between them.
         """
         first, budget = first or self.methods[0], budget or self.deciding
         ours, theirs = self.of(scene, first, budget), self.of(scene, rival, budget)
