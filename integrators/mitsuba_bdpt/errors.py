@@ -36,10 +36,7 @@ class FailureError(RuntimeError):
 
 
 def did_you_mean(name: str, known: Iterable[str], parts: bool = False) -> str:
-    """Return a question with the most similar ``known`` name, or an empty string.
-
-    ``parts``: with the shortest name that contains ``name``, if there is one.
-    """
+    """Ask for the most similar ``known`` name, or with ``parts`` the shortest that contains it; or empty."""
     import difflib  # takes 5 ms, and is rarely needed
 
     by_case = {other.lower(): other for other in known}
@@ -55,10 +52,7 @@ def listed(names: Sequence[str], most: int) -> str:
 
 
 def behind(error: BaseException, *kinds: type[BaseException]) -> BaseException | None:
-    """Return the exception of these ``kinds`` that ``error`` is or wraps, or None.
-
-    Mitsuba and Dr.Jit convert exceptions raised while rendering or recording to ``RuntimeError``.
-    """
+    """Return the exception of these ``kinds`` that ``error`` is or wraps (as a ``RuntimeError``), or None."""
     return next((found for found in chain(error) if isinstance(found, kinds)), None)
 
 
@@ -71,10 +65,7 @@ def chain(error: BaseException) -> Iterator[BaseException]:
 
 
 def message(error: BaseException) -> str:
-    """Return the text of `error`, or of the user's mistake that it wraps.
-
-    A Python traceback within the text is reduced to its last line.
-    """
+    """Return the text of ``error`` or the mistake it wraps; of a traceback the last line."""
     error = behind(error, UsageError, UnsupportedError) or error
     before, traceback, rest = str(error).partition("Traceback (most recent call last):")
     return before + rest.strip().splitlines()[-1] if traceback else before

@@ -294,10 +294,7 @@ _classes = {}
 
 
 def _class_of_variant():
-    """Return the plugin's class for the current variant.
-
-    Mitsuba's base class differs between variants, and allows no second base.
-    """
+    """Return the plugin's class for the current variant, whose base class allows no second one."""
     apart = ("__dict__", "__weakref__", "__abstractmethods__", "_abc_impl")
     own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in apart}
     made = type(mi.SamplingIntegrator)(
@@ -307,10 +304,7 @@ def _class_of_variant():
 
 
 def register():
-    """Register ``bdpt`` for the current variant, all later ones, and scalar_rgb.
-
-    Mitsuba's parser instantiates every plugin in scalar_rgb to query its type.
-    """
+    """Register ``bdpt`` for this and later variants, and scalar_rgb, where the parser queries types."""
 
     def register_variant(old=None, new=None):
         variant = mi.variant()

@@ -47,10 +47,7 @@ def share_done(report: Report, limit: float | None = None) -> float:
 
 
 def in_words(report: Report, limit: float | None = None, open_ended: bool = False) -> str:
-    """Describe samples per pixel, rays per second, remaining time and estimated error.
-
-    ``open_ended``: the total number of samples is not what the user asked for, and is not shown.
-    """
+    """Describe samples per pixel (``open_ended``: not the total), rays, remaining time and error."""
     text = f"{report.spp_done}{'' if open_ended else f'/{report.spp_total}'} spp"
     if report.rays:  # unknown for other integrators
         text += f", {readable(report.rays / max(report.seconds, 1e-9))} rays/s"

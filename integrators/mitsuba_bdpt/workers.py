@@ -18,10 +18,7 @@ one_at_a_time = threading.Lock()
 
 
 def _check_answers(address: str) -> None:
-    """Raise ``OSError`` if no scheduler answers at ``address``.
-
-    A scheduler sends first. Without an answer, ``Client`` would wait forever.
-    """
+    """Raise ``OSError`` if no scheduler sends at ``address``, where ``Client`` would wait forever."""
     from distributed.comm.addressing import parse_address, parse_host_port
 
     protocol, place = parse_address(address)

@@ -85,10 +85,7 @@ class Disks:
         self.details = BoundingSphere.about(found) if found is not None else None
 
     def share(self, side: int) -> float:
-        """Share of subpaths aimed at details beside tables of ``side`` x ``side`` cells.
-
-        0 if the details are not smaller than a cell, so that the tables can aim at them.
-        """
+        """Share of subpaths aimed at details; 0 unless they are smaller than one of ``side``^2 cells."""
         if self.details is None:
             return 0.0
         return AIMED if dr.slice(self.details.radius) * side < dr.slice(self.scene.radius) else 0.0
@@ -171,10 +168,7 @@ def _frame(d) -> mi.Frame3f:
 
 
 def details(found: list, whole):
-    """Bounding sphere of the boxes ``found`` that are small beside ``whole``.
-
-    None if there are none, if they are spread out (`LOCAL`), or too small for rounding (`TINY`).
-    """
+    """Bounding sphere of the boxes small beside ``whole``; None if none, spread (`LOCAL`) or `TINY`."""
     small = mi.ScalarBoundingBox3f()
     for box in found:
         if max(box.extents()) <= DETAIL * max(whole.extents()):

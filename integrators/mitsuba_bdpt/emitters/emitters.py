@@ -178,10 +178,7 @@ class Emitters:
         return self.disks.covers(p, d) if self.disks is not None else mi.Bool(True)
 
     def sample_emission(self, u_point, u_direction, shared, active) -> Emission:
-        """Sample y_0 and the direction to y_1; ``shared``: time and wavelengths.
-
-        ``u_point`` chooses the emitter and y_0, ``u_direction`` the direction.
-        """
+        """Sample y_0 (``u_point``) and the direction to y_1; ``shared``: time and wavelengths."""
         chosen, u_x = self._select(u_point.x, active)
         u_point = mi.Point2f(u_x, u_point.y)
         arguments = chosen, u_point, u_direction, shared

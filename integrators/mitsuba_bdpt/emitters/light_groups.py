@@ -44,10 +44,7 @@ _SEPARATORS = "for , and ; in an id write ?"
 
 
 def parsed(text: str) -> dict[str, list[str]]:
-    """Return the patterns of each group of a ``text`` like ``key: lamp1, lamp2; sky: envmap``.
-
-    Empty for an empty text and for ``auto``. Raises ``UsageError``.
-    """
+    """Return the patterns of each group of ``key: lamp1, lamp2; sky: envmap``; raises ``UsageError``."""
     if text.strip() in ("", AUTO):
         return {}
     found: dict[str, list[str]] = {}
@@ -155,11 +152,7 @@ class LightGroups:
 
     @staticmethod
     def of(scene: mi.Scene, text: str) -> LightGroups | None:
-        """Return the groups that the parameter's ``text`` defines; None for an empty text.
-
-        Emitters in no group form the group `REST`. A group whose patterns match none is empty. Raises
-        ``UsageError``.
-        """
+        """Return the groups that ``text`` defines; None if empty. Raises ``UsageError``."""
         if not text.strip():
             return None
         emitters = in_order(scene)
@@ -183,10 +176,7 @@ class LightGroups:
 def _matched(
     text: str, groups: dict[str, list[str]], emitters: list[mi.Emitter], names: list[str]
 ) -> tuple[dict[int, str], list[str]]:
-    """Return the group of each emitter that is in one, by index, and `LightGroups.warnings`.
-
-    ``names``: `_layer_names` of the ``emitters``.
-    """
+    """Return the group of each matched emitter by index, and warnings; ``names``: `_layer_names`."""
     real = [_ids(emitter) for emitter in emitters]
     known = [list(dict.fromkeys([*ids, made])) for ids, made in zip(real, names, strict=True)]
     every = sorted({name for of_one in known for name in of_one})

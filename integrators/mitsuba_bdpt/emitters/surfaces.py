@@ -98,10 +98,7 @@ class Surfaces:
         return ps
 
     def geometric_normal(self, ps, index, u, active):
-        """Geometric normal (sign of a hit's ``si.n``) at the point sampled from ``u``.
-
-        Mitsuba samples the interpolated normal on meshes, and the opposite normal on mirrored rectangles.
-        """
+        """Normal of hits at the point sampled from ``u``; Mitsuba samples interpolated or mirrored ones."""
         n = ps.n
         if self._reversed.any:
             n = dr.select(self._reversed.at(index, active), -n, n)

@@ -62,10 +62,7 @@ def switch(owners, method: str, index: mi.UInt32, *arguments):
 
 
 class Mask:
-    """Property of a group's emitters: ``any``, ``all``, and a mask by index.
-
-    ``values``: one per emitter of the scene, None for other groups.
-    """
+    """Property of a group's emitters; ``values``: one per emitter of the scene, None of other groups."""
 
     def __init__(self, values):
         known = [value for value in values if value is not None]

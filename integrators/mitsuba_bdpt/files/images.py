@@ -188,10 +188,7 @@ def write_layers(
 
 
 def read_layers(path: Path, *layers: str) -> tuple[list[np.ndarray], dict[str, Any]]:
-    """Return images (height, width, 3) of an EXR's layers, and its header.
-
-    ``layers``: prefixes as in `write_layers`. Raises ``CommandError`` for other files.
-    """
+    """Images (height, width, 3) of an EXR's layers (prefixes), and its header; or ``CommandError``."""
     channels, header = read_exr(path)
     missing = [f"{layer}{c}" for layer in layers for c in "RGB" if f"{layer}{c}" not in channels]
     if missing:

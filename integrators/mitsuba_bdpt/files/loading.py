@@ -61,10 +61,7 @@ def searching(scene: Path, folders: Iterable[Path] = ()) -> Iterator[None]:
 def parsed(
     scene: Path, definitions: Mapping[str, object], config: mi.parser.ParserConfig | None = None
 ) -> mi.parser.ParserState:
-    """Parse a ``scene`` file; parameters have Mitsuba 3's names also in files of version 0.6.
-
-    ``definitions``: values of the file's parameters.
-    """
+    """Parse a ``scene`` file with ``definitions`` of its parameters; upgrades names of version 0.6."""
     config = config or mi.parser.ParserConfig(mi.variant() or "llvm_ad_rgb")
     state = mi.parser.parse_file(config, utf8(scene), **definitions)
     mi.parser.transform_upgrade(config, state)  # no change when `transform_all` repeats it
@@ -230,10 +227,7 @@ def _load(options: Namespace, merges: bool) -> Loaded:
 
 
 def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: str | None) -> str:
-    """Describe which integrator is ``used``, and what it replaces.
-
-    ``own``: the scene file's, of which ``kept`` are parameters; ``asked``: as in `_load`.
-    """
+    """Describe the integrator ``used`` in place of the file's ``own``, with the ``kept`` parameters."""
     if own is None:
         return f"{used} (the scene file has no integrator)"
     if asked is None or own == used:

@@ -101,10 +101,7 @@ def _kind(layer: str) -> str:
 
 
 def _chosen(layers: Iterable[str], names: Iterable[str]) -> dict[str, str]:
-    """Return the name by layer, of one kind of ``layers``; exact names win over patterns.
-
-    Warns of patterns without a layer.
-    """
+    """Return the name by layer, of one kind; exact names win, patterns without a layer warn."""
     short = {layer: layer.partition(".")[2] for layer in layers}
     own: dict[str, str] = {}
     for name in sorted(names, key=is_pattern):

@@ -13,10 +13,7 @@ MAGIC = {".exr": b"\x76\x2f\x31\x01", ".png": b"\x89PNG"}
 
 
 def utf8(path: Path) -> str:
-    """Return a path as Mitsuba and OpenEXR take it: in UTF-8, whatever the encoding of the locale.
-
-    Raises ``CommandError`` for a path in another encoding.
-    """
+    """Return a path in UTF-8, as Mitsuba and OpenEXR take it; ``CommandError`` for other encodings."""
     try:
         return os.fsencode(path).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -35,10 +32,7 @@ def _temporary(path: Path) -> Path:
 
 
 def check_format(path: Path, output: Path) -> None:
-    """Raise ``CommandError`` if ``path`` exists in another format than its suffix.
-
-    ``output``: the user's path, for the message. An image of the suffix's format may be replaced.
-    """
+    """Raise ``CommandError``, naming ``output``, if ``path`` has another format than its suffix."""
     kind = path.suffix.lower()
     if kind not in MAGIC or not path.is_file():  # a pipe must not be read
         return
@@ -59,10 +53,7 @@ def check_own(path: Path, mark: str, remedy: str) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Raise ``OSError`` if `replacing` could not write `path` later.
-
-    Raises ``CommandError`` if `path` is not a file.
-    """
+    """Raise ``OSError`` if `replacing` could not write a file, ``CommandError`` if it is none."""
     if path.exists() and not path.is_file():
         raise CommandError(f"{str(path)!r} is no file; name another output.")
     try:
@@ -74,10 +65,7 @@ def check_writable(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path):
-    """Yield a temporary path that replaces `path` at the end.
-
-    Readers never see a partial file; an exception leaves the old file.
-    """
+    """Yield a temporary path that replaces ``path`` at the end; an exception leaves the old file."""
     temporary = _temporary(path)
     try:
         yield temporary

@@ -24,10 +24,7 @@ _ROUNDING = 1e-6
 
 
 def in_world(si: mi.SurfaceInteraction3f, value: mi.Spectrum, arriving, leaving) -> mi.Spectrum:
-    """Rotate the ``value`` of a BSDF at ``si`` to world frames, as ``si.to_world_mueller``, but by `basis`.
-
-    ``arriving``, ``leaving``: local directions in which the light travels.
-    """
+    """Rotate a BSDF's ``value`` to world frames (`basis`); ``arriving``, ``leaving``: local light paths."""
     if not mi.is_polarized:
         return value
     ends = []

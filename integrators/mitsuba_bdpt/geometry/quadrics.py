@@ -39,10 +39,7 @@ class Sphere:
 
     @property
     def inner_radius(self) -> float:
-        """Distance from the center up to which Mitsuba samples the sphere by area.
-
-        0 if normals point outwards: nothing inside is lit. (Mitsuba's ``pdf_direction`` lacks `RAY_EPSILON`.)
-        """
+        """Distance from the center up to which Mitsuba samples by area; 0 if normals point outwards."""
         return self.radius * (1 + RAY_EPSILON) if self.outward < 0 else 0.0
 
     @staticmethod
@@ -65,10 +62,7 @@ def sphere_normal(p, center, outward):
 
 
 def may_light_itself(shape: mi.Shape, sphere: Sphere | None) -> bool:
-    """Whether ``shape``, with this ``sphere`` or None, emits outwards and transmits.
-
-    Rounding puts some of its points outside, from where Mitsuba samples the cone into the sphere.
-    """
+    """Whether a shape emits outwards and transmits: rounding puts some of its points outside it."""
     if sphere is None or sphere.outward < 0:
         return False
     flags = shape.bsdf().flags()
@@ -96,9 +90,7 @@ def cone_pdf_w(center, radius, p):
 
 
 def outward_sign(shape: mi.Shape, matrix: np.ndarray) -> float:
-    """1 if the normals of hits on a sphere or cylinder point outwards, else -1.
-
-    Mitsuba's flag includes the mirroring by ``to_world`` of spheres, but not of cylinders.
-    """
+    """1 if hits on a sphere or cylinder have outward normals, else -1."""
+    # Mitsuba's flag includes the mirroring of spheres, not of cylinders.
     mirrors = not is_sphere(shape) and bool(np.linalg.det(matrix[:3, :3]) < 0)
     return -1.0 if shape.has_flipped_normals() != mirrors else 1.0

@@ -84,10 +84,7 @@ def spawn(anchor: Anchor, d: mi.Vector3f, shared) -> mi.Ray3f:
 
 
 def _before(a: Anchor, b: Anchor) -> mi.Point3f:
-    """End of the shadow ray from ``a`` to ``b`` if the surface of ``b`` is flat.
-
-    The offset of ``b`` covers the error of its hit and coordinates; that of the ray grows with its length.
-    """
+    """End of the shadow ray from ``a`` to a flat surface at ``b``; its offset grows with the length."""
     offset = dr.maximum(b.offset, offset_at(dr.norm(b.p - a.p)))
     return replace(b, offset=offset).towards(a.p - b.p)
 
@@ -146,10 +143,7 @@ class Own:
 def shadow_ray(
     shape_errors: ShapeErrors, a: Anchor, b: Anchor, number: mi.UInt32, shared
 ) -> tuple[mi.Ray3f, Own | None]:
-    """Return the shadow ray from ``a`` to ``b`` on the shape ``number``, and an `Own` for `occluded`.
-
-    None unless ``shape_errors`` are small.
-    """
+    """Shadow ray from ``a`` to ``b`` on the shape ``number``, and `Own` if ``shape_errors`` are small."""
     if not shape_errors.small:
         return segment(a, b, shared), None
     end = _before(a, b)

@@ -44,10 +44,7 @@ class ShapeFacts:
 
     @classmethod
     def of(cls, scene: mi.Scene, sensor: mi.Sensor) -> ShapeFacts:
-        """Return the cached facts; after an edit, new ones about the shapes that were edited.
-
-        Registry indices are part of the key: the cache may belong to another scene, see `notices.notes`.
-        """
+        """Cached facts, new after edits; keyed by registry indices: the cache may be another scene's."""
         marks = {registry_id(shape): _mark(shape) for shape in all_shapes(scene)}
         before = next(iter(notes(scene, sensor).get("shapes", {}).values()), None)
         return cached(
@@ -55,10 +52,7 @@ class ShapeFacts:
         )[0]
 
     def about(self, kind: str, find: Callable[[], Found], *shapes: mi.Shape | None) -> Found:
-        """Return the cached result of ``find()`` for a ``kind`` of fact and its ``shapes``.
-
-        It must depend on the own parameters of these alone; errors are not cached.
-        """
+        """Cached result of ``find()``, which depends on the own parameters of these ``shapes`` alone."""
         key = kind, *(None if shape is None else registry_id(shape) for shape in shapes)
         if key not in self._found:
             self._found[key] = find()

@@ -125,10 +125,7 @@ class _Faces:
         return _Faces(normals, corners, np.array(chosen.cdf), dr.slice(chosen.sum()))
 
     def starts(self) -> np.ndarray:
-        """The face chosen at the ends of 2^k equal parts of [0, 1], between one and two per face.
-
-        Within a part the search has few faces left (Chen and Asau's method of cutpoints, 1974).
-        """
+        """Faces chosen at the ends of 2^k equal parts of [0, 1] (cutpoints, Chen and Asau 1974)."""
         sums, area, parts = self.sums, np.float32(self.area), 1 << len(self.sums).bit_length()
         u = np.arange(parts + 1, dtype=np.float32) / np.float32(parts) * area
         found = np.maximum(np.searchsorted(sums, u), np.searchsorted(sums, 0, "right"))
@@ -145,10 +142,7 @@ def _arrays(params) -> list[np.ndarray]:
 
 
 def _curved_faces(shape):
-    """Cross products of faces' edges, (faces, 3), on the side of hits' normals.
-
-    None unless it is a mesh whose vertex normals differ from its faces' normals, be it by their sign.
-    """
+    """Cross products of faces' edges on the side of hits' normals, (faces, 3); None if it is flat."""
     if shape is None or not shape.is_mesh():
         return None
     params = own_parameters(shape)

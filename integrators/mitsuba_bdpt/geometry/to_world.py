@@ -41,11 +41,7 @@ def check_to_world(shape, owner: str):
 
 
 def is_reversed(shape: mi.Shape) -> bool:
-    """Whether normals sampled on ``shape`` are opposite to those of hits (``si.n``).
-
-    True for mirrored rectangles, whose hits use the cross product of the edges. (Meshes: see `smooth_meshes`;
-    mirrored cylinders raise an error in `check_to_world`.)
-    """
+    """Whether sampled normals are opposite to those of hits (``si.n``): on mirrored rectangles."""
     is_rectangle = shape.shape_type() == mi.ShapeType.Rectangle.value
     return is_rectangle and bool(np.linalg.det(matrix_of(shape)[:3, :3]) < 0)
 
@@ -141,10 +137,7 @@ def check_rotation(emitter: mi.Emitter):
 
 
 def check_angles(emitter: mi.Emitter):
-    """Raise ``UsageError`` unless ``to_world`` of a projector or spot keeps angles.
-
-    Intensity and density are functions of the untransformed angles. Uniform scaling and mirroring keep them.
-    """
+    """Raise ``UsageError`` unless ``to_world`` of a projector or spot keeps angles (up to scale)."""
     columns = matrix_of(emitter)[:3, :3]
     scale = np.linalg.norm(columns, axis=0).mean()
     with np.errstate(invalid="ignore"):  # non-finite is not close

@@ -81,10 +81,7 @@ def own_parameters(owner) -> dict:
 
 
 def _value(value, cpptype, owner):
-    """Return a parameter's value; raises ``UnsupportedError`` for an animated transformation.
-
-    Python plugins put the value itself, C++ plugins a pointer to a value of type ``cpptype``.
-    """
+    """Return the value that a plugin puts: of C++ plugins a pointer to a value of type ``cpptype``."""
     if renamed.is_transform(value):
         return renamed.transform(value, _called(owner))
     return value if cpptype is None else mi.get_property(value, cpptype, owner)

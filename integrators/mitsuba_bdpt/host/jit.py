@@ -30,10 +30,7 @@ def registered_emitters() -> list[str]:
 
 
 def ensure_two_threads() -> int:
-    """Give Dr.Jit a second thread if it has one only; returns the number before.
-
-    With one, Mitsuba's reader and writer of EXR files wait for ever.
-    """
+    """Give Dr.Jit two threads at least, else Mitsuba's EXR files hang; returns the number before."""
     before = dr.thread_count()
     if before < 2:
         dr.set_thread_count(2)
@@ -77,9 +74,6 @@ def gc_paused():
 
 
 def make_parameters_opaque(owners):
-    """Make the parameters of ``owners`` opaque, except differentiated ones.
-
-    Calls of objects of one class then differ in data alone and compile once, not once per object.
-    """
+    """Make parameters opaque, but differentiated ones: calls then differ in data, and compile once."""
     values = (value for owner in owners for value in own_parameters(owner).values())
     dr.make_opaque([value for value in values if not dr.grad_enabled(value)])

@@ -36,10 +36,7 @@ class LLVMNotFoundError(ImportError):
 
 @dataclass(frozen=True)
 class Choice:
-    """The LLVM library in use: its ``path``, None if Dr.Jit chose it, and major ``version``.
-
-    ``version`` is None where LLVM is not used.
-    """
+    """The LLVM library: ``path`` (None: Dr.Jit chose), major ``version`` (None: LLVM is not used)."""
 
     path: Path | None
     why: str

@@ -26,10 +26,7 @@ class Available:
 
 
 def set_limit(most: float | None) -> None:
-    """Set a limit of ``most`` bytes for this process; None removes it.
-
-    Not enforced: work that is known to need more raises an error before it begins.
-    """
+    """Set a limit of ``most`` bytes for work that is known to need more; None removes it."""
     _limit_set[:] = [] if most is None else [most]
 
 

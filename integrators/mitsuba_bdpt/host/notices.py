@@ -76,10 +76,7 @@ def cached(
 
 
 def warn_once(scene: mi.Scene, sensor: mi.Sensor, text: str, about: Hashable = None):
-    """Log a warning unless it was logged for ``scene`` before.
-
-    Warnings are equal if their ``text`` is, or their ``about`` where the text has varying numbers.
-    """
+    """Log a warning unless one with the same ``about`` (default: ``text``) was logged for ``scene``."""
     said = notes(scene, sensor).setdefault("said", set())
     about = about or text
     if about not in said:

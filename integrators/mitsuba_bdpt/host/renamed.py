@@ -36,10 +36,7 @@ def may_be_animated() -> bool:
 
 
 def transform(value: Any, owner: str) -> Any:
-    """Return the transformation in ``value`` (itself in 3.9).
-
-    Raises ``UnsupportedError``, which names ``owner``, if it has several key frames.
-    """
+    """Return the transformation in ``value``; ``UnsupportedError`` if it has several key frames."""
     if not is_transform(value):
         return value
     if value.is_animated():

@@ -47,10 +47,7 @@ class Block:
         self.data = dr.zeros(dr.value_t(self._packet), self._length)
 
     def put(self, position, values, active, row=0):
-        """Add ``values`` at a continuous film position, ``row`` rows below.
-
-        One value per channel; a final 0 may be left out.
-        """
+        """Add one value per channel (a final 0 may be left out) at a film position, ``row`` rows below."""
         if self._rfilter.is_box_filter():
             self._add(mi.Point2i(dr.floor(position)) - self._offset, values, active, row)
             return
@@ -65,10 +62,7 @@ class Block:
         self._add_each(taps**2, tap, values, active, row)
 
     def splat(self, position, values, active, u, row=0):
-        """Like `put` in expectation over ``u``, with fewer additions, see `taps`.
-
-        ``u``: uniform in [0, 1)^2, unused by the box filter and wide ones.
-        """
+        """Like `put` in expectation over ``u`` in [0, 1)^2, with fewer additions, see `taps`."""
         if self._rfilter.is_box_filter() or is_wide(self._rfilter):
             self.put(position, values, active, row)
             return
@@ -265,10 +259,7 @@ class Accumulator:
         self.camera.put(position, self._channels.sample(*values), active, strip * self._down)
 
     def put_light(self, c, colours, polarized, active, u):
-        """Add the splat ``c`` to the sums of its layers.
-
-        ``polarized``: channels of `Stokes`; ``u``: see `Block.splat`.
-        """
+        """Add the splat ``c`` to the sums of its layers; ``polarized``: channels of `Stokes`."""
         rows = [layer * self._down for layer in self.indices(c.layers)]
         for row in rows or [0]:
             self.light.splat(c.position, [*colours, *polarized], active, u, row)
@@ -374,10 +365,7 @@ class Accumulator:
         return _Pixels(colours, alpha, weight, features, splats, (polarized, of_splats), layers)
 
     def mean(self):
-        """Return the mean of the image so far, the scale of roulette.
-
-        The largest mean of a colour in its unit; an unevaluated ``Float64`` of width 1.
-        """
+        """Largest mean of a colour in its unit: the scale of roulette; an unevaluated ``Float64``."""
         channels, (camera, light) = self._channels, self._done[0][:2]
         if channels.layers:
             light = light[: channels.splats_of_image * self.size[1] * self.light.row]

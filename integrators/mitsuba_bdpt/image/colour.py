@@ -20,10 +20,7 @@ RESPONSE_SAMPLES = 4096
 
 
 def film_colours(sensor, stokes: bool = False):
-    """Return the colours of the film of ``sensor``, with Stokes vectors if ``stokes``.
-
-    Raises ``UnsupportedError`` for films other than Mitsuba's.
-    """
+    """Return the colours of a sensor's film; ``UnsupportedError`` for films other than Mitsuba's."""
     film = sensor.film()
     if not mi.has_flag(film.flags(), mi.FilmFlags.Special):
         return Rgb(film, Stokes(sensor, srgb) if stokes else None)

@@ -26,10 +26,7 @@ OF_VARIANCE = 2 * 2 + 8
 
 
 def check_film(film, channels: Channels, variance: bool):
-    """Raise `UsageError` if the film exceeds the memory or Dr.Jit's array size.
-
-    The memory is that of a render of several passes; one of a single pass takes less than half.
-    """
+    """Raise `UsageError` if a film of several passes exceeds the memory or Dr.Jit's array size."""
     width, height = (int(x) for x in film.crop_size())
     light = channels.light * channels.splats
     numbers = width * height * max(channels.camera, light)
@@ -58,10 +55,7 @@ def check_film(film, channels: Channels, variance: bool):
 
 
 def check_strategies(film, depth: int, merges: bool):
-    """Raise `UsageError` if strategy images take more than `STRATEGY_MEMORY`.
-
-    Images of paths of up to ``depth`` edges, and of ``merges`` if true.
-    """
+    """Raise `UsageError` if images of paths of up to ``depth`` edges exceed `STRATEGY_MEMORY`."""
     width, height = (int(x) for x in film.crop_size())
     # Six channels of each: three weighted, three unweighted.
     needed = image_count(depth, merges) * width * height * 6 * (DOUBLE + ALL)

@@ -17,10 +17,7 @@ GROUP, PATH = "groups.", "path."
 
 
 def strategies(depth: int):
-    """Return all ``(k, s, t)`` with k = s + t - 1 edges, 1 <= k <= depth, in order.
-
-    There are k + 2 of each length k.
-    """
+    """Return ``(k, s, t)`` with k = s + t - 1 edges in order, k + 2 of each 1 <= k <= depth."""
     return [(k, s, k + 1 - s) for k in range(1, depth + 1) for s in range(k + 2)]
 
 

@@ -28,10 +28,7 @@ class MappedNormals:
         self._maps = [_Map(bsdf) for bsdf in found.values()]
 
     def at(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool, of_aov: bool) -> mi.Normal3f:
-        """Return the shading normal at ``si``, in world space.
-
-        With ``of_aov``, normals of bump maps are in the shading frame, as in ``aov``.
-        """
+        """Return the shading normal at ``si`` (world; of bump maps in the shading frame if ``of_aov``)."""
         normal = mi.Normal3f(si.sh_frame.n)
         for one in self._maps:
             here = active & (bsdf == mi.BSDFPtr(one.bsdf))

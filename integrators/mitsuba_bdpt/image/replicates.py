@@ -88,11 +88,7 @@ class Replicates:
         return sum(half.spp for half in self.halves)
 
     def add(self, sums, spp: int, develop):
-        """Add an image.
-
-        ``sums`` and ``spp``: cumulative over all images; ``develop(camera, light, spp)`` returns the image of
-        the difference.
-        """
+        """Add an image, the difference of ``sums`` over ``spp`` from the last, by ``develop(*sums, spp)``."""
         new = sums if self._sums is None else [a - b for a, b in zip(sums, self._sums, strict=True)]
         n = spp - self.spp
         image = Spread.of(develop(*new, n), n)
@@ -113,11 +109,7 @@ class Replicates:
             self._sums = [mi.Float64(arrays[name]) for name in sorted(arrays) if name.startswith(LAST)]
 
     def variance(self, spp: int, shape=()):
-        """Return the variance of the mean of ``spp`` samples per pixel.
-
-        Includes samples of an incomplete replicate. Infinite, of the given shape, with fewer than two
-        replicates.
-        """
+        """Variance of the mean of ``spp`` samples per pixel; infinite with fewer than two replicates."""
         if self.count < 2:
             return np.full(shape, np.inf)
         first, second = self.halves

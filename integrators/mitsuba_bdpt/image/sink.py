@@ -41,10 +41,7 @@ class Image:
         return self._plus(total, c.weighted(), c.layers, c.active)
 
     def connect(self, kernel, z, lane, stream, total, start):
-        """Connect the camera vertex ``z`` to light vertices of its lane.
-
-        Returns the ``total`` and `Counters`.
-        """
+        """Connect the camera vertex ``z`` to light vertices of its lane; returns ``total`` and `Counters`."""
         if kernel.plan.connections == "all":
 
             def add(_, seen, total):

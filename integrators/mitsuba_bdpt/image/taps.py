@@ -84,10 +84,7 @@ class Taps:
 
 
 def _chosen(level: mi.Float, below: list[mi.Float], order: list[int], *columns) -> list:
-    """Return the entry of ``order``, and of each of the ``columns``, in whose interval ``level`` lies.
-
-    ``below``: the intervals' upper ends.
-    """
+    """Return the entries of ``order`` and ``columns`` whose interval (upper end ``below``) has ``level``."""
     found = [mi.Int32(order[0]), *(column[0] for column in columns)]
     for k, end in enumerate(below[:-1], 1):
         entry = [mi.Int32(order[k]), *(column[k] for column in columns)]

@@ -39,10 +39,7 @@ def check_resumable(start):
 
 
 def resolve_sensor(scene, sensor):
-    """Return the sensor for ``sensor``, an index or the sensor itself.
-
-    Raises `UsageError` and `UsageTypeError`.
-    """
+    """Return the sensor for an index or a sensor; raises `UsageError` and `UsageTypeError`."""
     if isinstance(sensor, mi.Sensor):
         return sensor
     if not is_index(sensor):

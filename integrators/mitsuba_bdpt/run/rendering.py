@@ -246,10 +246,7 @@ class Render:
         return kernel
 
     def _steps(self) -> Iterator[Step]:
-        """Yield the remaining passes of `schedule`.
-
-        Under ``timeout``, a pass takes at most about a tenth of it.
-        """
+        """Yield the remaining passes; under ``timeout`` one takes at most about a tenth of it."""
         if self._small_first is None:
             long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
             self._small_first = long and self.planner.threshold is None and self._plays_roulette()
@@ -331,19 +328,13 @@ class Render:
         return PassReport(sum(self.passes), self.spp, self.meter.work.seconds, counts, self._error, *made)
 
     def _freeze(self) -> tuple[tuple[int, ...], Progress, dict]:
-        """Return passes, progress and arrays of a snapshot, without copies.
-
-        The state is consistent even if an interruption comes while the next pass is recorded.
-        """
+        """Return passes, progress and arrays of a snapshot, consistent even if an interruption comes."""
         passes, arrays = self.accumulator.store()
         progress = Progress(self.planner.decided, self.meter.work, self._small_first, self.why_merged)
         return passes, progress, arrays | {"inverse_threshold": self.kernel.inverse_threshold}
 
     def _snapshot(self, reported: int) -> Snapshot:
-        """Return the snapshot of the report after ``reported`` passes.
-
-        Raises `UsageError` after a later report: every report would keep its own sums.
-        """
+        """Return the snapshot of the report after ``reported`` passes, the newest; else `UsageError`."""
         state = self._state
         if state is None or len(state[0]) != reported:
             raise _too_late("snapshot", reported)
@@ -364,10 +355,7 @@ class Render:
         return identity(self.settings, self.accumulator, int(self.points.seed[0]), self.spp, self.part)
 
     def resume(self, snapshot: Snapshot, apart_from=()):
-        """Continue after the passes of a snapshot.
-
-        Raises `UsageError` if it is of another render, see `Snapshot.check`.
-        """
+        """Continue after the passes of a snapshot; raises `UsageError` if it is of another render."""
         snapshot.check(self._identity(), apart_from)
         progress, arrays = snapshot.progress, snapshot.arrays
         self.planner.restore(progress.decided)
@@ -378,10 +366,7 @@ class Render:
         self._small_first, self.why_merged = progress.small_first, progress.why_merged
 
     def unsampled_light(self) -> dict[int, float]:
-        """Return shares of the image's light that are not sampled, by index in ``scene.emitters()``.
-
-        Warns of large shares, once per scene and plan.
-        """
+        """Return and warn of shares of light not sampled, by index in ``scene.emitters()``."""
         missing = self.missing() if self.passes else None
         messages.warn_of_unsampled_light(self.prepared, self.plan, missing)
         emitters, of_scene = self.prepared.emitters.objects, self.prepared.scene.emitters()
@@ -389,10 +374,7 @@ class Render:
         return {of_scene.index(emitters[i]): share for i, share in shares.items()}
 
     def _unsampled(self) -> UnsampledLight | None:
-        """Return the unsampled light transport; None if there is none.
-
-        Estimated once per scene and plan, and again after edits.
-        """
+        """Unsampled light transport, estimated once per scene and plan until an edit; None if none."""
         prepared, plan, settings = self.prepared, self.plan, self.settings
         if not unsampled_light.is_possible(prepared, plan, settings):
             return None
@@ -458,10 +440,7 @@ def interruptible():
 
 
 def raise_interrupt(error: BaseException):
-    """Raise the ``KeyboardInterrupt`` that ``error`` wraps, if any.
-
-    Dr.Jit converts exceptions within a recorded loop or call to ``RuntimeError``.
-    """
+    """Raise the ``KeyboardInterrupt`` that Dr.Jit has converted to the ``RuntimeError`` ``error``."""
     cause = behind(error, KeyboardInterrupt)
     if cause is not None:
         raise cause from None

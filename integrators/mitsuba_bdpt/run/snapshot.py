@@ -61,10 +61,7 @@ FORMAT = 13
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:
-    """Return the values, as JSON, that a render and its continuation must share.
-
-    The scene is not included.
-    """
+    """Return the values, as JSON, that a render and its continuation must share (not the scene)."""
     film, values = accumulator.film, asdict(settings)
     del values["timeout"]
     del values["internals"]["decisions"]

@@ -63,10 +63,7 @@ class Meter:
         return time.perf_counter() - self._started
 
     def rate(self, spp: int) -> float:
-        """Return samples per pixel and second of this part, at ``spp`` in total.
-
-        Excludes compilation and pilots.
-        """
+        """Samples per pixel and second of this part, at ``spp`` in total, without compilation and pilots."""
         busy = self.elapsed() - (self._noted.idle_seconds - self._earlier.idle_seconds)
         return (spp - self._earlier_spp) / max(busy, 1e-3)
 

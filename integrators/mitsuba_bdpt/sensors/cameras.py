@@ -153,11 +153,7 @@ class Camera(Sensor):
         )
 
     def _project(self, index, view, outward, lens):
-        """Return film position and depth along the axis, and whether the film sees it.
-
-        ``outward``: direction (world) from the point ``lens`` of the lens (camera coordinates: world
-        coordinates would be rounded far from the origin).
-        """
+        """Film position, depth and visibility along ``outward`` from the point ``lens`` (camera space)."""
         local = _transform(view.to_camera, outward, 0)
         depth = local.z
         x, y = local.x / depth, local.y / depth
@@ -173,10 +169,7 @@ class Camera(Sensor):
         return self.region.to_position(uv), depth, inside
 
     def hit(self, walk, vertex, distant) -> SensorHit:
-        """Intersect the walk's ray with the lens, which is not a shape of the scene.
-
-        Surfaces between the lens and the near plane do not block it: camera rays start at the near plane.
-        """
+        """Intersect the walk's ray with the lens, no shape; only surfaces before the near plane block it."""
         view = self._view(mi.UInt32(0))
         centre = _transform(view.to_world, mi.Point3f(0), 1)
         o, d = (_transform(view.to_camera, v, 0) for v in (walk.previous - centre, walk.d))

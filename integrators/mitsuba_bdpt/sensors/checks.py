@@ -35,10 +35,7 @@ def called(sensor: mi.Sensor) -> str:
 
 
 def check_sensor(sensor: mi.Sensor, of_scene: Sequence[mi.Sensor]):
-    """Raise ``UsageError`` or ``UnsupportedError`` if ``sensor``, or a view of a batch, has no camera rays.
-
-    ``of_scene``: the scene's sensors.
-    """
+    """Raise ``UsageError`` or ``UnsupportedError`` if ``sensor`` or a view has no camera rays."""
     kind = sensor.class_name()
     if kind == "BatchSensor":
         for view in views(sensor):
@@ -106,10 +103,7 @@ def _rows(matrix: np.ndarray) -> str:
 
 
 def rays_of(sensor: mi.Sensor, film: mi.Point2f, lens: mi.Point2f) -> tuple[np.ndarray, np.ndarray, mi.Ray3f]:
-    """Return origins and directions, (3, n) in double precision, and the camera rays.
-
-    Raises ``UsageError`` if one is not finite.
-    """
+    """Origins and directions (3, n), and the camera rays; ``UsageError`` if one is not finite."""
     ray, _ = sensor.sample_ray(0, 0.5, film, lens)
     o, d = (np.array(v, dtype=np.float64) for v in (ray.o, ray.d))
     if not (np.isfinite(o).all() and np.isfinite(d).all() and d.any(axis=0).all()):

@@ -13,11 +13,7 @@ from .records import Sensor
 
 
 def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
-    """Return the sensor for one render of ``scene``.
-
-    Kinds to which light vertices cannot be connected use camera subpaths alone, with a reason. Raises
-    ``UnsupportedError`` for sensors that Mitsuba cannot render.
-    """
+    """Return the sensor for one render; ``UnsupportedError`` for those that Mitsuba cannot render."""
     kind = sensor.class_name()
     if kind in cameras.KINDS:
         return cameras.Camera(sensor, [sensor])
