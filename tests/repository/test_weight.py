@@ -25,7 +25,7 @@ MOST = {
     "": 1419,  # top files
 }
 OUTSIDE = {"scripts": 2929, "tests": 36152}
-MOST_WORDS = 29047
+MOST_WORDS = 29045
 
 
 def _lines(files):
