@@ -163,12 +163,8 @@ def obtained(job: Job) -> Reference:
 def check(job: Job) -> None:
     """Raise ``CommandError``, before rendering, if a reference cannot be made."""
     recipe_of(job.project, job.scene.name)
-    width = fitting_width(job.scene, job.resolution)
-    if width != job.resolution:
-        raise CommandError(
-            f"scene={job.scene.name!r} with resolution={job.resolution} does not divide into {TILES} x "
-            f"{TILES} tiles; take resolution={width}"
-        )
+    if (width := fitted(job.scene, job.resolution)) != job.resolution:
+        raise CommandError(f"resolution={job.resolution} of {job.scene.name!r} must be {width}")
     try:
         if job.is_missing:
             job.path.parent.mkdir(parents=True, exist_ok=True)
@@ -207,36 +203,24 @@ def _announced(job: Job) -> str:
     return f"{job.scene.name}: {why}, for at most about {job.seconds:g} s"
 
 
-def fitting_width(scene: MeasuredScene, wanted: int) -> int:
-    """Load a scene, and return the nearest width at which it can be measured, see `resized`.
+def fitted(scene: MeasuredScene, wanted: int) -> int:
+    """Load a scene, and return the nearest width at which it can be measured; prints a message if it differs.
 
     Raises ``CommandError`` if there is none near.
     """
     widths = range(TILES, max(4 * wanted, TILES + 1), TILES)
     fitting = [n for n in widths if scene.size(n)[1] % TILES == 0]
-    found = min(fitting, key=lambda n: abs(n - wanted), default=None)
-    if found is None:
-        width, height = scene.size()
+    width = min(fitting, key=lambda n: abs(n - wanted), default=None)
+    if width is None:
+        own = " x ".join(map(str, scene.size()))
         raise CommandError(
-            f"scene={scene.name!r} has a film of {width} x {height} pixels, which divides into {TILES} x "
-            f"{TILES} tiles at no width near {wanted}; take another resolution"
+            f"scene={scene.name!r} has a film of {own} pixels, which divides into {TILES} x {TILES} tiles at "
+            f"no width near {wanted}; take another resolution"
         )
-    return found
-
-
-def resized(scene: MeasuredScene, wanted: int, width: int) -> list[str]:
-    """Return a message if a scene is not rendered at the width that is asked for."""
-    if width == wanted:
-        return []
-    size, asked = (" x ".join(map(str, scene.size(n))) for n in (width, wanted))
-    why = f"the {asked} of resolution={wanted} do not divide into {TILES} x {TILES} tiles"
-    return [f"{scene.name}: rendered with {size} pixels: {why}"]
-
-
-def fitted(scene: MeasuredScene, wanted: int) -> int:
-    width = fitting_width(scene, wanted)
-    for told in resized(scene, wanted, width):
-        print(told, flush=True)
+    if width != wanted:
+        size, asked = (" x ".join(map(str, scene.size(n))) for n in (width, wanted))
+        why = f"the {asked} of resolution={wanted} do not divide into {TILES} x {TILES} tiles"
+        print(f"{scene.name}: rendered with {size} pixels: {why}", flush=True)
     return width
 
 

@@ -22,7 +22,7 @@ from ..errors import CommandError, message
 from ..files.texts import read_toml
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
-from .making import fitting_width, resized
+from .making import fitted
 from .models import Method, More, PresetFile, checked
 from .project import Project
 from .reference import source_digest
@@ -62,11 +62,6 @@ class Preset:
         """The integrators; the first one has its samples, whose time the others match."""
         first, *others = self.file.integrator
         return first.model_copy(update={"match": "spp"}), *others
-
-    def resized(self) -> list[str]:
-        """Return a message about each scene that is not rendered at the width that is asked for."""
-        width = self.file.resolution
-        return [told for one in self.subjects for told in resized(one.scene, width, one.resolution)]
 
 
 def read_preset(path: Path, project: Project, only: Sequence[str] | None = None) -> Preset:
@@ -120,7 +115,7 @@ def _subjects(
     found, left_out = [], []
     for scene in scenes:
         try:
-            width, depth = fitting_width(scene, file.resolution), file.depth(scene.name, scene.max_depth)
+            width, depth = fitted(scene, file.resolution), file.depth(scene.name, scene.max_depth)
         except Exception as error:  # one scene must not cost the others
             raise_interrupt(error)
             left_out.append(f"{scene.name}: left out: {' '.join(message(error).split())}")

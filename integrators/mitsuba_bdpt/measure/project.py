@@ -4,7 +4,7 @@
     PROJECT/references/                 reference images, made according to references/scenes.toml
     PROJECT/presets/NAME.toml           definitions of sweeps
     PROJECT/results/NAME/               results of sweeps
-    PROJECT/renders/                    pictures, and sums from which references are refined
+    PROJECT/renders/                    pictures
 
 All folders are optional.
 """
@@ -43,7 +43,6 @@ class Project:
 
     @property
     def renders(self) -> Path:
-        """Folder of pictures and of intermediate sums."""
         return self.root / "renders"
 
     def scene_names(self) -> list[str]:

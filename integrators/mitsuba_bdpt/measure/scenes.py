@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,24 +36,18 @@ class _Look(NamedTuple):
     has_colours: bool
 
 
-class MeasuredScene(ABC):
-    """A scene with a ``name``, the key of its references and rows."""
+class MeasuredScene:
+    """A scene with a ``name``, the key of its references and rows.
+
+    ``called``: its name in messages; ``sha256``: SHA-256 of the scene and of all files that it names.
+    """
 
     name: str
+    called: str
+    sha256: str
 
-    @property
-    @abstractmethod
-    def called(self) -> str:
-        """Name for messages."""
-
-    @property
-    @abstractmethod
-    def sha256(self) -> str:
-        """SHA-256 of the scene and of all files that it names."""
-
-    @abstractmethod
     def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        """Return the parser's state."""
+        raise NotImplementedError
 
     def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
         """Return the scene; with another type of ``sampler`` unless None. ``merges`` meshes of a BSDF."""

@@ -524,7 +524,7 @@ def swept(
         )
     if options.scheduler and options.seconds is not None:
         raise CommandError(f"seconds={options.seconds:g} with scheduler={options.scheduler} is not possible")
-    for told in (*whole.left_out, *whole.resized()):
+    for told in whole.left_out:
         print(told, flush=True)
     sweep = Sweep(project, whole, output)
     sweep.check()
