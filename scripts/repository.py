@@ -34,9 +34,9 @@ def scene_file(name: str) -> Path:
     return PROJECT.scene(name).file
 
 
-def load_scene(name: str, **definitions):
+def load_scene(name: str, **size):
     """A scene, see `SceneFile.load`."""
-    return PROJECT.scene(name).load(**definitions)
+    return PROJECT.scene(name).load(**size)
 
 
 def benchmark_depth(name: str) -> int:

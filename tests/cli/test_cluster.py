@@ -5,12 +5,10 @@ import math
 import os
 import signal
 import threading
-from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
 import distributed
-import mitsuba as mi
 import numpy as np
 import pytest
 import rendered
@@ -64,21 +62,7 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
         assert decided["emission"] and decided["joined"] == 4
     assert main(arguments(workers, tmp_path / "short.exr", "--spp", "15", scene=path)) == 0
     assert "samples, a pilot needs" in rendered.image(tmp_path / "short.exr", "RGB")[1]["no_pilot"]
-    options = Namespace(
-        scene=path,
-        defines=[("resolution", "32")],
-        properties=[("merging", True)] * merges,
-        variant=mi.variant(),
-        integrator=None,
-        sensor=0,
-        time=None,
-        target_error=None,
-        denoise=False,
-        append=[],
-        size=None,
-        crop=None,
-        seed=0,
-    )
+    options = build_parser().parse_args(["render", str(path), "-D", "resolution=32", *given])
     scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 256)
     assert json.loads(job)["decisions"] == [decided]

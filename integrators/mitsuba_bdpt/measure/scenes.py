@@ -46,14 +46,14 @@ class MeasuredScene:
     called: str
     sha256: str
 
-    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
+    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
         raise NotImplementedError
 
-    def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
+    def _instantiated(self, sampler: str | None, merges: bool = True) -> mi.Scene:
         """Return the scene; with another type of ``sampler`` unless None. ``merges`` meshes of a BSDF."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel, config.merge_meshes = False, merges
-        state = self._parsed(config, definitions)
+        state = self._parsed(config)
         if sampler is not None:
             sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
             if not sensors:
@@ -63,14 +63,13 @@ class MeasuredScene:
         # The stub says object.
         return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
 
-    def load(self, resolution: int | None = None, sampler: str | None = None, **definitions: Any) -> mi.Scene:
+    def load(self, resolution: int | None = None, sampler: str | None = None) -> mi.Scene:
         """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
 
-        Size and sampler are of the first sensor; None keeps the scene's own. ``definitions``: values of its
-        parameters. Raises ``CommandError`` for a scene without sensor, ``RuntimeError`` (of Mitsuba) for an
-        invalid one.
+        Size and sampler are of the first sensor; None keeps the scene's own. Raises ``CommandError`` for a
+        scene without sensor, ``RuntimeError`` (of Mitsuba) for an invalid one.
         """
-        scene = unless_incompatible(lambda merges: self._instantiated(definitions, sampler, merges))
+        scene = unless_incompatible(lambda merges: self._instantiated(sampler, merges))
         if resolution is not None:
             _resize(scene, resolution)
         return scene
@@ -128,12 +127,12 @@ class SceneFile(MeasuredScene):
             content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
         return hashlib.sha256(b"".join(content)).hexdigest()
 
-    def _instantiated(self, definitions: dict, sampler: str | None, merges: bool = True) -> mi.Scene:
+    def _instantiated(self, sampler: str | None, merges: bool = True) -> mi.Scene:
         with searching(self.file):
-            return super()._instantiated(definitions, sampler, merges)
+            return super()._instantiated(sampler, merges)
 
-    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        return parsed(self.file, definitions, config)
+    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
+        return parsed(self.file, {}, config)
 
 
 class DictionaryScene(MeasuredScene):
@@ -169,9 +168,7 @@ class DictionaryScene(MeasuredScene):
     def sha256(self) -> str:
         return hashlib.sha256(b"".join(_bytes_of(self._dictionary, self.name))).hexdigest()
 
-    def _parsed(self, config: mi.parser.ParserConfig, definitions: dict) -> mi.parser.ParserState:
-        if definitions:
-            raise CommandError(f"{self.called} has no parameter {next(iter(definitions))!r}")
+    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
         return mi.parser.parse_dict(config, self._dictionary)
 
 
