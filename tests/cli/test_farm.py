@@ -219,24 +219,17 @@ def test_frames_go_on_where_they_were(capsys, monkeypatch):
     sensors(3)
     arguments = ["render", "frames.xml", "--frames", "0-2", "--spp", "8", "-P", "spp_per_pass=2"]
     arguments += ["-o", "shot.exr", "--checkpoint", "60", "--statistics", "shot.json"]
-    original, ended = render.render_job, []
+    watch, passes = checkpoints.Checkpoints.after_pass, []
 
-    def interrupted(scene, integrator, job, ending):
-        if job.sensor == 1 and not ended:
-            ended.append(job)
-            watch = checkpoints.Checkpoints.after_pass
+    def after_pass(self, report):
+        watch(self, report)
+        passes.append(report)
+        if len(passes) == 5:  # the first of the second frame
+            raise KeyboardInterrupt
 
-            def after_pass(self, report):
-                watch(self, report)
-                raise KeyboardInterrupt
-
-            with monkeypatch.context() as patch:
-                patch.setattr(checkpoints.Checkpoints, "after_pass", after_pass)
-                return original(scene, integrator, job, ending)
-        return original(scene, integrator, job, ending)
-
-    monkeypatch.setattr(render, "render_job", interrupted)
-    assert main(arguments) == 130
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoints.Checkpoints, "after_pass", after_pass)
+        assert main(arguments) == 130
     assert Path("shot.0001.checkpoint.npz").exists() and not Path("shot.0002.exr").exists()
     first = Path("shot.0000.exr").stat().st_mtime_ns
     capsys.readouterr()
