@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6357,
+    "measure": 6325,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2252,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 895,
     "": 1419,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 36152}
+OUTSIDE = {"scripts": 2929, "tests": 36127}
 MOST_WORDS = 29045
 
 
