@@ -440,7 +440,7 @@ def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
     reference.write(file, kept)
     table = [r | {"reference_sha256": digest(file)} for r in runs("bdpt", 2)]
     pd.DataFrame(table).to_parquet(tmp_path / "rows.parquet")
-    found, made = load(Project(tmp_path), tmp_path)
+    found, made, _ = load(Project(tmp_path), tmp_path)
     assert found.scenes == ["box"] == list(made) and not found.references
     with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
         found.bias("box", "bdpt")

@@ -195,7 +195,7 @@ def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
     """What is missing, and the key that mends it."""
     kept = results(("b",))
     one = replace(kept, rows=kept.rows.query("seed == 0"))
-    monkeypatch.setattr(figures, "load", lambda *_: (one, {}))
+    monkeypatch.setattr(figures, "load", lambda *_: (one, {}, {}))
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "efficiency"}
     with pytest.raises(CommandError, match="two renders of each integrator; set seeds = 2 or more"):
         figures.run(Namespace(**ALL | words, columns=1))
@@ -204,7 +204,7 @@ def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
 def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
     """A warning with the height and the option that mends it; none for one scene."""
     kept, found = results(("a", "b")), saved(monkeypatch, crops)
-    monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab")))
+    monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab"), {}))
     monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "crops"}
     for scenes in (None, ["b"]):

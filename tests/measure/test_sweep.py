@@ -875,10 +875,9 @@ def test_time_left_follows_from_work(monkeypatch, capsys):
         assert not capsys.readouterr().err
         clock[0] = 31
         made.end("pool", 8)
-        assert capsys.readouterr().err == "2 of 3 renders, 0:10 left: pool\n"
+        assert capsys.readouterr().err == "2 of 3 renders, 0:00:10 left: pool\n"
         made.plan([12])
-        assert made.words("x").startswith("2 of 4 renders, 0:41 left")
-    assert [showing.clock(s) for s in (59.6, 61, 3600)] == ["1:00", "1:01", "1:00:00"]
+        assert made.words("x").startswith("2 of 4 renders, 0:00:41 left")
 
 
 def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6325,
+    "measure": 6309,
     "transport merging guided_emission": 5706,
     "planning": 1731,
     "emitters": 2252,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 895,
     "": 1419,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 36127}
-MOST_WORDS = 29045
+OUTSIDE = {"scripts": 2929, "tests": 36126}
+MOST_WORDS = 29028
 
 
 def _lines(files):

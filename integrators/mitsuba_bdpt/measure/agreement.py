@@ -97,12 +97,10 @@ class Difference(NamedTuple):
 
 
 def welch(a: Sample, b: Sample) -> Difference:
-    """Welch's unequal-variances t-test; Student's where one side is known exactly.
+    """Welch's two-sided t-test; Student's where one side is known exactly.
 
-    Two-sided: t = |a - b| / hypot(error_a, error_b). Differences within `ROUNDING` of the larger mean count
-    as none. p is 1 where both sides are nonzero in less than `NONZERO_SHARE` of the renders. Degrees of
-    freedom: 1 / (c^2 / n_a + (1 - c)^2 / n_b) with c = v_a / (v_a + v_b) of the variances of the means, and 1
-    where both are 0. Source: B. L. Welch, Biometrika 34, 1947.
+    Differences within `ROUNDING` of the larger mean count as none. p is 1 where both sides are nonzero in
+    less than `NONZERO_SHARE` of the renders. Source: B. L. Welch, Biometrika 34, 1947.
     """
     error = np.hypot(a.error, b.error)
     gap = np.abs(a.mean - b.mean)

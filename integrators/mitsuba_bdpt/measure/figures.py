@@ -320,7 +320,7 @@ def run(options: Namespace) -> int:
     for name, plots in NOT_FOR.items():
         if options.plot in plots and getattr(options, name):
             raise CommandError(f"--{name} is not for --plot {options.plot}; leave it out")
-    results, made = load(project, folder)
+    results, made, _ = load(project, folder)
     results = replace(_among(results, options.integrators), compared=options.spp)
     _ = results.deciding  # raises for a budget that is not there
     for scene in options.scenes or ():

@@ -22,7 +22,7 @@ import pandas as pd
 from jinja2 import Template
 
 from ..errors import CommandError
-from ..files.texts import read_toml, text_of, write_text
+from ..files.texts import write_text
 from ..files.whole import check_own, check_writable
 from . import figures
 from .analysis import (
@@ -442,14 +442,9 @@ class Report:
 
     @staticmethod
     def of(project: Project, folder: Path, spp: int | None = None) -> Report:
-        """Read a folder; raises ``CommandError`` like `results.load`, or for invalid notes."""
-        results, made = load(project, folder)
+        """Read a folder; raises ``CommandError`` like `results.load`, or for notes of other scenes."""
+        results, made, notes = load(project, folder)
         results = replace(results, compared=spp)
-        file = folder / "notes.toml"
-        notes = read_toml(file) if file.exists() else {}
-        notes.pop("aside", None)  # read by `results.load`
-        for scene, text in notes.items():
-            text_of(file, scene, text)
         if unknown := sorted(set(notes) - set(results.scenes)):
             raise CommandError(f"notes.toml: {unknown[0]!r} is not among the scenes")
         name = folder.resolve().name  # the preset's

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
-from ..files.texts import list_of, read_json, read_toml, write_json
+from ..files.texts import list_of, read_json, read_toml, text_of, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
 from .preset import FIRST_SEED, Cell, Cells, Preset
@@ -308,8 +308,8 @@ def decisive(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(seconds=table.apply(decided, axis=1))
 
 
-def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference]]:
-    """Return the results in a folder, and the references of its scenes by name.
+def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference], dict[str, str]]:
+    """Return the results in a folder, and the references of its scenes and the notes by scene.
 
     The integrators that notes.toml lists as ``aside`` are not compared. Raises ``CommandError`` if there are
     no results, or if errors are against other references than the ``project``'s.
@@ -339,10 +339,10 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     notes = folder / "notes.toml"
     given = read_toml(notes) if notes.exists() else {}
-    aside = list_of(notes, "aside", given["aside"], str, "texts in quotes") if "aside" in given else []
+    aside = list_of(notes, "aside", given.pop("aside", []), str, "texts in quotes")
     found = analysis.Results(table, means, measured, aside)
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
             f"{notes}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
         )
-    return found, made
+    return found, made, {scene: text_of(notes, scene, text) for scene, text in given.items()}

@@ -9,25 +9,26 @@ import sys
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from datetime import timedelta
 from itertools import count
 from typing import Self
 
+from rich import progress as rich
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 
-def bar() -> Progress:
-    """Return a bar that counts steps."""
+def bar(*columns: rich.ProgressColumn) -> rich.Progress:
+    """Return a bar with a text before it and these ``columns`` after it."""
     console = Console(stderr=True)
-    text = TextColumn("{task.description}", markup=False)  # names of integrators may contain brackets
-    columns = text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    text = rich.TextColumn("{task.description}", markup=False)  # names of integrators may contain brackets
+    is_off = not console.is_terminal
+    return rich.Progress(text, rich.BarColumn(), *columns, console=console, transient=True, disable=is_off)
 
 
 @contextmanager
 def steps(total: int) -> Generator[Callable[[str], None]]:
     """A `bar` of ``total`` steps; call the result with a description at each step."""
-    with bar() as shown:
+    with bar(rich.MofNCompleteColumn(), rich.TimeRemainingColumn()) as shown:
         task, done = shown.add_task("", total=total), count()
         yield lambda text: shown.update(task, description=text, completed=next(done))
 
@@ -35,7 +36,7 @@ def steps(total: int) -> Generator[Callable[[str], None]]:
 @contextmanager
 def amount(text: str, total: float) -> Generator[Callable[[float], None]]:
     """Like `steps`, for seconds or samples; call the result with the amount done."""
-    with bar() as shown:
+    with bar(rich.MofNCompleteColumn(), rich.TimeRemainingColumn()) as shown:
         task = shown.add_task(text, total=round(total))
         yield lambda done: shown.update(task, completed=min(round(done), round(total)))
 
@@ -51,14 +52,10 @@ class Renders:
     """
 
     def __init__(self, limit: float | None = None):
-        console = Console(stderr=True)
-        text = TextColumn("{task.description}", markup=False)  # names of integrators may contain brackets
-        self._is_bar = console.is_terminal
-        self._bar = Progress(text, BarColumn(), console=console, transient=True, disable=not self._is_bar)
+        self._bar, self._limit = bar(), limit
         self._task = self._bar.add_task("", total=0.0)
-        self._limit, self._began = limit, time.monotonic()
         self._done, self._total, self._work, self._whole, self._spent = 0, 0, 0.0, 0.0, 0.0
-        self._since = self._printed = self._began
+        self._began = self._since = self._printed = time.monotonic()
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -75,15 +72,18 @@ class Renders:
     def begin(self, text: str) -> None:
         """Show what is rendered next."""
         self._since = time.monotonic()
-        self._show(text)
+        self._bar.update(self._task, description=self.words(text), completed=self._work, total=self._whole)
 
     def end(self, text: str, work: float) -> None:
         """Count a render, whose seconds are those since the last `begin` or `end`."""
         now = time.monotonic()
-        self._spent, self._since = self._spent + now - self._since, now
-        self._done, self._work = self._done + 1, self._work + work
-        self._show(text)
-        if not self._is_bar and now - self._printed >= max(EVERY, SHARE * (now - self._began)):
+        self._spent, self._done, self._work = (
+            self._spent + now - self._since,
+            self._done + 1,
+            self._work + work,
+        )
+        self.begin(text)
+        if self._bar.disable and now - self._printed >= max(EVERY, SHARE * (now - self._began)):
             self._printed = now
             print(self.words(text), file=sys.stderr, flush=True)
 
@@ -98,14 +98,5 @@ class Renders:
     def words(self, text: str) -> str:
         """Return how many renders are done, and the time left."""
         left = self.seconds_left()
-        said = f"{self._done} of {self._total} renders" + ("" if left is None else f", {clock(left)} left")
-        return f"{said}: {text}"
-
-    def _show(self, text: str) -> None:
-        self._bar.update(self._task, description=self.words(text), completed=self._work, total=self._whole)
-
-
-def clock(seconds: float) -> str:
-    """Format seconds as minutes, or as hours and minutes."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"
+        time_left = "" if left is None else f", {timedelta(seconds=round(left))} left"
+        return f"{self._done} of {self._total} renders{time_left}: {text}"
