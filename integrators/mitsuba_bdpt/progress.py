@@ -68,10 +68,7 @@ def readable(number: float) -> str:
 
 
 class Display:
-    """Shows nothing.
-
-    ``open_ended``: time or an error ends the render, not its number of samples.
-    """
+    """Shows nothing. ``open_ended``: time or an error ends the render, not its samples."""
 
     def __init__(self, limit: float | None = None, open_ended: bool = False):
         self._limit, self._open_ended = limit, open_ended

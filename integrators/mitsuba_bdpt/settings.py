@@ -78,10 +78,7 @@ class Internals:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters, checked.
-
-    ``max_depth`` is `UNLIMITED` for -1, ``layers`` in the order of `LAYERS`.
-    """
+    """The parameters, checked: ``max_depth`` `UNLIMITED` for -1, ``layers`` in the order of `LAYERS`."""
 
     max_depth: int = _parameter(
         -1,

@@ -411,7 +411,6 @@ OWN = "--integrator", "scene", "-D", "integrator=bdpt"
         ([], ["-P", "max_dept=4"], r"max_dept=4 is not a parameter; did you mean max_depth\? Parameters:"),
         ([], ["-P", "decisions=[]"], r"decisions='\[\]': the parameter was removed; set light_paths and"),
         ([], ["--spp", "9999999999"], "spp=9999999999 must be an integer from 1 to 4294967295, or 0"),
-        ([('"width" value="6"', '"width" value="0"')], [], "width=0 of the film must be 1 or more pixels"),
         ([('"width" value="6"', '"width" value="1000001"')], [], "for a PNG, whose sides have 1000000"),
         ([('count" value="4"', 'count" value="0"')], [], "sample_count=0: nothing is to"),
         ([('<default name="light" value="2"/>', "")], [], r"col 31\): undefined parameter: \$light"),

@@ -277,10 +277,7 @@ class AreaEmitters(Group):
         )
 
     def _corrected(self, chosen, ds, weight, si, u, active):
-        """Replace Mitsuba's sample of next-event estimation where it is wrong.
-
-        Returns sample, density (solid angle, with the shading normal's cosine in its denominator) and weight.
-        """
+        """Correct Mitsuba's sample: sample, density (solid angle, by the shading cosine) and weight."""
         emitter, index = chosen.emitter, chosen.index
         if self._redrawn.any:
             mask = self._redrawn.at(index, active)

@@ -17,10 +17,7 @@ from .records import Chosen
 
 @dataclass(frozen=True)
 class Context:
-    """Arguments common to all groups of a scene's emitters.
-
-    ``by_shapes``: points are sampled by the shapes, since emitters' `sample_position` cannot be called.
-    """
+    """Arguments of all groups; ``by_shapes``: shapes sample points, as emitters' `sample_position` fails."""
 
     scene: mi.Scene
     facts: ShapeFacts

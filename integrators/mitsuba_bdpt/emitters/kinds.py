@@ -16,10 +16,7 @@ from .records import Chosen, Direct
 
 
 class ThirdPartyEmitters(Group):
-    """Emitters of user-defined classes: only calls that camera subpaths need are used.
-
-    Their density gets the normal of Mitsuba's ``DirectionSample3f``, not the geometric one.
-    """
+    """User-defined classes: only calls of camera subpaths; densities get the sample's normal."""
 
     limits = "its class is not Mitsuba's: only the calls that camera subpaths need are used"
 

@@ -34,10 +34,7 @@ class _Cone:
 
 
 class PositionEmitters(Group):
-    """Emitters at a point: intensity by Mitsuba, density of directions by formulas.
-
-    Emission: y_0 is the position; the direction is uniform in a cone, or a projector's own (solid angle).
-    """
+    """Emitters at a point: y_0 fixed, d uniform in a cone or a projector's own (solid angle)."""
 
     @classmethod
     def tables(cls, emitter) -> int:

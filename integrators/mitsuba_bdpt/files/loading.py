@@ -109,8 +109,8 @@ def in_proportion(scene: Path, definitions: dict) -> dict:
         return definitions
 
     def sizes(definitions: dict) -> list[tuple]:
-        films = _films(parsed(scene, definitions))
-        return [(film.props.get("width"), film.props.get("height")) for film in films]
+        nodes = (n for n in parsed(scene, definitions).nodes if n.type == mi.ObjectType.Film)
+        return [(film.props.get("width"), film.props.get("height")) for film in nodes]
 
     others = {name: value for name, value in definitions.items() if name != "resolution"}
     try:
@@ -188,7 +188,6 @@ def _load(options: Namespace, merges: bool) -> Loaded:
     config.merge_meshes = merges
     state = parsed(options.scene, in_proportion(options.scene, dict(options.defines)), config)
     _check_root(state, options.scene)
-    _check_film_sizes(state)
     for film in _films_of_images(state):
         set_film_size(film.props, options.size, options.crop)
     if len(_meters(state)) > 1:  # equal ones would be merged, and rejected on a second shape
@@ -250,10 +249,6 @@ def _check_root(state: mi.parser.ParserState, scene: Path) -> None:
         )
 
 
-def _films(state: mi.parser.ParserState) -> list:
-    return [node for node in state.nodes if node.type == mi.ObjectType.Film]
-
-
 def _meters(state: mi.parser.ParserState) -> list:
     """Return the nodes of sensors without image: at a point, along a ray, on a shape."""
     sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
@@ -282,14 +277,6 @@ def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
                 f"{given}={written} is for images, and sensor {index} is a meter, whose film keeps its size; "
                 f"leave out --{given}, or choose another sensor by --sensor."
             )
-
-
-def _check_film_sizes(state: mi.parser.ParserState) -> None:
-    """Raise ``CommandError`` for films without pixels; Mitsuba's message misleads."""
-    for node in _films(state):
-        for name in ("width", "height"):
-            if isinstance(size := node.props.get(name, 1), int) and size < 1:
-                raise CommandError(f"{name}={size} of the film must be 1 or more pixels.")
 
 
 def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequence[int] | None) -> None:

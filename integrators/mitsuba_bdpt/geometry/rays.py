@@ -130,10 +130,7 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """Surface (``number``, see `met`) at a shadow ray's end, hit from ``t`` on.
-
-    ``first_hit``: mask, the first hit of the whole ray decides; other rays are tested up to ``t`` only.
-    """
+    """Surface ``number`` (`met`) at a shadow ray's end, hit from ``t``; ``first_hit``: that decides alone."""
 
     number: mi.UInt32
     t: mi.Float

@@ -96,11 +96,7 @@ class SmoothMeshes:
 
 @dataclass
 class _Faces:
-    """The faces of a mesh.
-
-    Unit ``normals`` and first ``corners``, shape (faces, 3); the running ``sums`` of their areas as in
-    Mitsuba, and the total ``area``.
-    """
+    """Faces: unit ``normals``, first ``corners`` (faces, 3), running ``sums`` of areas, total ``area``."""
 
     normals: np.ndarray
     corners: np.ndarray

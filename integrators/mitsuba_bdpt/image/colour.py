@@ -41,11 +41,7 @@ def srgb(value: mi.UnpolarizedSpectrum, wavelengths) -> mi.Color3f:
 
 
 class Rgb:
-    """Linear sRGB, which ``hdrfilm`` stores in every pixel format.
-
-    ``names``: of the colours; ``unit``: approximate colour of a spectrum of 1; ``stokes``: the `Stokes`, or
-    None.
-    """
+    """Linear sRGB, as ``hdrfilm`` stores; ``names`` and ``unit`` of the colours, and `Stokes` or None."""
 
     names = ("R", "G", "B")
     unit = (1.0, 1.0, 1.0)

@@ -67,10 +67,7 @@ class _Map:
 
 
 def _flips(bsdf: mi.BSDF) -> bool:
-    """Return whether ``flip_invalid_normals`` is set, which Mitsuba does not expose.
-
-    Compares the sampled directions of the map with those of a copy that flips, at grazing incidence.
-    """
+    """Return ``flip_invalid_normals``, not exposed: compares sampled directions with a copy that flips."""
     rng = np.random.default_rng(1)
     u, turn = rng.random((3, _COMPARED)), 2 * np.pi * rng.random(_COMPARED)
     z = 0.5 * rng.random(_COMPARED) ** 4 * rng.choice([-1, 1], _COMPARED)

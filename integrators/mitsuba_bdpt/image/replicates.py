@@ -68,10 +68,7 @@ def halves_of(arrays: dict) -> tuple[Spread, ...]:
 
 
 class Replicates:
-    """Independent images of the scene, alternately in one of two `Spread`.
-
-    The halves are independent: one estimates the error, the other the image.
-    """
+    """Independent images, alternately in two `Spread`: one estimates the error, the other the image."""
 
     def __init__(self):
         self.halves: tuple[Spread, Spread] = (Spread(), Spread())

@@ -19,10 +19,7 @@ from ..transport.contribution import Counters, one
 
 
 class Image:
-    """Adds contributions to a film's raw sums (an `Accumulator`).
-
-    Contributions with t >= 2 are summed in ``total``; splats are added at once.
-    """
+    """Adds contributions to an `Accumulator`: t >= 2 summed in ``total``, splats at once."""
 
     def __init__(self, film):
         self._film = film
@@ -116,10 +113,7 @@ class Image:
 
 @dataclass
 class _Total:
-    """Sum of a camera subpath's contributions: the ``whole``, and the intensity in each layer.
-
-    ``layers``: of all partitions, see `Accumulator.indices`.
-    """
+    """Sum of a camera subpath: the ``whole``, and the intensity in the ``layers`` of all partitions."""
 
     whole: mi.Spectrum
     layers: dr.Local

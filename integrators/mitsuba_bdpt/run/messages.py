@@ -69,10 +69,7 @@ def warn_of_unsampled_light(prepared, plan, missing: Missing | None):
 
 
 def warn_of_missing_direct(prepared, plan, settings):
-    """Warn once of light that falls on a meter and that no strategy in use samples.
-
-    Cameras with a lens lack the image of the lamp alone.
-    """
+    """Warn once of light on a meter that no strategy samples; cameras lack the lamp's image alone."""
     if isinstance(prepared.camera.sensor, mi.ProjectiveCamera):
         return
     for paths in unsampled_at_sensor(prepared, plan, settings):

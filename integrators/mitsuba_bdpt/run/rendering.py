@@ -60,10 +60,7 @@ LEAST_OF_MEAN = 1 << 10
 
 @dataclass(frozen=True)
 class PassReport(Report):
-    """Progress after a pass.
-
-    ``snapshot`` and ``image`` are valid until the report of the next pass.
-    """
+    """Progress after a pass; ``snapshot`` and ``image`` are valid until the report of the next one."""
 
     snapshot: Callable[[], Snapshot]
     """Returns the snapshot from which another render can continue."""
@@ -410,10 +407,7 @@ class Render:
         return number(other.accumulator.mean())
 
     def _samples(self) -> int:
-        """Samples per pixel of the whole render, or of a snapshot, as far as is known.
-
-        Under ``timeout`` those that the passes so far predict, rounded, as each number has its own estimate.
-        """
+        """Samples per pixel of the whole render; under ``timeout`` those that the passes so far predict."""
         done, timeout = sum(self.passes), self.settings.timeout
         if not done:
             pixels = int(self.prepared.camera.region.size.prod())

@@ -33,10 +33,7 @@ def _most_samples() -> int:
 
 
 def longest_pass(camera: Sensor, settings: Settings, best: int = 0) -> int:
-    """Return the samples per pixel of a whole pass; the same for renders of any length.
-
-    ``best``: as many if the user does not say, 0 for as many as a launch has.
-    """
+    """Samples per pixel of a whole pass, in renders of any length; ``best``: if the user says none."""
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
     # One row of pixels has to fit into four launches, see `batches`.
@@ -57,10 +54,7 @@ def pass_sizes(spp: int, longest: int, small_first: bool) -> list[int]:
 
 @dataclass(frozen=True)
 class Step:
-    """A pass: ``size`` samples per pixel, after ``done`` of its replicate's ``of``.
-
-    ``replicate``: index of the independent image, 0 without `variance`.
-    """
+    """A pass: ``size`` samples per pixel after ``done`` of ``of`` of its ``replicate`` (0 without one)."""
 
     replicate: int
     done: int

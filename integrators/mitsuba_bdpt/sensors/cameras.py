@@ -117,7 +117,6 @@ class Camera(Sensor):
             ray=mi.Ray3f(z0 + d * near, mi.Vector3f(d), far - near, shared.time, shared.wavelengths),
             p=z0,
             pdf_w=pdf_w,
-            weight=mi.Float(1),
             arrival=mi.Float(0) if self.no_area else cos * view.lens_area() / pdf_w,
         )
 

@@ -30,8 +30,6 @@ class _Parallel(Sensor):
             ray=mi.Ray3f(o, mi.Vector3f(self._axis), reach, shared.time, shared.wavelengths),
             p=mi.Point3f(o),
             pdf_w=self._density,
-            weight=mi.Float(1),
-            arrival=mi.Float(0),
         )
 
     def _connected(self, z0, position, valid) -> CameraConnection:
@@ -42,9 +40,7 @@ class _Parallel(Sensor):
             dist2=mi.Float(1),
             importance=self._density,
             pdf_w=self._density,
-            arrival=mi.Float(0),
             position=position,
-            reach=mi.Float(dr.inf),
             valid=valid,
         )
 
@@ -201,7 +197,6 @@ class IrradianceMeter(Sensor):
             pdf_w=cos * dr.inv_pi,
             arrival=mi.Float(0) if self.no_area else cos / (dist2 * self._density),
             position=self.region.to_position(u_film),
-            reach=mi.Float(dr.inf),
             valid=cos > 0,
         )
 
@@ -242,13 +237,7 @@ class RayOnlySensor(Sensor):
             ray, weight = dr.select(chosen, other, ray), dr.select(chosen, other_weight, weight)
         # The weight of the wavelengths is applied when the sample is added to the film.
         weight = dr.select(shared.weight != 0, weight / shared.weight, 0)
-        return CameraStart(
-            ray=ray,
-            p=mi.Point3f(ray.o),
-            pdf_w=mi.Float(1),
-            weight=weight,
-            arrival=mi.Float(0),
-        )
+        return CameraStart(ray, mi.Point3f(ray.o), mi.Float(1), weight)
 
 
 def _sampled(view, uv, u_lens, shared):

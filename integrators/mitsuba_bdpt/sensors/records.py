@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -25,8 +25,8 @@ class CameraStart:
     ray: mi.Ray3f
     p: mi.Point3f
     pdf_w: mi.Float
-    weight: mi.Float | mi.UnpolarizedSpectrum
-    arrival: mi.Float
+    weight: mi.Float | mi.UnpolarizedSpectrum = field(default_factory=lambda: mi.Float(1))
+    arrival: mi.Float = field(default_factory=lambda: mi.Float(0))
     position: mi.Point2f | None = None
     counted: mi.Point2f | None = None
 
@@ -49,10 +49,10 @@ class CameraConnection:
     dist2: mi.Float
     importance: mi.Float
     pdf_w: mi.Float
-    arrival: mi.Float
     position: mi.Point2f
-    reach: mi.Float
     valid: mi.Bool
+    reach: mi.Float = field(default_factory=lambda: mi.Float(dr.inf))
+    arrival: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
 @dataclass
