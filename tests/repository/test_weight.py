@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 36126}
+OUTSIDE = {"scripts": 2929, "tests": 36125}
 MOST_WORDS = 29028
 
 
