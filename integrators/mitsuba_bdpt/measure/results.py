@@ -339,7 +339,7 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
     measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     notes = folder / "notes.toml"
     given = read_toml(notes) if notes.exists() else {}
-    aside = list_of(notes, "aside", given.pop("aside", []), str, "texts in quotes")
+    aside = list_of(notes, "aside", given.pop("aside"), str, "texts in quotes") if "aside" in given else []
     found = analysis.Results(table, means, measured, aside)
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
