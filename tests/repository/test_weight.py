@@ -25,7 +25,7 @@ MOST = {
     "": 1413,  # top files
 }
 OUTSIDE = {"scripts": 2929, "tests": 36125}
-MOST_WORDS = 29028
+MOST_WORDS = 29027
 
 
 def _lines(files):
