@@ -80,7 +80,7 @@ class HitTables:
         places = targets | {index: first_of[name] for index, name in zip(rows, names, strict=False)}
         sides = {registry_id(s): -1.0 if s.has_flipped_normals() else 1.0 for s in spheres}
         indices = range(max(*places, *rows) + 1)
-        frames = np.array([about("frame", partial(_frame_of, shape), shape) for shape in placed])
+        frames = np.array([about("frame", partial(_frame, shape), shape) for shape in placed])
         made = HitTables(
             first=mi.UInt32([places.get(index, 0) for index in indices]),
             row=mi.UInt32([rows.get(index, 0) for index in indices]),
@@ -131,8 +131,8 @@ class Hits:
             if tables.instances:
                 own = dr.gather(mi.UInt32, tables.targets, number, inside)
                 shape = dr.select(inside, dr.reinterpret_array(mi.ShapePtr, own), shape)
-            questions = [partial(_ask, shape) for shape in self._targets]
-            si = dr.switch(number, questions, pi, local, active & ~on_sphere, label="Shape")
+            calls = [partial(_call, shape) for shape in self._targets]
+            si = dr.switch(number, calls, pi, local, active & ~on_sphere, label="Shape")
         if tables.instances:
             si = _placed(si, inside, to_world)
         if tables.spheres:
@@ -142,7 +142,7 @@ class Hits:
         return _finished(si, pi, ray, active)
 
 
-def _ask(shape: mi.Shape, pi, ray, active) -> mi.SurfaceInteraction3f:
+def _call(shape: mi.Shape, pi, ray, active) -> mi.SurfaceInteraction3f:
     return shape.compute_surface_interaction(ray, pi, renamed.hit_flags(), active)
 
 
@@ -197,7 +197,7 @@ def _group_of(instance: mi.Shape) -> str | None:
     return found[1] if found else None
 
 
-def _frame_of(shape: mi.Shape) -> np.ndarray:
+def _frame(shape: mi.Shape) -> np.ndarray:
     return np.array([matrix_of(shape)[:3], inverse_of(shape)[:3]])
 
 

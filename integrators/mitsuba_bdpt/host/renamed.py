@@ -27,8 +27,7 @@ Parameters = Mapping[str, Any]
 
 def is_transform(value: Any) -> bool:
     """Whether ``value`` is an ``AnimatedTransform4f``, the ``to_world`` of 3.10."""
-    kind = getattr(mi, "AnimatedTransform4f", None)
-    return kind is not None and isinstance(value, kind)
+    return isinstance(value, getattr(mi, "AnimatedTransform4f", ()))
 
 
 def may_be_animated() -> bool:
