@@ -12,11 +12,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_version_has_one_home():
-    """Expected: CITATION.cff and the newest release in CHANGELOG.md name the package's version, and the same
-    day. What is to come, under "Unreleased", has neither."""
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     changes = (ROOT / "CHANGELOG.md").read_text()
-    newest = re.search(r"^## (?!Unreleased$)(\S+)\n\n(\d{4}-\d\d-\d\d)\. ", changes, re.MULTILINE)
+    newest = re.search(r"^## (\S+) \((\d{4}-\d\d-\d\d)\)$", changes, re.MULTILINE)
     assert citation["version"] == newest[1] == mitsuba_bdpt.__version__
     assert str(citation["date-released"]) == newest[2]
 

@@ -58,7 +58,7 @@ def test_the_notebook_runs(tmp_path):
 
 
 @pytest.mark.parametrize("installed", [False, True])
-@pytest.mark.parametrize("wheels", [["mitsuba_bdpt-0.3.0-py3-none-any.whl", "other-1-py3-none-any.whl"], []])
+@pytest.mark.parametrize("wheels", [["mitsuba_bdpt-1.0.0-py3-none-any.whl", "other-1-py3-none-any.whl"], []])
 def test_the_first_cell_installs_the_package(tmp_path, monkeypatch, wheels, installed):
     """Rationale: Colab opens the notebook where the package is not installed. Expected: pip installs the
     wheel beside the notebook, without one the repository of pyproject.toml; nothing where it is installed.

@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 36125}
-MOST_WORDS = 29027
+OUTSIDE = {"scripts": 2929, "tests": 36123}
+MOST_WORDS = 29023
 
 
 def _lines(files):
