@@ -20,7 +20,7 @@ MOST = {
     "files": 890,
     "run": 1134,
     "scene sampling": 777,
-    "host": 834,
+    "host": 828,
     "sensors": 883,
     "": 1413,  # top files
 }

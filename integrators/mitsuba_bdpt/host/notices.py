@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import zlib
-from collections import OrderedDict
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from functools import cache
@@ -17,13 +16,10 @@ import numpy as np
 
 from .introspection import all_parameters, own_parameters
 
-# Maximum number of scenes; the oldest are dropped.
-REMEMBERED = 64
-
 # Maximum number of cached results of one kind per scene; the oldest are dropped.
 FINDINGS = 16
 
-_scenes: OrderedDict[int, tuple] = OrderedDict()
+_scenes: dict[int, tuple] = {}
 
 Found = TypeVar("Found")
 
@@ -38,12 +34,10 @@ def notes(scene: mi.Scene, sensor: mi.Sensor) -> dict[str, Any]:
     for number in [n for n, held in _scenes.items() if _references(held) <= _alone()]:
         del _scenes[number]  # its scene is gone
     mark = next(iter(scene.sensors()), sensor).film().rfilter()
-    known, found = _scenes.pop(id(scene), (None, None))
+    known, found = _scenes.get(id(scene), (None, {}))
     if known is not mark:
         found = {}
-    _scenes[id(scene)] = mark, found
-    while len(_scenes) > REMEMBERED:
-        _scenes.popitem(last=False)
+        _scenes[id(scene)] = mark, found
     return found
 
 
