@@ -320,7 +320,7 @@ def test_recipes_say_what_makes_a_reference(here):
         ("window = 1", "window=1: there is no such key; did you mean windows"),
         ('by = "merging"\nmerging_radius = 0', "merging_radius=0: .* greater than 0"),
         ("merging_radius = 0.5", "merging_radius=0.5 needs by = 'merging'"),
-        ("radiance = { limit = true }", "radiance.limit=True: .* number; radiance.lacks=.*required"),
+        ("radiance = { limit = true }", "radiance.limit=True: .* number; radiance.lacks is missing"),
     ):
         recipe.write_text(f"[room]\n{wrong}\n")
         with pytest.raises(CommandError, match=message):

@@ -6,7 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, StrictInt, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    ValidationError,
+)
 from pydantic import model_validator as validator
 
 from ..errors import CommandError, did_you_mean
@@ -18,6 +26,9 @@ Whole = Annotated[int, Field(strict=True, ge=1)]
 Text = Annotated[str, Field(min_length=1)]
 Names = Annotated[tuple[Text, ...], Field(min_length=1)]
 Numbers = Annotated[tuple[Whole, ...], Field(min_length=1)]
+Seeds = Annotated[
+    Numbers, BeforeValidator(lambda given: given if isinstance(given, list | tuple) else [given])
+]
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 
 
@@ -35,8 +46,13 @@ def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> Model
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        texts = "; ".join(_text(kind, found) for found in error.errors(include_url=False))
-        raise CommandError(f"{where}: {texts}") from error
+        errors = [_text(kind, found) for found in error.errors(include_url=False) if not _follows(found)]
+        raise CommandError(f"{where}: {'; '.join(errors)}") from error
+
+
+def _follows(found: Mapping[str, Any]) -> bool:
+    """Whether a list is too short only for what is wrong with its entries."""
+    return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
 
 
 def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
@@ -46,7 +62,16 @@ def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
         tables = schema, *schema.get("$defs", {}).values()
         known = sorted({name for table in tables for name in table.get("properties", ())})
         text = f"there is no such key; {did_you_mean(str(found['loc'][-1]), known)}".rstrip("; ")
-    return f"{key}={value!r}: {text}" if key else text.removeprefix("Value error, ")
+    if found["type"] == "missing":
+        return f"{key} is missing"
+    text = text.removeprefix("Value error, ")
+    return f"{key}={value!r}: {text}" if key else text
+
+
+def _of_plugin(value: Any) -> Any:
+    if not isinstance(value, bool | int | float | str):
+        raise ValueError("must be a number, a text, true or false")
+    return value
 
 
 class Method(Model):
@@ -58,7 +83,7 @@ class Method(Model):
     """
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, StrictBool | StrictInt | StrictFloat | str]
+    __pydantic_extra__: dict[str, Annotated[Any, AfterValidator(_of_plugin)]]
 
     type: Text
     name: Text = Field(default_factory=lambda data: data.get("type", ""))
@@ -88,7 +113,7 @@ class SceneKeys(Model):
 
     max_depth: Whole | None = None
     spp: Numbers | None = None
-    seeds: Whole | Numbers | None = None
+    seeds: Seeds | None = None
 
 
 class More(Model):
@@ -125,7 +150,7 @@ class PresetFile(Model):
     clock: Literal["wall", "processor"] = "wall"
     first_image: Annotated[int, Field(strict=True, ge=0)] = 0
     spp: Numbers = (4, 16, 64)
-    seeds: Whole | Numbers = FEWEST_RUNS
+    seeds: Seeds = (FEWEST_RUNS,)
     scene: dict[str, SceneKeys] = {}
     integrator: Annotated[tuple[Method, ...], Field(min_length=1)] = (
         Method(type="bdpt"),
@@ -143,7 +168,7 @@ class PresetFile(Model):
         """Return samples per pixel and seeds of each budget of a scene."""
         own = self.scene.get(scene, SceneKeys())
         spp, seeds = own.spp or self.spp, own.seeds or self.seeds
-        return spp, seeds if isinstance(seeds, tuple) else (seeds,) * len(spp)
+        return spp, seeds if len(seeds) > 1 else seeds * len(spp)
 
     @validator(mode="after")
     def _check(self) -> PresetFile:
