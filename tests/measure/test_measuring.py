@@ -372,11 +372,6 @@ def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
     assert capsys.readouterr().err == "interrupted; what was finished is kept, and the same command goes on\n"
 
 
-def test_the_frame_of_the_page_is_in_the_package():
-    frame = importlib.resources.files("mitsuba_bdpt.measure").joinpath("page.html")
-    assert "@DATA@" in frame.read_text()
-
-
 def test_a_default_that_nothing_uses_is_no_parameter(here):
     file = here / "elsewhere" / "room.xml"
     declared = '<default name="resolution" value="64"/>'
