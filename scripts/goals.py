@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 
 import numpy as np
+import repository
 from mitsuba_bdpt.measure.analysis import (
     ALONE,
     IMPOSSIBLE,
@@ -164,16 +166,29 @@ def pilot(results: Results, scene: str) -> Measured:
     return Measured(text, [shares[max(shares)]])
 
 
+PROBES = repository.ROOT / "docs" / "reports" / "benchmark" / "probes.json"
+
+
+def probed(results: Results, name: str) -> dict[str, list[float]]:
+    """Return the results of a probe for the software of the rows."""
+    probe, row = json.loads(PROBES.read_text()).get(name), results.rows.iloc[0]
+    if probe is None:
+        raise Unavailable("not measured")
+    if probe["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
+        raise Unavailable("measured of another version or on another machine")
+    return probe["values"]
+
+
 def floor(results: Results) -> Measured:
     """Kernel time over that of its rays alone."""
-    found = {name: summary(v) for name, v in results.probed("floor").items()}
+    found = {name: summary(v) for name, v in probed(results, "floor").items()}
     text = ", ".join(f"{one} `{name}`" for name, one in found.items())
     return Measured(text, [one.median for one in found.values()])
 
 
 def coldstart(results: Results) -> Measured:
     """Seconds of a process to the first image, also over `path`'s."""
-    values = results.probed("coldstart")
+    values = probed(results, "coldstart")
     ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
     seconds = float(np.median(values["bdpt"]))
     return Measured(f"{seconds:.2f} s, {ratios} `path`'s", [seconds, ratios.median])
@@ -181,7 +196,7 @@ def coldstart(results: Results) -> Measured:
 
 def memory(results: Results) -> Measured:
     """Peak memory of a process in GiB."""
-    found = {name: float(np.median(v)) for name, v in results.probed("memory").items()}
+    found = {name: float(np.median(v)) for name, v in probed(results, "memory").items()}
     return Measured(", ".join(f"{v:.2f} GiB for {name}" for name, v in found.items()), [*found.values()])
 
 

@@ -63,10 +63,8 @@ def runs(method, count, **values):
     return [row(method, seed, **values) for seed in range(1, count + 1)]
 
 
-def results_of(rows, references=None, probes=None, **more):
-    return Results(
-        pd.DataFrame(rows), {"box": KNOWN} if references is None else references, probes or {}, **more
-    )
+def results_of(rows, references=None, **more):
+    return Results(pd.DataFrame(rows), {"box": KNOWN} if references is None else references, **more)
 
 
 def noisy(method, count, factor=1.0, **values):
@@ -177,11 +175,7 @@ def results():
     rows += noisy("bdpt merging", 16, rel_mse=0.002)
     dark = [r | {"scene": "dark", "tile_means": list(0.9 * np.array(r["tile_means"]))} for r in rows]
     dark = [r | {"tile_means": list(TRUE)} if r["method"].startswith("bdpt") else r for r in dark]
-    values = {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}
-    kept = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
-    probes = {"coldstart": {"versions": kept, "values": values}}
-    probes["floor"] = {"versions": kept, "values": {"box": [1.4, 1.2, 1.3]}}
-    return results_of(rows + dark, {"box": KNOWN, "dark": KNOWN}, probes, aside=ASIDE)
+    return results_of(rows + dark, {"box": KNOWN, "dark": KNOWN}, aside=ASIDE)
 
 
 ASIDE = "bdpt skip=none", "ptracer", "bdpt skip=impossible", "bdpt guiding=photons", "bdpt merging"
@@ -273,9 +267,14 @@ def test_tables_say_what_the_rows_say(results):
     assert checks[4].startswith("≥ 1x (1–1); 50 % of the energy is missing")
 
 
-def test_goals_stand_beside_what_is_measured(results):
+def test_goals_stand_beside_what_is_measured(results, monkeypatch, tmp_path):
     """A row per goal: its bound, its aim, the figure, and whether all numbers meet the bound, of several each
     its own; without a number, no verdict. Every goal of the project gives a text for any data."""
+    versions = {"mitsuba": "3.9.1", "source": "s", "machine": "a machine"}
+    values = {"coldstart": {"path": [2.0, 2.0], "bdpt": [4.0, 4.0]}, "floor": {"box": [1.4, 1.2, 1.3]}}
+    probes = {name: {"versions": versions, "values": found} for name, found in values.items()}
+    (tmp_path / "probes.json").write_text(json.dumps(probes))
+    monkeypatch.setattr(goals, "PROBES", tmp_path / "probes.json")
     near = "0.800x, interval 0.800–0.800, 16 pairs"
     dark = goals.Goal("dark", (1,), goals.over_path, ("dark",)).row(results)[3]
     assert dark.startswith("≥ 0.8x (0.8–0.8); `path`: ") and "% of the energy is missing" in dark
@@ -353,7 +352,7 @@ def test_integrators_are_in_the_order_of_the_preset():
     """In the table of errors of a scene with media the order of its rows, those of the preset."""
     plain = [row for name in ("bdpt", "path", "merging", "all") for row in runs(name, 3)]
     fog = [row | {"scene": "fog"} for name in ("bdpt", "volpath", "all") for row in runs(name, 3)]
-    found = results_of(plain + fog, {"box": KNOWN, "fog": KNOWN}, {})
+    found = results_of(plain + fog, {"box": KNOWN, "fog": KNOWN})
     assert found.methods == ["bdpt", "path", "merging", "volpath", "all"]
     text = report.errors_table(found)
     assert [cells(text, "`fog`", i)[0] for i in range(3)] == ["bdpt", "volpath", "all"]
@@ -427,7 +426,7 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     checks = report.checks_table(found, MADE, {})
     assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
     with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
-        results_of(rows, {}, {}).surplus("box", "bdpt")
+        results_of(rows, {}).surplus("box", "bdpt")
     with pytest.raises(Unavailable, match="fewer than two renders"):
         results_of(rows[:1]).surplus("box", "bdpt")
 
@@ -511,7 +510,6 @@ def test_a_report_is_written(results, tmp_path):
     reference.write(file, kept)
     table = results.rows[results.rows["scene"] == "box"].assign(reference_sha256=digest(file))
     table.to_parquet(tmp_path / "rows.parquet")
-    (tmp_path / "probes.json").write_text(json.dumps(results.probes))
     (tmp_path / "notes.toml").write_text('box = "why"\n')
     readme = tmp_path / "TOP.md"
     readme.write_text(

@@ -50,7 +50,7 @@ def rows_of(images, reference, method="bdpt"):
 
 
 def results_of(reference, *rows):
-    return Results(pd.concat(rows, ignore_index=True), {"box": reference.means}, {})
+    return Results(pd.concat(rows, ignore_index=True), {"box": reference.means})
 
 
 def known(deviation, reference):

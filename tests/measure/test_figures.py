@@ -53,7 +53,7 @@ def results(scenes=("a_caustic_with_a_long_name", "b")):
                 }
                 | {f"rays_{kind}": 64 * budget for kind in figures.RAYS}
             )
-    return Results(pd.DataFrame(rows), dict.fromkeys(scenes, KNOWN), {})
+    return Results(pd.DataFrame(rows), dict.fromkeys(scenes, KNOWN))
 
 
 def drawn(monkeypatch, plot, columns, scenes=("a_caustic_with_a_long_name", "b")):
@@ -108,7 +108,7 @@ def test_crops_are_of_the_sweep(tmp_path):
     scene without any is an error."""
     rows = results(("b",)).rows
     rows = rows.assign(reference_rel_mse_trimmed=0.004, key=rows["method"] + rows["seed"].astype(str))
-    found = Results(rows, {"b": KNOWN}, {}, compared=64)
+    found = Results(rows, {"b": KNOWN}, compared=64)
     kept = Namespace(image=np.ones((8, 8, 3)))
 
     def mean(method):

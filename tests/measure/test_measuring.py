@@ -444,7 +444,6 @@ def test_damaged_files_are_named_with_what_to_do(here, capsys):
             ["equal-time", *reference_words[1:-2]],
             "room_16_4.exr' is .*anew, by mitsuba-bdpt reference",
         ),
-        (here / "out" / "probes.json", 0, report_words, "probes.json' is damaged .*; delete it"),
         (
             here / "out" / "rows.parquet",
             2,

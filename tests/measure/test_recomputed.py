@@ -82,7 +82,7 @@ def test_efficiencies_follow_from_the_table_of_renders(tmp_path, own):
     the marks of the table of errors; with a reference noisier than the renders too."""
     rows, means = rendered(own)
     write_tables(rows, tmp_path)
-    found = Results(rows, {"box": means}, {})
+    found = Results(rows, {"box": means})
     renders = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
     marked = {name: found.error("box", name, "rel_mse").bound == "≥" for name in found.methods}
     assert own > 0.1 or [name for name in marked if marked[name]] == ["dark"]
@@ -111,7 +111,7 @@ def test_errors_and_intervals_follow_from_the_table_of_renders(tmp_path):
     without = np.log((variance.sum() * (n - 1) / n - variance) / (n - 2))
     error = math.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2))
     factor = math.exp(stats.t.ppf(0.975, n - 1) * error)
-    found = Results(rows, {"box": means}, {}).error("box", "path", "rel_mse")
+    found = Results(rows, {"box": means}).error("box", "path", "rel_mse")
     expected = estimates.Estimate(variance.mean(), variance.mean() / factor, variance.mean() * factor)
     for end in ("value", "low", "high"):
         assert getattr(found.total, end) == pytest.approx(getattr(expected, end))
@@ -123,7 +123,7 @@ def test_points_of_figures_are_the_errors_of_the_table(error):
     """Of each integrator the cell of the table of errors, with its interval and bound: value and ends; no
     ends of two renders."""
     rows, means = rendered(0.01)
-    found = Results(rows, {"box": means}, {})
+    found = Results(rows, {"box": means})
     column = {"rel_mse_trimmed": 6, "rel_mse": 7}[error]
     for line in report.errors_table(found).splitlines()[2:]:
         cells = [cell.strip() for cell in line.split("|")]
@@ -145,7 +145,7 @@ def test_energies_follow_from_the_table_and_the_header_of_the_reference(tmp_path
     kept = json.loads(mi.Bitmap(str(tmp_path / "box.exr")).metadata()["provenance"])["means"]["whole"]
     shown = np.array(dict(mi.Bitmap(str(tmp_path / "box.exr")).split())["<root>"])
     np.testing.assert_array_equal(shown, image)
-    (r,), (e,), found = kept["mean"], kept["error"], Results(rows, {"box": means}, {})
+    (r,), (e,), found = kept["mean"], kept["error"], Results(rows, {"box": means})
     for name in ("bdpt", "path", "few"):
         here = [float(row["mean"]) for row in renders if row["integrator"] == name]
         x, n = np.mean(here), len(here)
@@ -161,7 +161,7 @@ def test_pages_have_the_errors_of_the_table():
     """In its table of renders the errors of the report, with their bounds."""
     rows, means = rendered(0.1)
     others = dict.fromkeys(("mape", "flip", "delta_e_itp"))
-    found = Results(rows.assign(**others), {"box": means}, {})
+    found = Results(rows.assign(**others), {"box": means})
     for line in page.lines(found):
         cells = dict(zip(page.COLUMNS, line, strict=True))
         for head, kind in (("relMSE, trimmed", "rel_mse_trimmed"), ("relMSE, raw", "rel_mse")):

@@ -837,7 +837,7 @@ def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
     seconds = {row["method"]: row["seconds_first_image"] for row in found}
     assert seconds == {"ours": 3.0, "path": 1.5} and len(asked) == 6
     assert {(one["spp"], one["resolution"], one["max_depth"]) for one in asked} == {(2, 8, 3)}
-    text = report.first_images_table(analysis.Results(pd.DataFrame(found), {}, {}))
+    text = report.first_images_table(analysis.Results(pd.DataFrame(found), {}))
     assert [cell.strip() for cell in text.splitlines()[-2].split("|")[2:4]] == ["3 s", "1.5 s, 2x"]
     text = PRESET.replace("seeds = 2", 'seeds = 2\nfirst_image = 3\nclock = "processor"')
     assert swept(preset_file(folder, text), "-o", folder / "out") == 0

@@ -139,7 +139,7 @@ def cost(ours: pd.DataFrame, theirs: pd.DataFrame) -> Summary:
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """Rows of a sweep, tile means of its references by scene, and results of probes.
+    """Rows of a sweep, and tile means of its references by scene.
 
     ``aside``: integrators of which efficiencies are not compared; ``compared``: the budget of comparisons.
     Figures that tables share are cached, for the length of a command.
@@ -147,7 +147,6 @@ class Results:
 
     rows: pd.DataFrame
     references: dict[str, Means]
-    probes: dict[str, Any]
     aside: Sequence[str] = ()
     compared: int | None = None
 
@@ -269,15 +268,6 @@ class Results:
         if enough.empty:
             raise Unavailable(f"fewer than {FEWEST_RUNS} renders of one budget")
         return compare_means(means_of(self.of(scene, method, enough.idxmax())), self.references[scene])
-
-    def probed(self, name: str) -> dict[str, list[float]]:
-        """Return a probe's results for the software of the rows."""
-        probe, row = self.probes.get(name), self.rows.iloc[0]
-        if probe is None:
-            raise Unavailable("not measured")
-        if probe["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
-            raise Unavailable("measured of another version or on another machine")
-        return probe["values"]
 
     @cache  # noqa: B019
     def lacks(self, scene: str, method: str) -> str:

@@ -1,6 +1,6 @@
 """Tables and plots of a sweep.
 
-Reads rows.parquet and probes.json in a folder; writes plots and README.md with all tables beside them, by the
+Reads rows.parquet in a folder; writes plots and README.md with all tables beside them, by the
 template report.md.jinja. Explanations are read from notes.toml, if present. Parts of another Markdown file
 between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``efficiency``,
 ``errors``, ``first images`` or ``gallery`` (of images in ../images/gallery).

@@ -335,12 +335,10 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
                 f"{project.sweep_command(folder)}, which takes them anew"
             )
     means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
-    file = folder / "probes.json"
-    measured = read_json(file, "delete it, and sweep again to measure it anew") if file.exists() else {}
     notes = folder / "notes.toml"
     given = read_toml(notes) if notes.exists() else {}
     aside = list_of(notes, "aside", given.pop("aside"), str, "texts in quotes") if "aside" in given else []
-    found = analysis.Results(table, means, measured, aside)
+    found = analysis.Results(table, means, aside)
     if unknown := [name for name in aside if name not in found.methods]:
         raise CommandError(
             f"{notes}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"

@@ -433,7 +433,7 @@ class Sweep:
         try:
             ours, *others = (cell.method for cell in cells.of(more.spp, FIRST_SEED, more.integrators))
             rows = decisive(read_rows(self.output, cells, found)).assign(first=ours)
-            results = analysis.Results(rows, {}, {})
+            results = analysis.Results(rows, {})
             ratios = [results.efficiency(cells.subject.name, name) for name in others]
         except ValueError as error:
             self.failed.append(f"further seeds in {cells.subject.name}: {error}")
