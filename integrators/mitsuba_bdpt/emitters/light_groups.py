@@ -137,7 +137,8 @@ class LightGroups:
 
     def __init__(self, emitters: list[mi.Emitter], text: str):
         groups, made = parsed(text), _layer_names(emitters)
-        chosen, self.warnings = _matched(text, groups, emitters, made) if groups else (_own(made), [])
+        first = sorted(enumerate(made), key=lambda item: by_numbers(item[1]))[:MOST_OWN]  # of ``auto``
+        chosen, self.warnings = _matched(text, groups, emitters, made) if groups else (dict(first), [])
         names = list(groups) if groups else list(dict.fromkeys(chosen.values()))
         self.names = tuple(names + [REST] * (len(chosen) < len(emitters)))
         self.of_emitters = tuple(self.names.index(chosen.get(i, REST)) for i in range(len(emitters)))
@@ -207,12 +208,6 @@ def _matched(
         f"have such an emitter, correct the pattern. {there}"
         for name, pattern in unmatched
     ]
-
-
-def _own(names: Sequence[str]) -> dict[int, str]:
-    """Return the ``names`` of the first `MOST_OWN` emitters by name, by index."""
-    named = sorted(enumerate(names), key=lambda item: by_numbers(item[1]))
-    return dict(named[:MOST_OWN])
 
 
 def by_numbers(name: str) -> list[int | str]:

@@ -170,7 +170,9 @@ class _Projector:
         self._from_uv = [dr.opaque(mi.Float, float(x)) for x in np.linalg.inv(to_uv).ravel()]
         self._area = dr.opaque(mi.Float, abs(np.linalg.det(np.linalg.inv(to_uv))))
         texture = children(emitter)["irradiance"]
-        self._texture = texture if texture.is_spatially_varying() and _is_as_it_was(texture) else None
+        to_uv = own_parameters(texture).get("to_uv")
+        as_it_was = to_uv is None or np.allclose(np.array(to_uv.matrix).reshape(3, 3), np.eye(3), atol=1e-7)
+        self._texture = texture if texture.is_spatially_varying() and as_it_was else None
 
     def sample(self, u, active):
         """Sample a direction (world) and its density (solid angle)."""
@@ -196,9 +198,3 @@ class _Projector:
 
     def _to_solid_angle(self, pdf, cos):
         return pdf / (self._area * cos * cos * cos)
-
-
-def _is_as_it_was(texture) -> bool:
-    """Whether a texture has no ``to_uv`` that changes it."""
-    to_uv = own_parameters(texture).get("to_uv")
-    return to_uv is None or np.allclose(np.array(to_uv.matrix).reshape(3, 3), np.eye(3), atol=1e-7)
