@@ -12,7 +12,7 @@ MOST = {
     "measure": 6309,
     "transport merging guided_emission": 5706,
     "planning": 1731,
-    "emitters": 2240,
+    "emitters": 2231,
     "cli": 1695,
     "media": 1349,
     "geometry": 1475,
