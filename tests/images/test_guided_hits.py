@@ -49,14 +49,16 @@ def bdpt(**parameters):
 def photons(count, spread, seed=1):
     """``count`` photons on a unit square, whose directions differ by about ``spread`` from (0, 0, 1)."""
     rng = np.random.default_rng(seed)
-    p = np.zeros((3, count))
-    p[:2] = rng.random((2, count))
+    p = np.concatenate([rng.random((2, count)), np.zeros((1, count))])
     d = np.concatenate([spread * rng.standard_normal((2, count)), np.ones((1, count))])
-    d /= np.linalg.norm(d, axis=0)
     found = Photon.zeros(count)
-    found.p, found.d, found.distance = mi.Point3f(*p), mi.Vector3f(*d), mi.Float(np.full(count, 2.0))
-    found.lane = dr.arange(mi.UInt32, count)
+    found.p, found.d = mi.Point3f(*p), mi.Vector3f(*(d / np.linalg.norm(d, axis=0)))
+    found.distance, found.lane = mi.Float(np.full(count, 2.0)), dr.arange(mi.UInt32, count)
     return found
+
+
+def density_at(guide, at, w):
+    return np.array(photon_guide.density(guide, at, photon_guide.find(guide, at), w))
 
 
 @pytest.mark.parametrize("count", [1, 3, 50, 5000])
@@ -68,22 +70,18 @@ def test_directions_follow_the_density(count):
     p = mi.Point3f(0.4, 0.6, 0.2)  # not nearer to any than 0.2, over a length of 2: lobes are wide
     rng, n = mi.PCG32(size=1 << 20), 1 << 20
     at = dr.zeros(mi.Point3f, n) + p
-    found = photon_guide.find(guide, at)
-    d, active = photon_guide.draw(
-        guide, at, found, rng.next_float32(), mi.Point2f(*(rng.next_float32() for _ in "xy"))
-    )
-    drawn, active = np.array(d)[2], np.array(active)
+    u, v, w = (rng.next_float32() for _ in "uvw")
+    d, active = photon_guide.draw(guide, at, photon_guide.find(guide, at), u, mi.Point2f(v, w))
 
     z, phi = np.meshgrid(np.linspace(-1, 1, 2001)[:-1] + 5e-4, (np.arange(720) + 0.5) * math.pi / 360)
     sin = np.sqrt(1 - z**2)
     w = mi.Vector3f(*(x.ravel() for x in (sin * np.cos(phi), sin * np.sin(phi), z)))
     at = dr.zeros(mi.Point3f, dr.width(w)) + p
-    density = np.array(photon_guide.density(guide, at, photon_guide.find(guide, at), w))
-    cell = 4 * math.pi / density.size
+    density = density_at(guide, at, w)
     for power in (0, 1, 2, 4):
-        values = np.where(active, drawn**power, 0)
-        error = values.std() / math.sqrt(n)
-        assert abs(values.mean() - (density * z.ravel() ** power).sum() * cell) < 4 * error + 2e-3
+        values = np.where(active, np.array(d)[2] ** power, 0)
+        expected = (density * z.ravel() ** power).mean() * 4 * math.pi
+        assert abs(values.mean() - expected) < 4 * values.std() / math.sqrt(n) + 2e-3
 
 
 def test_the_guide_is_the_same_in_any_order():
@@ -93,11 +91,16 @@ def test_the_guide_is_the_same_in_any_order():
     order = mi.UInt32(np.random.default_rng(2).permutation(1000).astype(np.uint32))
     at = mi.Point3f(0.5, 0.5, dr.linspace(mi.Float, 0, 1, 64))
     w = dr.normalize(mi.Vector3f(dr.linspace(mi.Float, -1, 1, 64), 0.1, 1))
-    a, b = (
-        np.array(photon_guide.density(guide, at, photon_guide.find(guide, at), w))
-        for guide in (Guide.of(found, 1000), Guide.of(found.at(order), 1000))
-    )
+    a, b = (density_at(Guide.of(x, 1000), at, w) for x in (found, found.at(order)))
     np.testing.assert_array_equal(a, b)
+
+
+def test_the_guide_finds_a_weak_caustic_beside_a_strong_one():
+    """Of one photon in 50; windows alone have the density of a diffuse BSDF at one of ten points."""
+    found = photons(5000, 0.02)
+    found.d = dr.normalize(found.d + mi.Vector3f(dr.select(found.lane % 50 == 0, 1, 0), 0, 0))
+    at, w = mi.Point3f(*np.random.default_rng(3).random((2, 200)), 0), dr.normalize(mi.Vector3f(1, 0, 1))
+    assert (density_at(Guide.of(found, 5000), at, w) > 1 / math.pi).mean() > 0.9
 
 
 # -- unbiased -------------------------------------------------------------------------------------------
@@ -134,17 +137,17 @@ def test_without_photons():
 # -- when ------------------------------------------------------------------------------------------------
 
 
-def caustic():
-    """A small lamp over the plate, and a film that is large enough for a pilot."""
-    scene = under_glass(ball(0.02))
+def large(lamp):
+    """The plate under a ``lamp``, and a film that is large enough for a pilot."""
+    scene = under_glass(lamp)
     scene["sensor"]["film"] |= {"width": 64, "height": 64}
-    return mi.load_dict(scene)
+    return scene
 
 
 def test_the_pilot_guides_where_it_pays(monkeypatch):
     """In the caustic of a small lamp, and it is said; the decision done again is the same image; ``always``
     guides whatever it costs, and nothing says the contrary."""
-    scene = caustic()
+    scene = mi.load_dict(large(ball(0.02)))
     method = bdpt()
     image = np.array(mi.render(scene, integrator=method, spp=16))
     found = method.statistics
@@ -241,11 +244,10 @@ def test_pilots_of_any_seed_decide_alike(name, monkeypatch):
         scene = mi.load_dict(ball_in_the_sun())
     else:
         scene = mi.load_file(str(SCENES / f"{name}.xml"), resolution=64)
-    settings = bdpt(max_depth=12).settings
     for spp in (16, 64):
         for seed in range(5):
             monkeypatch.setattr(Planner, "pilot_seed", seed)
-            render = Render(scene, scene.sensors()[0], settings, 0, spp)
+            render = Render(scene, scene.sensors()[0], bdpt(max_depth=12).settings, 0, spp)
             assert bool(render.planner.run_pilot()[0].candidate.guided) == (name != "sun")
 
 
@@ -253,8 +255,7 @@ def test_pilots_of_any_seed_decide_alike(name, monkeypatch):
 def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
     """Where photons cost more than they gain the ball is rendered without them, and the point lamp, which
     nothing else finds, with them."""
-    described = under_glass(light())
-    described["sensor"]["film"] |= {"width": 64, "height": 64}
+    described = large(light())
     method = bdpt(merging=True)
     for cost, used in ((choice.COSTS["guided"], True), (1e9, needed)):
         monkeypatch.setitem(choice.COSTS, "guided", cost)
@@ -269,8 +270,7 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
 def test_light_that_is_hit_too_rarely_is_merged():
     """A pilot dropped hits that a render rarely has, found no gain, and left out ``merging=true``: the image
     was black. A tiny lamp is merged, and guided where the user excludes merging."""
-    described = under_glass(ball(0.001))
-    described["sensor"]["film"] |= {"width": 64, "height": 64}
+    described = large(ball(0.001))
     method = bdpt(merging=True)
     image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))
     assert image.any() and method.statistics["merging"]["merges"]

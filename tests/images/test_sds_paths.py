@@ -128,7 +128,7 @@ def test_light_subpaths_with_two_diffuse_vertices(monkeypatch):
     def draw(guide, p, found, u1, u2):
         return mi.warp.square_to_uniform_sphere(u2), p.x > -0.5
 
-    def density(guide, p, found, d):
+    def density(guide, p, found, d, lobes=None):
         return dr.select(p.x > -0.5, dr.inv_four_pi, 0)
 
     scene = lit_by_a_wall()

@@ -98,7 +98,7 @@ class Passes:
 def photons_of_pass(samples: int, pixels: float, radius: float) -> int:
     """Number of photon subpaths of a pass; ``samples`` of the whole film, ``radius`` in pixels."""
     most = max(_PER_DISC * pixels / (math.pi * radius**2), 64)
-    return int(min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON), most))
+    return int(min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON, photon_pass.MOST_OF_PASS), most))
 
 
 def trace(

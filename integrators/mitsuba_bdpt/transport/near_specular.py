@@ -25,7 +25,7 @@ NARROW = 20.0
 
 # Least density (1 / sr) from both sides of an event that counts as specular in guiding, see `sds` and
 # experiments, "Photon-guided BSDF sampling".
-SPECULAR = 4.0
+SPECULAR = 2.0
 
 # Least cosine of incidence of sampled BSDFs: at grazing incidence all glossy lobes are narrow.
 _LEAST_COS = 0.5

@@ -22,16 +22,15 @@ from .photon import Photon
 from .photon_guide import Guide
 
 # Initial memory, in photons per subpath.
-_CAPACITY = 0.5
+_CAPACITY = 1.0
 
-# Camera samples per photon subpath of a guide; bounds of the number of photon subpaths.
-SAMPLES_PER_PHOTON = 4
-FEWEST_PHOTONS, MOST_PHOTONS = 1 << 12, 1 << 18
+# Bounds of the number of photon subpaths: of all, of a guide, of a pass of merging.
+FEWEST_PHOTONS, MOST_OF_GUIDE, MOST_OF_PASS = 1 << 12, 1 << 19, 1 << 18
 
 
-def photons_of(samples: int, each: int = SAMPLES_PER_PHOTON) -> int:
+def photons_of(samples: int, each: int = 1, most: int = MOST_OF_GUIDE) -> int:
     """Number of photon subpaths for ``samples`` camera samples, one per ``each``."""
-    return min(max(samples // each, FEWEST_PHOTONS), MOST_PHOTONS)
+    return min(max(samples // each, FEWEST_PHOTONS), most)
 
 
 class PhotonPolicy:
