@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import strategies as st
 from scene_parts import T, film, grey
 
-from .rooms import area
+from scenes import area, floor
 
 
 def bitmap(pixels):
@@ -150,12 +150,8 @@ def sensors(draw):
 @st.composite
 def scenes(draw, kinds):
     """A scene as a dictionary: shapes on a floor, `lamps`, a sensor."""
-    floor = {
-        "type": "rectangle",
-        "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(4),
-        "bsdf": BSDFS[draw(st.sampled_from(["diffuse", "plastic", "roughconductor", "blend"]))](0.25),
-    }
-    scene = {"type": "scene", "sensor": draw(sensors()), "floor": floor}
+    bsdf = BSDFS[draw(st.sampled_from(["diffuse", "plastic", "roughconductor", "blend"]))](0.25)
+    scene = {"type": "scene", "sensor": draw(sensors()), "floor": floor(-1, 4, bsdf)}
     scene |= {f"object {i}": o for i, o in enumerate(draw(st.lists(objects(), min_size=1, max_size=3)))}
     return scene | draw(lamps(kinds))
 

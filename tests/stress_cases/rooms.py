@@ -5,21 +5,20 @@ import numpy as np
 import scene_parts as parts
 from scene_parts import T
 
-from scenes import area
+from scenes import DOWNWARDS, area, square
 
 # Of the film, along each side.
 SIZE = 16
 
-# The plate of `room` in its place, and from above onto it.
-PLATE = [0, -0.3, -0.2]
 
-
-def to_world():
-    return T().translate(PLATE).rotate([1, 0, 0], -50).scale(0.45)
+def plate(bsdf=None):
+    """That of `room` in its place."""
+    return square((0, -0.3, -0.2), ([1, 0, 0], -50), 0.45, bsdf or diffuse(0.5))
 
 
 def down():
-    return T().look_at([0, 0.5, 0.3], PLATE, [0, 0, 1])
+    """From above onto the plate."""
+    return T().look_at([0, 0.5, 0.3], [0, -0.3, -0.2], [0, 0, 1])
 
 
 def diffuse(reflectance: float):
@@ -49,12 +48,8 @@ def room(bsdf=None, **found):
 
     Or other parts in their place.
     """
-    lamp_at = T().translate([0.3, 0.8, 0]).rotate([1, 0, 0], 90).scale(0.2)
-    inside = {
-        "wall": {"type": "sphere", "bsdf": diffuse(0.5)},
-        "plate": {"type": "rectangle", "to_world": to_world(), "bsdf": bsdf or diffuse(0.5)},
-        "lamp": {"type": "rectangle", "to_world": lamp_at, "emitter": area(4.0)},
-    }
+    lamp = square((0.3, 0.8, 0), DOWNWARDS, 0.2, emitter=area(4.0))
+    inside = {"wall": {"type": "sphere", "bsdf": diffuse(0.5)}, "plate": plate(bsdf), "lamp": lamp}
     return loaded(camera(), **inside | found)
 
 

@@ -101,61 +101,29 @@ def test_arguments():
     )
 
 
-def crop(x, y, width, height):
-    return {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
+def crop(x, y, width, height, film=(16, 12)):
+    found = {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
+    return found | {"width": film[0], "height": film[1]}
 
 
-LARGE = {"width": 100_000, "height": 100_000}
-# The film, and the shape of its image, if it has one.
+SIZES = (1, 1), (1, 7), (301, 1), (1, 4097), (40_000, 2), (17, 13)
 FILMS = [
+    *({"width": width, "height": height} for width, height in SIZES),
     *(
-        ({"width": width, "height": height}, shape)
-        for width, height, shape in [
-            (0, 0, None),
-            (-1, 8, None),
-            (1, 1, (1, 1)),
-            (1, 7, (7, 1)),
-            (301, 1, (1, 301)),
-            (1, 4097, (4097, 1)),
-            (40_000, 2, (2, 40_000)),
-            (17, 13, (13, 17)),
-        ]
+        crop(*window)
+        for window in ((0, 0, 1, 1), (15, 11, 1, 1), (15, 0, 1, 12), (3, 5, 7, 1), (0, 0, 16, 12))
     ),
-    *(
-        ({"width": 16, "height": 12} | crop(*window), shape)
-        for window, shape in [
-            ((0, 0, 1, 1), (1, 1)),
-            ((15, 11, 1, 1), (1, 1)),
-            ((15, 0, 1, 12), (12, 1)),
-            ((3, 5, 7, 1), (1, 7)),
-            ((0, 0, 16, 12), (12, 16)),
-            ((0, 0, 0, 0), None),
-            ((4, 4, 0, 5), None),
-            ((16, 12, 1, 1), None),
-            ((8, 8, 9, 4), None),
-            ((0, 0, 17, 1), None),
-        ]
-    ),
-    (LARGE | crop(50_000, 50_000, 16, 16), (16, 16)),
+    crop(50_000, 50_000, 16, 16, (100_000, 100_000)),
 ]
+# Windows of nothing, and beyond the film.
+REFUSED = [{"width": -1, "height": 8}, *(crop(*w) for w in ((4, 4, 0, 5), (16, 12, 1, 1), (8, 8, 9, 4)))]
 
 
-@pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
-@pytest.mark.parametrize(
-    "film, shape", FILMS, ids=lambda x: str(list(x.values()) if isinstance(x, dict) else x)
-)
-def test_films(film, shape, parameters):
-    """Films of 0, 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1; crop windows of one pixel,
-    of a row, of nothing, beyond the film, of 16 x 16 in a film of 10^10 pixels; path tracing alone, and light
-    subpaths.
-
-    Expected: an error that names width, height or the crop window, or an image of that size and radiance:
-    within 20 %, for roulette leaves noise in one pixel, and no row or column below half of it, as one that
-    lost a side of its pixels would be.
-    """
+def seen(film, parameters):
+    """The image of a room of radiance 1."""
     wall = {"type": "sphere", "flip_normals": True, "bsdf": {"type": "diffuse", "reflectance": 0.5}}
     # Where there are no pixels the larger axis has no field of view, and Mitsuba would speak of that.
-    axis = "larger" if min(film["width"], film["height"]) > 0 else "x"
+    axis = "larger" if film["width"] > 0 else "x"
     film = {"type": "hdrfilm", "rfilter": {"type": "box"}} | film
     scene = {
         "type": "scene",
@@ -163,15 +131,33 @@ def test_films(film, shape, parameters):
         "wall": wall | {"emitter": {"type": "area", "radiance": 0.5}},
     }
     bdpt = mi.load_dict({"type": "bdpt"} | parameters)
-    if shape is None:
-        with pytest.raises((ValueError, RuntimeError), match=r"width|height|crop|\d x \d"):
-            bdpt.render(mi.load_dict(scene), spp=16)
-        return
-    image = np.array(bdpt.render(mi.load_dict(scene), spp=16), dtype=np.float64)
-    assert image.shape[:2] == shape
+    return np.array(bdpt.render(mi.load_dict(scene), spp=16), dtype=np.float64)
+
+
+@pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
+@pytest.mark.parametrize("film", FILMS, ids=lambda film: str(list(film.values())))
+def test_films(film, parameters):
+    """Films of 1 x 1, 1 x 4097, 40000 x 2, ... pixels in a room of radiance 1; crop windows of one pixel, of
+    a row, of 16 x 16 in a film of 10^10 pixels; path tracing alone, and light subpaths.
+
+    Expected: an image of that size and radiance: within 20 %, for roulette leaves noise in one pixel, and no
+    row or column below half of it, as one that lost a side of its pixels would be.
+    """
+    image = seen(film, parameters)
+    assert image.shape[:2] == (film.get("crop_height", film["height"]), film.get("crop_width", film["width"]))
     assert np.isfinite(image).all()
     assert abs(image.mean() - 1) < 0.2
     assert min(image.mean((1, 2)).min(), image.mean((0, 2)).min()) > 0.5
+
+
+@pytest.mark.parametrize("film", REFUSED, ids=lambda film: str(list(film.values())))
+def test_films_without_pixels(film):
+    """A film of a negative width; crop windows of nothing, beyond the film.
+
+    Expected: an error that names width, height or the crop window.
+    """
+    with pytest.raises((ValueError, RuntimeError), match=r"width|height|crop|\d x \d"):
+        seen(film, {})
 
 
 SCENE = """

@@ -10,6 +10,9 @@ from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.measure.agreement import Sample
 from scene_parts import T, grey
 
+from scenes import load as scene
+from scenes import square
+
 from .compare import WAYS, family, tiles
 from .rooms import area, view
 
@@ -21,14 +24,9 @@ def floor(reflectance=0.5, half=2.0):
     return {"type": "rectangle", "to_world": T().scale(half), "bsdf": grey(reflectance)}
 
 
-def lamp(height=3.0, half=0.3, radiance=10.0, turn=None, at=(0.4, 0.3)):
+def lamp(height=3.0, half=0.3, radiance=10.0, at=(0.4, 0.3)):
     """A square that faces down."""
-    to_world = (turn or T()).translate([*at, height]).rotate([1, 0, 0], 180).scale(half)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": grey(0.0), "emitter": area(radiance)}
-
-
-def scene(**parts):
-    return mi.load_dict({"type": "scene"} | parts)
+    return square((*at, height), ([1, 0, 0], 180), half, grey(0.0), emitter=area(radiance))
 
 
 BALL = {"type": "sphere", "center": [0, 0, 0.4], "radius": 0.4}
@@ -300,11 +298,11 @@ def test_large_floors():
     Expected: what `path` sees on a rectangle of 30: Welch's test of tiles (1e-3), standard error below 0.5 %.
     """
     turn = T().rotate([0.6, 0, 0.8], 33)
-    camera = view((0, -4, 2), (0, 0, 0))
+    camera, shines = view((0, -4, 2), (0, 0, 0)), lamp(half=0.5, at=(0, 0))
     common = {
         "sensor": camera | {"to_world": turn @ camera["to_world"]},
         "ball": {"type": "sphere", "to_world": turn @ T().translate([0, 0, 1]).scale(0.5)},
-        "lamp": lamp(half=0.5, turn=turn, at=(0, 0)),
+        "lamp": shines | {"to_world": turn @ shines["to_world"]},
     }
     floors = [{"type": "rectangle", "to_world": turn @ T().scale(size)} for size in (30.0, 1e3)]
     floors += [

@@ -7,9 +7,11 @@ from mitsuba_bdpt.settings import HEURISTICS
 from scene_parts import T
 from warned import Warned
 
+from scenes import square
+
 from .compare import agree, tiles
 from .poisons import BAD_TEXELS, BSDFS, INF, NAN, brightness, painted, reflecting, sky_of, texture
-from .rooms import SIZE, area, down, filled, room, to_world
+from .rooms import SIZE, area, down, filled, plate, room
 from .twins import DEFAULTS, EVERYTHING, PILOTED, RENDERS, SPP, compare_with_twin, decided, rendered
 
 # -- BSDFs ----------------------------------------------------------------------------------------
@@ -34,10 +36,14 @@ def test_bsdfs(name, bad, way):
 
 
 def glowing(value):
-    at = T().translate([-0.4, 0.5, -0.3]).rotate([1, 0, 0], 60).scale(0.2)
     # Mitsuba orders shapes by their addresses: random numbers would choose another of two lamps on shapes.
     lamp = {"type": "point", "position": [0.3, 0.7, 0], "intensity": 0.5}
-    return room(other={"type": "rectangle", "to_world": at, "emitter": area(value)}, lamp=lamp)
+    return room(other=square((-0.4, 0.5, -0.3), ([1, 0, 0], 60), 0.2, emitter=area(value)), lamp=lamp)
+
+
+def spot(value):
+    lamp = {"type": "spot", "intensity": 5.0, "cutoff_angle": 40, "to_world": down()}
+    return room(other=lamp | {"texture": texture(value)})
 
 
 LAMPS = {
@@ -54,18 +60,7 @@ LAMPS = {
         lambda x: room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": x}),
         NAN,
     ),
-    "spot NaN": (
-        lambda x: room(
-            other={
-                "type": "spot",
-                "intensity": 5.0,
-                "cutoff_angle": 40,
-                "to_world": down(),
-                "texture": texture(x),
-            }
-        ),
-        NAN,
-    ),
+    "spot NaN": (spot, NAN),
 }
 HIDDEN = {"hide_emitters": True}  # a sky seen directly is asked for no density
 
@@ -135,11 +130,14 @@ def test_strategy_images():
     compare_with_twin(BSDFS["eval"], NAN, EVERYTHING | {"layers": "strategies"})
 
 
-def only_light():
-    """A closed white sphere with nothing in it but a point light of intensity NaN; all strategies, depth 3.
+@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
+def test_only_light(variant):
+    """The only light, a point in a closed white sphere, of intensity NaN; all strategies.
 
-    Black, and three values of each sample count: its light subpath, s = 1 at two vertices.
+    Expected: black; three values of each sample are counted (its light subpath, s = 1 at two vertices), and
+    the intensity is named once.
     """
+    mi.set_variant(variant)
     wall = {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
     lamp = {"type": "point", "position": [0.2, 0, 0.1], "intensity": brightness(NAN)}
     scene = room(wall=wall, plate=None, lamp=lamp)
@@ -148,15 +146,6 @@ def only_light():
     assert statistics["non_finite"] == 3 * SIZE**2 * SPP
     assert len(warnings) == 1
     assert "intensity" in warnings[0]
-
-
-def test_only_light():
-    """The only light, a point in a closed sphere, of intensity NaN.
-
-    Expected: black; three values of each sample are counted (its light subpath, s = 1 at two vertices), and
-    the intensity is named once.
-    """
-    only_light()
 
 
 def spectrally_painted(value):
@@ -175,7 +164,7 @@ def spectrally_painted(value):
 
 
 @pytest.mark.parametrize(
-    "what", ["radiance NaN", "densities infinite", "point NaN", "sky NaN", "eval", "texels", "only light"]
+    "what", ["radiance NaN", "densities infinite", "point NaN", "sky NaN", "eval", "texels"]
 )
 def test_spectral(what):
     """`llvm_ad_spectral`, where a poisoned value has as many wavelengths as a path: lamps, a texture and a
@@ -184,9 +173,7 @@ def test_spectral(what):
     Expected: as in colours.
     """
     mi.set_variant("llvm_ad_spectral")
-    if what == "only light":
-        only_light()
-    elif what == "texels":
+    if what == "texels":
         compare_with_twin(spectrally_painted, NAN, BY_CAMERA, count=2 * PIXELS * SPP)
     elif what == "eval":
         compare_with_twin(BSDFS["eval"], NAN, EVERYTHING)
@@ -278,11 +265,8 @@ def test_area_texels(way):
     Expected: only these texels are lost: the image of its twin, in which they are 0; Welch's test of tiles
     (1e-3), which sees errors of 2 %.
     """
-    at = T().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3)
-    scenes = (
-        room(other={"type": "rectangle", "to_world": at, "emitter": area(texture(value))})
-        for value in (NAN, 0.0)
-    )
+    place = (-0.2, 0.6, -0.3), ([1, 0, 0], 60), 0.3
+    scenes = (room(other=square(*place, emitter=area(texture(value)))) for value in (NAN, 0.0))
     agree(*(tiles(scene, RENDERS[way][0], range(8), PILOTED) for scene in scenes), 0.02)
 
 
@@ -321,7 +305,7 @@ def test_vertices(data, bad):
     that end there count, and are warned of); Welch's test of tiles (1e-3), which sees errors of 2 %.
     """
     scene = room(
-        plate=mesh(to_world(), spoilt=data, bad=bad, bsdf={"type": "twosided", "bsdf": painted(0.1)})
+        plate=mesh(plate()["to_world"], spoilt=data, bad=bad, bsdf={"type": "twosided", "bsdf": painted(0.1)})
     )
     theirs = tiles(scene, {"type": "path", "max_depth": 4}, range(8), PILOTED)
     agree(tiles(scene, {"max_depth": 4}, range(8), PILOTED), theirs, 0.02)

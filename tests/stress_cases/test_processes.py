@@ -17,12 +17,18 @@ import repository
 from mitsuba_bdpt.planning import budget
 from scene_parts import T, film
 
+from scenes import DOWNWARDS, area, floor, square
+
 # Sums of the same numbers in another order, in single precision.
 ROUNDING = 1e-4
 
 # Along each side of most films here, and samples per pixel with which such a render asks a pilot.
 SIZE = 8
 PILOTED = budget.LEAST_SAMPLES // SIZE**2
+
+
+def rgb(value):
+    return {"type": "rgb", "value": value}
 
 
 def room(
@@ -37,25 +43,13 @@ def room(
             "to_world": T().look_at(list(eye), [0, 0, 0], [0, 1, 0]),
             "film": film(size),
         },
-        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.1 * light}},
-        "floor": {
-            "type": "rectangle",
-            "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap}},
-        },
-        "wall": {
-            "type": "rectangle",
-            "to_world": T().translate([0, 0, -1]),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": wall}},
-        },
+        "sky": {"type": "constant", "radiance": rgb(0.1 * light)},
+        "floor": floor(-1, 1, {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap}}),
+        "wall": square((0, 0, -1), bsdf={"type": "diffuse", "reflectance": rgb(wall)}),
         "ball": {"type": "sphere", "radius": 0.3, "center": [0.4, -0.6, 0], "bsdf": {"type": "dielectric"}},
         "block": {"type": "cube", "to_world": T().translate([-0.5 + moved, -0.7, 0]).scale(0.2)},
-        "lamp": {
-            "type": "rectangle",
-            "to_world": T().translate(list(lamp)).rotate([1, 0, 0], 90).scale(0.2),
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 5 * light}},
-        },
-        "spark": {"type": "point", "position": [0.5, 0.5, 0.5], "intensity": {"type": "rgb", "value": spark}},
+        "lamp": square(lamp, DOWNWARDS, 0.2, emitter=area(rgb(5 * light))),
+        "spark": {"type": "point", "position": [0.5, 0.5, 0.5], "intensity": rgb(spark)},
     }
 
 

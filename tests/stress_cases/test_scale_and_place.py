@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import repository
 from mitsuba_bdpt.measure.agreement import Sample, welch
+from scipy.spatial.transform import Rotation
 
 from .compare import WAYS, family, tiles
 
@@ -104,15 +105,7 @@ def placed(kind, scale=1.0, turn=np.eye(3), shift=(0.0, 0.0, 0.0), light=1.0):  
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), parallel=False, resolution=SIZE)
 
 
-def rotation(axis, degrees):
-    """Matrix of a turn about an axis."""
-    x, y, z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.deg2rad(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-TURN = rotation([1, 2, 3], 35.7)
+TURN = Rotation.from_rotvec(np.deg2rad(35.7) * np.array([1, 2, 3]) / np.sqrt(14)).as_matrix()
 SMALL, LARGE = {"scale": 1e-4, "turn": TURN}, {"scale": 1e4, "turn": TURN}
 
 

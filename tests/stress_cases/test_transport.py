@@ -10,8 +10,10 @@ from mitsuba_bdpt.transport.inputs import Shared
 from scene_parts import T
 from warned import Warned
 
+from scenes import DOWNWARDS, area, floor, square
+
 from .compare import WAYS, agree, tiles
-from .rooms import area, camera, diffuse, view
+from .rooms import camera, diffuse, view
 
 SEEDS = range(8)
 
@@ -82,12 +84,8 @@ def test_black(way):
     target = scene(
         wall={"type": "sphere", "bsdf": diffuse(0.0)},
         ball={"type": "sphere", "center": [0.2, -0.3, -0.4], "radius": 0.2, "bsdf": glass},
-        plate={"type": "rectangle", "to_world": T().translate([-0.3, -0.4, -0.3]).scale(0.2), "bsdf": metal},
-        lamp={
-            "type": "rectangle",
-            "to_world": T().translate([0.3, 0.8, 0]).rotate([1, 0, 0], 90).scale(0.2),
-            "emitter": area(4.0),
-        },
+        plate=square((-0.3, -0.4, -0.3), size=0.2, bsdf=metal),
+        lamp=square((0.3, 0.8, 0), DOWNWARDS, 0.2, emitter=area(4.0)),
     )
     made = mi.load_dict({"type": "bdpt", "hide_emitters": True} | WAYS[way])
     with Warned() as warnings:
@@ -125,8 +123,7 @@ def test_corridor(reflectance):
         }
         for i in range(4)
     }
-    to_world = T().translate([0, 0, -100]).scale(0.6)
-    end = {"type": "rectangle", "to_world": to_world, "emitter": area(1.0), "bsdf": diffuse(0)}
+    end = square((0, 0, -100), size=0.6, bsdf=diffuse(0), emitter=area(1.0))
     fov = float(np.rad2deg(2 * np.arctan(SLOPE)))
     target = scene(look((0, 0, 0), (0, 0, -1), fov), end=end, **sides)
     means = tiles(target, {"max_depth": 70, "rr_depth": 200}, SEEDS, 64)[:, :-1]
@@ -181,11 +178,7 @@ def test_total_reflection():
             "bsdf": {"type": "dielectric", "int_ior": 1.8},
         },
         lamp={"type": "sphere", "radius": 0.2, "bsdf": diffuse(0.3), "emitter": area(3.0)},
-        floor={
-            "type": "rectangle",
-            "bsdf": diffuse(0.6),
-            "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(2),
-        },
+        floor=floor(-1, 2, diffuse(0.6)),
     )
     theirs = tiles(target, {"type": "path", "max_depth": 16}, SEEDS, 1024)
     for way in WAYS.values():
@@ -235,28 +228,11 @@ def test_surface(name):
     bsdf = SURFACES[name]
     target = scene(
         look((0, 0.4, 3.2), (0, 0.1, 0), 45),
-        floor={
-            "type": "rectangle",
-            "bsdf": diffuse(0.5),
-            "to_world": T().translate([0, -0.6, 0]).rotate([1, 0, 0], -90).scale(2.5),
-        },
-        back={
-            "type": "rectangle",
-            "bsdf": diffuse(0.4),
-            "to_world": T().translate([0, 0.9, -1.5]).scale(2.5),
-        },
+        floor=floor(-0.6, 2.5, diffuse(0.5)),
+        back=square((0, 0.9, -1.5), size=2.5, bsdf=diffuse(0.4)),
         ball={"type": "sphere", "center": [-0.6, 0, 0], "radius": 0.55, "bsdf": bsdf},
-        plate={
-            "type": "rectangle",
-            "to_world": T().translate([0.8, 0, -0.2]).rotate([0, 1, 0], -25).scale(0.5),
-            "bsdf": bsdf,
-        },
-        lamp={
-            "type": "rectangle",
-            "to_world": T().translate([0, 2.2, 0.5]).rotate([1, 0, 0], 90).scale(0.9),
-            "bsdf": diffuse(0),
-            "emitter": area(2.0),
-        },
+        plate=square((0.8, 0, -0.2), ([0, 1, 0], -25), 0.5, bsdf),
+        lamp=square((0, 2.2, 0.5), DOWNWARDS, 0.9, diffuse(0), emitter=area(2.0)),
         sky={"type": "constant", "radiance": 0.1},
     )
     theirs = tiles(target, {"type": "path", "max_depth": 6}, SEEDS, 512)

@@ -6,9 +6,10 @@ import mitsuba as mi
 import pytest
 from scene_parts import T, film, grey
 
+from scenes import area, floor
+
 from .chance import by_chance
 from .random_scenes import LAMPS, SHAPES, kinds_of, renders
-from .rooms import area
 from instruments.capture import Capture, Weighed
 
 # Share of the kernel's paths that may be left out since rounding decides (else a fault may hide there); 0.4
@@ -58,11 +59,10 @@ def test_paths_around_a_glint():
     Expected: as of random scenes; 20,000 paths at least.
     """
     view = T().look_at([0, 0.5, 4], [0, -0.3, 0], [0, 1, 0])
-    below = T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(4)
     scene = {
         "type": "scene",
         "sensor": {"type": "perspective", "fov": 50.0, "to_world": view, "film": film(16)},
-        "floor": {"type": "rectangle", "to_world": below, "bsdf": grey(0.6)},
+        "floor": floor(-1, 4, grey(0.6)),
         "box": SHAPES["cube"]([0, -0.6, 0], 0, 0.4) | {"bsdf": grey(0.6)},
         "lamp": {"type": "sphere", "radius": 1e-3, "bsdf": {"type": "diffuse"}, "emitter": area(4.0)},
     }
