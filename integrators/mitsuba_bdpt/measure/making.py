@@ -1,13 +1,10 @@
 """Makes reference images that include an estimate of their own error.
 
 A reference is good enough if its own error adds at most 1 % to the relMSE, raw and trimmed, of `bdpt` with
-the samples per pixel that it has to judge, and of `path` in the same time if `path` makes the reference; one
-that another command makes on the way, which subtracts its error, 10 %. It is the mean of two halves with
-different seeds, rendered alternately until that is reached or the time is over; the halves differ by twice
-the standard error of their mean. `Recipe` names the integrator: `bdpt` with all strategies, with `merging`
-where nothing else samples some light, or `path` (with media `volpath`) where that converges, as an
-independent integrator. Windows in which few samples find the light have more samples; furnaces are known
-exactly.
+the samples per pixel that it has to judge (and of `path` in the same time if `path` makes it); one that
+another command makes on the way, which subtracts its error, 10 %. It is the mean of two halves with different
+seeds, which differ by twice the standard error of their mean, rendered until that is reached or the time is
+over. `Recipe` names the integrator; windows in which few samples find the light have more samples.
 
 `reference` describes the files. Each round is stored; a further run continues from the stored image, whose
 rounding to half precision is far below its error.
@@ -30,12 +27,13 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, message
+from ..files.texts import read_toml
 from ..files.whole import check_writable
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means, tile_columns
 from .metrics import TRIM, rel_mse
-from .models import Radiance, Recipe, read_table
+from .models import Radiance, Recipe, checked
 from .options import REFERENCE_SECONDS, VARIANT
 from .project import Project
 from .reference import (
@@ -83,7 +81,9 @@ MARGIN = 0.9  # of that share
 
 
 def recipe_of(project: Project, name: str) -> Recipe:
-    return read_table(Recipe, project.references / "scenes.toml", name)
+    file = project.references / "scenes.toml"
+    tables = read_toml(file) if file.is_file() else {}
+    return checked(Recipe, tables.get(name, {}), f"{file}: [{name}]")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
@@ -18,7 +17,6 @@ from pydantic import (
 from pydantic import model_validator as validator
 
 from ..errors import CommandError, did_you_mean
-from ..files.texts import read_toml
 from .agreement import FEWEST_RUNS, TILES
 from .options import RESOLUTION
 
@@ -46,13 +44,10 @@ def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> Model
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        errors = [_text(kind, found) for found in error.errors(include_url=False) if not _follows(found)]
-        raise CommandError(f"{where}: {'; '.join(errors)}") from error
-
-
-def _follows(found: Mapping[str, Any]) -> bool:
-    """Whether a list is too short only for what is wrong with its entries."""
-    return found["type"] == "too_short" and len(found["input"]) >= found["ctx"]["min_length"]
+        found = error.errors(include_url=False)
+        # A list is too short, too, if its entries are wrong.
+        errors = [one for one in found if one["type"] != "too_short" or len(found) == 1]
+        raise CommandError(f"{where}: {'; '.join(_text(kind, one) for one in errors)}") from error
 
 
 def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
@@ -237,8 +232,3 @@ class Recipe(Model):
             if not (left < right and top < bottom):
                 raise ValueError(f"windows={list(window)} must be left, top, right, bottom")
         return self
-
-
-def read_table(kind: type[ModelT], file: Path, name: str) -> ModelT:
-    tables = read_toml(file) if file.is_file() else {}
-    return checked(kind, tables.get(name, {}), f"{file}: [{name}]")

@@ -131,11 +131,7 @@ FIRST_SEED = 1  # seed 0 warms up
 
 @dataclass(frozen=True)
 class Cell:
-    """One render, and all that determines it.
-
-    ``against``: for equal time, parameters and sampler of the first integrator, and the samples at which both
-    were timed.
-    """
+    """One render, and all that determines it."""
 
     scene: str
     scene_sha256: str
@@ -146,7 +142,7 @@ class Cell:
     parameters: tuple
     sampler: str
     match: str
-    against: tuple
+    against: tuple  # for equal time: of the first integrator, and the samples at which both were timed
     budget: int
     seed: int
     versions: tuple

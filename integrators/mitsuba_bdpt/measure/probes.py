@@ -44,7 +44,7 @@ def numbers(code: str, *arguments: str, environment: Mapping[str, str] | None = 
     done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace")
     if done.returncode:
         raise RuntimeError(f"a probe ended with status {done.returncode}: {done.stderr[-500:]}")
-    return [float(word) for word in done.stdout.split() if _is_number(word)]
+    return [float(word) for word in done.stdout.splitlines()[-1].split()]
 
 
 def rendered(wanted: Mapping[str, Any], **environment: str) -> list[float]:
@@ -53,7 +53,7 @@ def rendered(wanted: Mapping[str, Any], **environment: str) -> list[float]:
     ``wanted``: ``parameters`` of the integrator, ``max_depth`` and ``spp``; ``file``, ``resolution`` and
     ``sampler`` of a scene, else ``film`` of the Cornell box. ``environment``: added to that of the process.
     """
-    return numbers(RENDER, json.dumps(dict(wanted)), environment=os.environ | environment)[-3:]
+    return numbers(RENDER, json.dumps(dict(wanted)), environment=os.environ | environment)
 
 
 def first_image(wanted: Mapping[str, Any]) -> dict[str, float]:
@@ -61,14 +61,6 @@ def first_image(wanted: Mapping[str, Any]) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as cache:
         wall, processor, _ = rendered(wanted, DRJIT_CACHE_DIR=cache, HOME=cache)
     return {"seconds": wall, "cpu_seconds": processor}
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def coldstart(rounds: int) -> dict[str, list[float]]:

@@ -1,15 +1,12 @@
 """Sweeps of run time against error: scenes x integrators x samples x seeds.
 
-A preset (see `preset`) names the renders. For each scene, budget and seed the integrators run consecutively,
-so that noise of the machine affects all. Each finished render is a file in OUTPUT/cells, named by a hash of
-all that determines it (parameters, scene, versions, the plugin's source), and is not repeated; its image is
-in OUTPUT/images. Failed cells, and scenes without reference, are reported and tried again by the next run.
-Errors are against the references of `making`, which are made first if missing; they are computed again when a
-reference changes. HDR-FLIP is computed for the first seed only, since it is slow.
-
-On a cluster, consecutive renders go to one worker; workers need the project under the same path, and the same
-software. Probes are left out there. OUTPUT/rows.parquet has all rows; OUTPUT/rows.csv their numbers, and
-OUTPUT/rows.json the parameters, decisions and statistics of each; OUTPUT/probes.json the results of `probes`.
+For each scene, budget and seed the integrators of a preset run consecutively, so that noise of the machine
+affects all. Each render is a file in OUTPUT/cells, named by a hash of all that determines it (parameters,
+scene, versions, the plugin's source), and is not repeated; its image is in OUTPUT/images. Failed cells, and
+scenes without reference, are reported and tried again by the next run. Errors are against the references of
+`making`, made first if missing, and computed again when a reference changes. On a cluster, consecutive
+renders go to one worker; workers need the project under the same path and the same software. Probes are left
+out there. `results` describes the files.
 """
 
 from __future__ import annotations
