@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
@@ -45,55 +46,47 @@ def _measured(
     join: str = ", ",
 ) -> Measured:
     """Named ``figures``, or why there is none; judged by ``value``."""
-    texts: list[str] = []
-    values: list[float] = []
+    texts, values = list[str](), list[float]()
     for name, figure in figures.items():
         try:
             found = figure()
+            text, number = show(found), value(found)
         except Unavailable as why:
-            texts.append(f"{why} {name}")
-            values.append(np.nan)
-        else:
-            texts.append(f"{show(found)} {name}")
-            values.append(value(found))
+            text, number = str(why), np.nan
+        texts.append(f"{text} {name}")
+        values.append(number)
     return Measured(join.join(texts), values)
 
 
 def over_path(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> Measured:
     """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
-    lacks = results.path_lacks(scene)
-    rival = results.tracer(scene)
-    found = results.against_path(scene, error)
-    return Measured(f"{found}" + (f"; `{rival}`: {lacks}" if lacks else ""), [found.median])
-
-
-# Pairs required near 1, until the interval of their median is this narrow.
-MANY, NARROW = 20, 0.04
+    lacks, found = results.path_lacks(scene), results.against_path(scene, error)
+    return Measured(f"{found}" + (f"; `{results.tracer(scene)}`: {lacks}" if lacks else ""), [found.median])
 
 
 def _near(found: Summary) -> str:
-    wide = found.count >= MANY and found.high - found.low > NARROW
     middle = f"{found.bound} {found.median:.3f}x".lstrip()
     what = "interval" if found.count >= FEWEST_WITH_INTERVAL else "range"
-    text = f"{middle}, {what} {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
-    return text + (f" (not narrower than {NARROW})" if wide else "")
+    return f"{middle}, {what} {found.low:.3f}–{found.high:.3f}, {found.count} pairs"
+
+
+def _over_rivals(results: Results, scene: str, **more: str) -> dict[str, Callable[[], Summary]]:
+    """Efficiency over each of `Results.standard`."""
+    over, rivals = partial(results.efficiency, scene, **more), results.standard_in(scene) or RIVALS
+    return {f"over {rival}": partial(over, rival) for rival in rivals}
 
 
 def near_one(results: Results, scene: str) -> Measured:
     """Efficiency over each of `Results.standard`, judged by the lower end of its interval."""
-    rivals = results.standard_in(scene) or RIVALS
-    figures = {f"over {rival}": partial(results.efficiency, scene, rival) for rival in rivals}
-    return _measured(figures, _near, attrgetter("low"), "; ")
+    return _measured(_over_rivals(results, scene), _near, attrgetter("low"), "; ")
 
 
 def worst(results: Results) -> Measured:
     """Smallest efficiency over all scenes."""
     found: dict[str, Summary] = {}
     for scene in results.scenes:
-        try:
+        with suppress(Unavailable):  # not rendered, or exact
             found[scene] = results.against_path(scene)
-        except Unavailable:  # not rendered, or exact
-            continue
     if not found:
         raise Unavailable("not rendered")
     name = min(found, key=lambda scene: found[scene].median)
@@ -111,20 +104,17 @@ def against_none(results: Results) -> Measured:
 
 def _mean_over_none(results: Results, scenes: list[str]) -> Measured:
     """Geometric means over the scenes, trimmed and raw."""
-    found: dict[str, float] = {}
-    medians: list[float] = []
+    found, medians = dict[str, float](), list[float]()
     for error, kind in KINDS.items():
         medians = []
         for scene in scenes:
-            try:
+            with suppress(Unavailable):  # not rendered, or exact
                 medians.append(results.efficiency(scene, NONE, error).median)
-            except Unavailable:  # not rendered, or exact
-                continue
         if not medians:
             raise Unavailable("not rendered")
         found[kind] = float(stats.gmean(medians))
     text = ", ".join(f"{ratio(mean)} {kind}" for kind, mean in found.items())
-    return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", list(found.values()))
+    return Measured(f"{text}, {len(medians)} of {len(scenes)} scenes", [*found.values()])
 
 
 def unaimed(results: Results, scene: str) -> Measured:
@@ -135,9 +125,7 @@ def unaimed(results: Results, scene: str) -> Measured:
 
 def merged(results: Results, scene: str) -> Measured:
     """Raw efficiency of `merging` over each of `Results.standard`, biased or not."""
-    rivals = results.standard_in(scene) or RIVALS
-    over = partial(results.efficiency, scene, error="rel_mse", first=MERGING)
-    return _measured({f"over {rival}": partial(over, rival) for rival in rivals})
+    return _measured(_over_rivals(results, scene, error="rel_mse", first=MERGING))
 
 
 def alone(results: Results, scene: str) -> Measured:
@@ -171,11 +159,9 @@ PROBES = repository.ROOT / "docs" / "reports" / "benchmark" / "probes.json"
 
 def probed(results: Results, name: str) -> dict[str, list[float]]:
     """Return the results of a probe for the software of the rows."""
-    probe, row = json.loads(PROBES.read_text()).get(name), results.rows.iloc[0]
-    if probe is None:
-        raise Unavailable("not measured")
-    if probe["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
-        raise Unavailable("measured of another version or on another machine")
+    probe, row = json.loads(PROBES.read_text()).get(name, {}), results.rows.iloc[0]
+    if probe.get("versions") != json.loads(row["versions"]) | {"machine": row["machine"]}:
+        raise Unavailable("not measured of this version on this machine")
     return probe["values"]
 
 
@@ -189,7 +175,7 @@ def floor(results: Results) -> Measured:
 def coldstart(results: Results) -> Measured:
     """Seconds of a process to the first image, also over `path`'s."""
     values = probed(results, "coldstart")
-    ratios = summary([a / b for a, b in zip(values["bdpt"], values["path"], strict=True)])
+    ratios = summary(np.divide(values["bdpt"], values["path"]))
     seconds = float(np.median(values["bdpt"]))
     return Measured(f"{seconds:.2f} s, {ratios} `path`'s", [seconds, ratios.median])
 
@@ -204,8 +190,7 @@ def memory(results: Results) -> Measured:
 class Goal:
     """``what`` must reach ``bounds``: one for all numbers of ``measure``, or one for each.
 
-    ``text``: how the table writes the bounds; ``aim``: what more would be worth; ``scenes``: names given to
-    ``measure``.
+    ``text``: how the table writes the bounds; ``aim``: what more is worth; ``scenes``: given to ``measure``.
     """
 
     what: str
@@ -322,7 +307,7 @@ GOALS = (
 )
 
 
-def goals_table(results: Results, goals: Sequence[Goal] = GOALS) -> str:
+def goals_table(results: Results) -> str:
     """Goals and measurements, and whether they are met, at the default budget of comparisons."""
     results = replace(results, compared=None)
-    return table(["what", "bound", "aim", "measured", "met"], [goal.row(results) for goal in goals])
+    return table(["what", "bound", "aim", "measured", "met"], [goal.row(results) for goal in GOALS])

@@ -292,7 +292,7 @@ def test_goals_stand_beside_what_is_measured(results, monkeypatch, tmp_path):
         (goals.against_none, (), (2,), "3x trimmed, 3x raw, 2 of 2 scenes", "yes"),
         (goals.merged, ("box",), (9,), "20x (20–20) over path, 8x (8–8) over path multijitter", "**no**"),
         (goals.unaimed, ("box",), (2,), "2.5x (2.5–2.5) trimmed, 1x (1–1) raw", "yes"),
-        (goals.memory, (), (1,), "not measured", "–"),
+        (goals.memory, (), (1,), "not measured of this version on this machine", "–"),
         (goals.floor, (), (1.35,), "1.3x (1.2–1.4; n = 3) `box`", "**no**"),
     ):
         assert goals.Goal("", bounds, measure, scenes).row(results)[3:] == [text, met]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Hashable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
@@ -208,11 +209,8 @@ class Results:
         """Return whether the first integrator has an efficiency over a rival in one of the ``scenes``."""
         for scene in scenes:
             for rival in self.rivals:
-                try:
-                    self.efficiency(scene, rival)
-                except Unavailable:
-                    continue
-                return True
+                with suppress(Unavailable):
+                    return bool(self.efficiency(scene, rival))
         return False
 
     def present(self, scene: str, methods: Sequence[str], *budget: int) -> list[str]:
@@ -345,10 +343,9 @@ class Results:
         """Return the scenes by decreasing `gap`; those without one are last."""
 
         def size(scene: str) -> float:
-            try:
+            with suppress(Unavailable):
                 return self.gap(scene, method).median
-            except Unavailable:
-                return 0.0
+            return 0.0
 
         return sorted(self.scenes, key=size, reverse=True)
 

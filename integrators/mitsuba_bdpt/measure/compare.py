@@ -1,10 +1,8 @@
 """Compares two integrators in alternating renders: seconds, errors, efficiency.
 
-Medians over pairs of renders with different seeds, after a warm-up that compiles; for efficiency also
-quartiles. Errors are relMSE, trimmed of the worst 0.1 % and raw, less the reference's own
-(`estimates.seed_errors`); ≥, ≤ and ~ mark ratios that are bounds, where the reference is too noisy. The last
+Medians over pairs of renders with different seeds, after a warm-up that compiles. Errors are relMSE, less the
+reference's own (`estimates.seed_errors`); ≥, ≤ and ~ mark bounds, where the reference is too noisy. The last
 column is the share of the reference's own error in the trimmed measured one (the larger of both sides).
-Without any error there are no ratios. Equality of means is not tested here: see `agreement`.
 """
 
 from __future__ import annotations

@@ -123,8 +123,7 @@ def draw(
 ) -> float:
     """Draw the ``blocks`` under each other, ``columns`` (1 or 2) wide; return the height in inches.
 
-    In each, a column per image, the reference last: image, windows, errors in false colours. ``places``:
-    centres of the windows, see `centres`; None: where errors differ most.
+    A column per image, the reference last. ``places``: centres of windows; None: where errors differ most.
     """
     rows = [_heights(block, WIDTHS[columns]) for block in blocks]
     heights = [sum(row) + len(row) * GAP for row in rows]

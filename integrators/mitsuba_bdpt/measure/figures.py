@@ -279,9 +279,7 @@ NOT_FOR = {"windows": tuple(PLOTS), "integrators": ("rays",), "spp": ("samples",
 def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
     """Return images of a scene at the deciding budget, rivals first, and the reference.
 
-    Each integrator's image is of the seed with the median trimmed error. Captions have the median seconds and
-    the trimmed relMSE of all seeds, those of the tables, and say which integrators have equal samples in
-    place of equal time.
+    Each image is of the seed with the median trimmed error. Captions have the seconds and errors of tables.
     """
     columns: list[crops.Column] = []
     for method in results.present(scene, [*results.rivals, results.methods[0]], results.deciding):

@@ -13,6 +13,7 @@ import re
 from argparse import Namespace
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -132,10 +133,9 @@ def budgets_table(results: Results) -> str:
     """Efficiency over the strongest of `Results.standard`, by budget; "–" where there is none."""
 
     def figure(error: Error, budget: int, scene: str) -> str:
-        try:
+        with suppress(Unavailable):
             return str(results.against_path(scene, error, budget))
-        except Unavailable:
-            return "–"
+        return "–"
 
     columns: dict[str, Figure] = {
         f"{budget} spp, {kind}": partial(figure, error, budget)
@@ -291,7 +291,7 @@ def _rays_per_sample(rows: pd.DataFrame) -> str:
     if "rays_camera" not in rows or rows["rays_camera"].iloc[:1].dropna().empty:
         return "–"
     first = rows.iloc[0]
-    kinds = (("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner"))
+    kinds = ("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner")
     samples = first["spp"] * first["width"] * first["height"]
     return "; ".join(" + ".join(f"{first[f'rays_{kind}'] / samples:.2f}" for kind in of) for of in kinds)
 

@@ -43,10 +43,7 @@ def image_file(output: Path, render: Any) -> Path:
 
 
 def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
-    """Return a reference, and the SHA-256 of its file, computed before reading.
-
-    If it is replaced meanwhile, the next run computes the errors again.
-    """
+    """Return a reference, and the SHA-256 of its file, computed before reading."""
     path = reference_path(project, scene.name, resolution, depth)
     sha256 = digest(path) if path.exists() else ""
     return load_reference(project, scene, resolution, depth), sha256
@@ -60,10 +57,7 @@ def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None
 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
-    """Return all error measures of an image.
-
-    HDR-FLIP is slower than most renders: only with ``flip``, else None.
-    """
+    """Return all error measures of an image; of HDR-FLIP, slower than most renders, only with ``flip``."""
     return relative_errors(image, ref) | {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
