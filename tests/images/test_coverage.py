@@ -212,7 +212,7 @@ def test_kinds_that_take_part_partly_beside_others():
     lamps = {
         "a": parts.EMITTERS["sphere"](),
         "b": parts.EMITTERS["own lamp"](),
-        "c": BEAM | {"to_world": T().translate([0.3, 2.6, 0.6]).rotate([1, 0, 0], 90).scale(0.3)},
+        "c": beam((0.3, 2.6, 0.6), 0.3),
         "d": parts.EMITTERS["textured projector"](),
     }
     alone = 0
@@ -233,23 +233,21 @@ def unlit(part):
 
 # -- known answers ----------------------------------------------------------------------------
 
-BEAM = {
-    "type": "rectangle",
-    "bsdf": parts.grey(0.0),
-    "emitter": {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2.0, 3.0, 4.0]}},
-}
+DIRECTIONAL_AREA = {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2.0, 3.0, 4.0]}}
+
+
+def beam(at, size):
+    """A lamp that shines straight down."""
+    return scenes.square(at, scenes.DOWNWARDS, size, parts.grey(0.0), emitter=DIRECTIONAL_AREA)
+
+
 RADIANCE = np.array([2.0, 3.0, 4.0]) @ CHANNELS
 
 
 def beam_scene(sensor, half=0.5, height=1.5):
     """A lamp that shines straight down on a floor of reflectance 0.6."""
-    lamp = BEAM | {"to_world": T().translate([0, height, 0]).rotate([1, 0, 0], 90).scale(half)}
-    floor = {
-        "type": "rectangle",
-        "bsdf": parts.grey(0.6),
-        "to_world": T().rotate([1, 0, 0], -90).scale(2),
-    }
-    return mi.load_dict({"type": "scene", "sensor": sensor, "floor": floor, "lamp": lamp})
+    floor = scenes.floor(0, 2, parts.grey(0.6))
+    return scenes.load(sensor=sensor, floor=floor, lamp=beam((0, height, 0), half))
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
@@ -291,36 +289,22 @@ def test_directionalarea_by_inner_connections():
 
 # A meter of half-width 0.4 that faces up, and lamps above it.
 UPWARDS = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(0.4)}
-ABOVE = T().translate([0.2, 1, 0]).rotate([1, 0, 0], 90).scale(0.7)
+DOWN = T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1])
+
+
+def above(emitter):
+    return scenes.square((0.2, 1, 0), scenes.DOWNWARDS, 0.7, parts.grey(0.0), emitter=emitter)
+
+
+SPOT = {"type": "spot", "intensity": 3.0, "cutoff_angle": 40, "beam_width": 39.9, "to_world": DOWN}
 LAMPS_ABOVE = {
-    "rectangle": lambda: {
-        "type": "rectangle",
-        "to_world": ABOVE,
-        "bsdf": parts.grey(0.0),
-        "emitter": {"type": "area", "radiance": 2.0},
-    },
+    "rectangle": lambda: above(scenes.area(2.0)),
     "point": lambda: {"type": "point", "position": [0.2, 1, 0], "intensity": 3.0},
-    "spot": lambda: {
-        "type": "spot",
-        "intensity": 3.0,
-        "cutoff_angle": 40,
-        "beam_width": 39.9,
-        "to_world": T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1]),
-    },
-    "projector": lambda: {
-        "type": "projector",
-        "irradiance": 1.0,
-        "fov": 60,
-        "to_world": T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1]),
-    },
+    "spot": lambda: SPOT,
+    "projector": lambda: {"type": "projector", "irradiance": 1.0, "fov": 60, "to_world": DOWN},
     "directional": lambda: {"type": "directional", "direction": [0.6, -0.8, 0], "irradiance": 3.0},
     "constant": lambda: {"type": "constant", "radiance": 0.7},
-    "directionalarea": lambda: {
-        "type": "rectangle",
-        "to_world": ABOVE,
-        "bsdf": parts.grey(0.0),
-        "emitter": {"type": "directionalarea", "radiance": 2.0},
-    },
+    "directionalarea": lambda: above({"type": "directionalarea", "radiance": 2.0}),
 }
 
 
@@ -398,8 +382,7 @@ def test_strategies_of_a_batch_of_meters_agree():
     """Meters side by side share the densities of one; a wrong one would show in the weights."""
     lamp = LAMPS_ABOVE["rectangle"]()
     mirror = {"type": "rectangle", "to_world": T().translate([0, 0, -1]), "bsdf": {"type": "conductor"}}
-    flat = T().translate([0, -0.2, 0]) @ T().rotate([1, 0, 0], -90).scale(3)
-    floor = {"type": "rectangle", "to_world": flat}
+    floor = scenes.floor(-0.2, 3)
     scene = meters_under_a_point(2, lamp=lamp, mirror=mirror, floor=floor)
     both = [renders(scene, bdpt(**o), SAMPLES, i) for i, o in enumerate(({}, {"light_paths": 0}))]
     a, b = (images[:, 0, :, :3] @ CHANNELS for images in both)
