@@ -15,15 +15,11 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "user" / "api.md"
 
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
 def test_integrators_are_instances_of_the_public_class(variant):
-    """Rationale: each variant has a class of its own. Expected: the integrator of a dictionary and that of a
-    scene are instances of `BDPTIntegrator` in every variant; one of Mitsuba's is none.
-    """
     mi.set_variant(variant)
     scene = mi.cornell_box()
     scene["integrator"] = {"type": "bdpt"}
     for integrator in (mi.load_dict({"type": "bdpt"}), mi.load_dict(scene).integrator()):
         assert isinstance(integrator, mitsuba_bdpt.BDPTIntegrator)
-        assert issubclass(type(integrator), mitsuba_bdpt.BDPTIntegrator)
     assert not isinstance(mi.load_dict({"type": "path"}), mitsuba_bdpt.BDPTIntegrator)
 
 
@@ -39,18 +35,12 @@ def documented():
 
 
 def test_all_public_names_are_documented():
-    """Expected: what `mitsuba_bdpt.__all__` names exists and is on the page of the API; all names of the page
-    exist where it says, and have docstrings.
-    """
     assert documented()["mitsuba_bdpt"] == set(mitsuba_bdpt.__all__) - {"__version__", "llvm_choice"}
     for module, names in documented().items():
         assert all(getattr(importlib.import_module(module), name).__doc__ for name in names)
 
 
 def test_statistics_are_of_their_declared_type():
-    """Expected: a render's statistics have all keys that `Statistics` requires, no others than it declares,
-    and values of the declared types.
-    """
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 2, "layers": "variance", "skip": "impossible"})
     scene = mi.cornell_box()
     scene["sensor"]["film"].update(width=8, height=8)

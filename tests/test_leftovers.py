@@ -19,8 +19,7 @@ def keep_a_scene():
 
 
 def test_a_scene_that_an_exception_keeps_is_freed():
-    """Rationale: kernels of later tests visited it, and failed on some days: nobody knows when the cycle
-    collector runs. Expected: it is there before the clean-up of `conftest`, and gone after it."""
+    """Rationale: kernels of later tests visited it, and failed when the cycle collector had not run."""
     before = registered_emitters()
     enabled = gc.isenabled()
     gc.disable()

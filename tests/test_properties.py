@@ -304,8 +304,8 @@ def test_progress_is_reported():
 @pytest.mark.parametrize("cancel", [False, True])
 @pytest.mark.parametrize("rfilter", ["box", "gaussian"])
 def test_interruption_keeps_what_is_done(rfilter, cancel):
-    """Expected: after Ctrl-C, and after `cancel`, the film holds two of five passes, normalised (0.5 exactly for
-    direct light; with splats 1 within four standard errors), and the next render is whole."""
+    """Expected: after Ctrl-C, and after `cancel`, the film holds two of five passes, normalised (0.5 exactly
+    for direct light; with splats 1 within four standard errors), and the next render is whole."""
 
     def stop(report):
         if report.spp_done >= 8:
@@ -1000,8 +1000,8 @@ print("done")
 
 @pytest.mark.parametrize("method", ["render", "decide", "explain"])
 def test_frozen_functions_are_refused_in_words(method):
-    """Expected: a cause and a remedy, which is tried: outside of the function, and without freezing, it renders.
-    (In a process of its own: dr.freeze takes every object of Mitsuba's in it as an input.)"""
+    """Expected: a cause and a remedy, which is tried: outside of the function, and without freezing, it
+    renders. (In a process of its own: dr.freeze takes every object of Mitsuba's in it as an input.)"""
     refused, last = run(FROZEN, method).splitlines()
     assert re.match("UnsupportedError bdpt: .*dr.freeze is not supported.*call render outside", refused)
     assert last == "done"

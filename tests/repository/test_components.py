@@ -24,11 +24,8 @@ TESTS = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class Component:
-    """What is known of a component beside its line in the table.
-
-    ``tests``: its own; ``never``: parameters of a render without it; ``asked``: parameters that ask for it,
-    or ``things`` of a scene that needs it.
-    """
+    """Its own ``tests``; ``never``: parameters of a render without it; ``asked``: parameters that ask for it,
+    or ``things`` of a scene that needs it."""
 
     tests: tuple[str, ...]
     never: dict = field(default_factory=dict)
@@ -38,21 +35,10 @@ class Component:
 
 # A decision that names tables of guided emission.
 _TABLES = {"side": 4, "left": 0.5, "levels": "eJxjYGhgGAUEAAAAgIAB"}
-_DECISION = {
-    "light_paths": 1,
-    "connections": "one",
-    "emission": _TABLES,
-    "coefficients": {"t<=1": 1, "s=1": 1},
-    "cost": 1,
-    "variance": 1,
-    "mean": 1,
-}
+_DECISION = {"light_paths": 1, "connections": "one", "emission": _TABLES, "cost": 1, "variance": 1, "mean": 1}
+_DECISION["coefficients"] = {"t<=1": 1, "s=1": 1}
 
-# Parts of the names of modules that test media.
-_OF_MEDIA = (
-    *("", "_boundaries", "_edges", "_facts", "_identities"),
-    *("_known_answers", "_plausible_bugs", "_plugins"),
-)
+FOG = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
 
 KNOWN = {
     "guided_emission": Component(
@@ -68,9 +54,10 @@ KNOWN = {
         ),
     ),
     "media": Component(
-        things={"fog": {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}},
+        things={"fog": FOG},
         tests=(
-            *(f"images/test_media{name}.py" for name in _OF_MEDIA),
+            "images/test_media.py",
+            "images/test_media_boundaries.py",
             "run/test_media_runs.py",
             "transport/test_media_oracle.py",
             "transport/test_media_counters.py",
@@ -83,7 +70,7 @@ REST = ("emitters/test_endpoints.py", "transport/test_sharing.py", "images/test_
 
 
 def without(name: str, folder: Path) -> Path:
-    """A copy of the package without the component: neither its folder nor its line. Returns its parent."""
+    """The folder of a copy of the package without the component's folder and line."""
     package = Path(mitsuba_bdpt.__file__).parent
     copy = folder / "integrators" / "mitsuba_bdpt"
     shutil.copytree(package, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -96,7 +83,6 @@ def without(name: str, folder: Path) -> Path:
 
 
 def run(sources: Path, *arguments) -> str:
-    """Output of Python with these arguments and the package in ``sources``."""
     paths = os.pathsep.join(map(str, (sources, TESTS, TESTS / "support")))
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
@@ -111,7 +97,6 @@ def run(sources: Path, *arguments) -> str:
 
 
 def scene(things: dict):
-    """A scene that needs no component, and these ``things``."""
     import scene_parts as parts  # once there is a variant
 
     lamp = parts.EMITTERS["rectangle"]()
@@ -129,7 +114,7 @@ def images(parameters: dict) -> dict[str, np.ndarray]:
 
 
 def _render(name: str, out: str):
-    """Render without the component ``name``, and ask for it; both results go to the file ``out``."""
+    """Render without the component ``name``, and ask for it."""
     import short_pilots  # noqa: F401  (imported by conftest.py elsewhere)
 
     mi.set_variant(variants.of("rgb"))
@@ -142,15 +127,13 @@ def _render(name: str, out: str):
 
 
 def test_every_component_is_known_here():
-    """Expected: those of the table."""
     assert set(KNOWN) == set(COMPONENTS)
 
 
 @pytest.mark.parametrize("name", KNOWN)
 def test_the_rest_renders_as_before(name, tmp_path):
-    """Expected: a copy without the component makes the image of a render that does not use it, up to the
-    order of atomic sums, with all strategies and as a pilot chooses; who asks for the component is told.
-    """
+    """Expected: the image of a render that does not use the component, up to the order of atomic sums, with
+    all strategies and as a pilot chooses; who asks for it gets an error."""
     known, sources, out = KNOWN[name], without(name, tmp_path), tmp_path / "made.npz"
     run(sources, __file__, name, out)
     found = np.load(out)
@@ -158,16 +141,6 @@ def test_the_rest_renders_as_before(name, tmp_path):
     assert f"{name.replace('_', ' ')} is not part of this installation" in str(found["said"])
     for skip, expected in images(known.never).items():
         np.testing.assert_allclose(found[skip], expected, rtol=2e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("name", KNOWN)
-def test_tests_that_import_a_component_are_known_here(name):
-    """Rationale: two new ones could not be collected without it, which only the slow test saw. Expected: each
-    module that imports it when it is collected is among its tests."""
-    imports = re.compile(rf"^(from|import) mitsuba_bdpt(\.| import ){name}\b", re.MULTILINE)
-    found = {file for file in TESTS.rglob("test_*.py") if imports.search(file.read_text())}
-    known = [TESTS / path for path in KNOWN[name].tests]
-    assert not {file for file in found if not any(file.is_relative_to(own) for own in known)}
 
 
 @pytest.mark.slow

@@ -24,9 +24,7 @@ def anchors(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files(page):
-    """Rationale: `make docs` checks the links of the site; GitHub forms anchors in another way, and shows
-    pages that the site does not have. Expected: every relative link of a page leads to a file of the
-    repository, and its anchor to a heading as GitHub names it."""
+    """As GitHub names anchors; `make docs` checks the links of the site."""
     missing = []
     for link in re.findall(r"\]\(([^)\s]+)[^)]*\)", page.read_text()):
         path, _, anchor = link.partition("#")
@@ -37,21 +35,17 @@ def test_links_lead_to_files(page):
 
 
 def test_the_page_of_the_parameters_is_made_from_them():
-    """Expected: docs/user/parameters.md has the table of `settings` between its markers."""
     page = (ROOT / "docs" / "user" / "parameters.md").read_text()
     found = re.search(r"<!-- report: parameters -->\n(.*)<!-- end -->", page, re.DOTALL)[1]
     assert found.strip() == settings.table().strip()
 
 
 TABLES = ROOT / "docs" / "user" / "coming_from.md"
-NAMES = {"path", "bdpt"}
-"""Integrators, which the tables of that page name beside parameters."""
+NAMES = {"path", "bdpt"}  # integrators, beside parameters
 
 
 def test_parameters_named_for_newcomers_exist():
-    """Rationale: nobody who comes from another renderer can tell a parameter that was renamed from one never
-    tried. Expected: in the last column of the page's tables every name is a parameter, every `name=value`
-    loads and every option is one of `render`."""
+    """In the last column every name is a parameter, every `name=value` loads, every option is `render`'s."""
     mi.set_variant("llvm_ad_rgb")
     cells = re.findall(r"^\|.*\| (.*) \|$", TABLES.read_text(), re.MULTILINE)
     spans = [span for cell in cells for span in re.findall(r"`([^`]+)`", cell)]
@@ -70,7 +64,6 @@ def test_parameters_named_for_newcomers_exist():
 
 
 def test_the_menu_for_blender_has_our_parameters():
-    """Expected: the entry for the add-on's integrators.json names parameters, their types and defaults."""
     page = (ROOT / "docs" / "user" / "blender.md").read_text()
     text = re.search(r"```json\n(.*?)```", page, re.DOTALL)[1]
     kinds = {int: "integer", float: "float", bool: "boolean"}

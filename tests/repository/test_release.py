@@ -20,8 +20,7 @@ def test_version_has_one_home():
 
 
 def test_the_repository_has_one_address():
-    """Rationale: many files name the address. Expected: each address of this repository on GitHub or in Colab
-    begins with that of pyproject.toml, and a file that it names on the branch main exists."""
+    """As in pyproject.toml, on GitHub and in Colab; and a file that it names on the branch main exists."""
     home = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Homepage"]
     files = [*ROOT.glob("*.*"), *ROOT.glob("docs/user/*"), *ROOT.glob(".github/*/*")]
     text = "\n".join(
@@ -39,18 +38,7 @@ def test_the_repository_has_one_address():
         )
 
 
-def test_each_package_is_required_once():
-    """Rationale: a package that two extras name with different bounds was tested with neither. Expected:
-    every package has one home among the dependencies, the extras and the dependency groups."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    extras = project["project"]["optional-dependencies"] | project["dependency-groups"]
-    lists = [project["project"]["dependencies"], *extras.values()]
-    names = [re.match(r"[\w-]+", requirement)[0] for texts in lists for requirement in texts]
-    assert len(names) == len(set(names)), sorted(names)
-
-
 def test_the_extra_of_measuring_is_what_is_looked_for():
-    """Expected: the modules that the commands look for are those of the packages of the extra `[measure]`."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     packages = [re.match(r"[\w-]+", text)[0] for text in project["optional-dependencies"]["measure"]]
     modules = {re.sub("_(science|py)$", "", name.replace("-", "_")) for name in packages}

@@ -65,23 +65,18 @@ def by_user(monkeypatch, command, *arguments):
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("choices.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
-        (
-            "compare bdpt path --scenes nowhere",
-            "scene='nowhere' is neither a scene file nor the name of one",
-        ),
-        (
-            "equal-time scenes/nowhere",
-            "neither a scene file nor the name of one in",
+        *(
+            (f"{command} nowhere", "scene='nowhere' is neither a scene file nor the name of one")
+            for command in (
+                *("choices.py", "fireflies.py", "floor.py", "overhead.py", "pyramid", "equal-time"),
+                *("compare bdpt path --scenes", f"versus.py {SCRIPTS.parent} --scenes"),
+            )
         ),
         ("equal-time room.xml -o a.jpg", "output='a.jpg' must end in .pdf, .svg, .png"),
         ("equal-time room.xml --reference words.toml", "'words.toml' is not an EXR"),
         ("equal-time words.toml --reference flat.exr", "Parsing of XML"),
         ("equal-time room.xml --reference flat.exr -i nope bdpt", "nope"),
         ("equal-time room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
-        ("fireflies.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
-        ("floor.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
-        ("overhead.py nowhere", "scene='nowhere' is neither a scene file nor the name of one"),
         ("scale.py nothing", "kind='nothing' is not known; use some of spheres, "),
         ("scale.py --sizes 3", "--sizes needs kinds"),
         ("scale.py lamps --sizes 0", "size='0': "),
@@ -91,7 +86,6 @@ def by_user(monkeypatch, command, *arguments):
         ("page . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page . -o words.toml/a.html", "words.toml"),
         ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
-        ("pyramid nowhere", "scene='nowhere' is neither a scene file"),
         ("pyramid room.xml -o words.toml/a", "words.toml"),
         ("pyramid room.xml --max-depth 1", "max_depth=1 has no strategies"),
         ("pyramid room.xml --heuristic some", "bdpt: heuristic='some' is not known"),
@@ -99,15 +93,10 @@ def by_user(monkeypatch, command, *arguments):
         ("sweep.py words.toml", "words.toml is not TOML"),
         (f"sweep.py {SCRIPTS.parent / 'presets' / 'small.toml'} -o words.toml", "words.toml"),
         ("versus.py nowhere", "checkout=nowhere has no integrators/mitsuba_bdpt; give a clone or a worktree"),
-        (
-            f"versus.py {SCRIPTS.parent} --scenes nowhere",
-            "scene='nowhere' is neither a scene file nor the name of one",
-        ),
         (f"versus.py {SCRIPTS.parent} --parameters skip=some", "bdpt: skip='some' is not known"),
     ],
 )
 def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, message):
-    """Expected: one line on standard error that names what is wrong, status 2, no traceback."""
     write_layers(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
     script, *words = shlex.split(command)
     assert by_user(monkeypatch, script, *words) == 2
@@ -138,8 +127,6 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
     ],
 )
 def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command):
-    """Rationale: NaN seconds ended at once or never, no samples at all were a warning of NumPy's. Expected:
-    the usage, which option is meant and what it takes, status 2."""
     script, *words = command.split()
     assert by_user(monkeypatch, script, *words) == 2
     error = capsys.readouterr().err
@@ -156,8 +143,6 @@ def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command
     ],
 )
 def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, command, taken):
-    """Rationale: a name given by mistake must not cost the user the file. Expected: refused in words before
-    anything is rendered."""
     write_layers(Path("flat.exr"), {"": np.ones((8, 8, 3))}, {})
     Path(taken).write_text("precious")
     before = sorted(Path().iterdir())
@@ -168,20 +153,15 @@ def test_a_file_of_another_format_is_not_overwritten(here, monkeypatch, capsys, 
 
 
 def test_a_comparison_with_what_has_no_error_is_refused():
-    """Rationale: 0 / 0 and 1 / 0 stood in the table. Expected: words instead of figures."""
     exact = pd.DataFrame({"rel_mse_trimmed": [0.0, 0.0]})
-    assert list(compare.line(exact, exact).values()) == [
-        "every value (trimmed) is exactly that of the reference"
-    ]
+    (text,) = compare.line(exact, exact).values()
+    assert text == "every value (trimmed) is exactly that of the reference"
 
 
 @pytest.mark.parametrize(("second", "ratio", "bounds"), [(0.1, 4.0, ("", "")), (0.02, None, ("≥", "≤"))])
 def test_a_comparison_is_of_the_errors_of_reports(second, ratio, bounds):
-    """Renders of 20 % noise and of 10 % or 2 % against a reference of 10 %, half of the second's measured
-    error or most of it. Rationale: measured ratios, with the reference's error in both, were 2.5 for a ratio
-    of variances of 4.
-    Expected: 4 within 10 % (12,288 values), and the efficiency its reciprocal; of a second side with less
-    noise than the reference, bounds."""
+    """Noise of 20 %, and of 10 % or 2 %; a reference of 10 %. Expected: a ratio of variances of 4 within
+    10 % (12,288 values), the efficiency its reciprocal; bounds below the reference's noise."""
     rng, truth = np.random.default_rng(1), np.ones((64, 64, 3))
 
     def noisy(sigma):
@@ -200,8 +180,7 @@ def test_a_comparison_is_of_the_errors_of_reports(second, ratio, bounds):
 
 
 def test_the_floor_is_recorded_in_a_variant(monkeypatch):
-    """Rationale: the versions in the record name the LLVM of the variant, and without one the last command of
-    `make benchmark` failed after an hour. Expected: the variant is set first."""
+    """The record names the LLVM of the variant."""
     steps = []
     monkeypatch.setattr(mi, "set_variant", lambda name: steps.append("variant"))
     monkeypatch.setattr(floor, "record", lambda file, rounds: steps.append("record"))
@@ -214,21 +193,17 @@ COMMANDS = sorted(path.name for path in SCRIPTS.glob("*.py") if "__main__" in pa
 @pytest.mark.parametrize("script", COMMANDS)
 @pytest.mark.parametrize("words", [["--help"], ["--no-such-option"]], ids=" ".join)
 def test_help_does_nothing_else(here, monkeypatch, capsys, script, words):
-    """Rationale: three scripts took --help for the name of a folder, or measured for minutes. Expected: the
-    usage, or the error of the command, and nothing else: no file, no render, status 0; a mistyped option has
-    the status 2."""
+    """Expected: the usage or an error; no file, no render."""
     monkeypatch.setattr(mi, "render", lambda *args, **keys: pytest.fail("rendered"))
     monkeypatch.setattr(mi, "load_dict", lambda *args, **keys: pytest.fail("loaded"))
     before = sorted(here.rglob("*"))
     assert by_user(monkeypatch, script, *words) == (0 if words == ["--help"] else 2)
     shown = capsys.readouterr()
-    assert (shown.out + shown.err).startswith(("usage: ", "mitsuba-bdpt ")) and sorted(
-        here.rglob("*")
-    ) == before
+    assert (shown.out + shown.err).startswith(("usage: ", "mitsuba-bdpt "))
+    assert sorted(here.rglob("*")) == before
 
 
 def test_every_script_of_the_documents_exists():
-    """Expected: the commands that the README and the pages of docs/ name are there, and are commands."""
     pages = SCRIPTS.parent / "README.md", *(SCRIPTS.parent / "docs").rglob("*.md")
     named = {name for page in pages for name in re.findall(r"python scripts/(\w+\.py)", page.read_text())}
     assert len(named) > 8 and named <= set(COMMANDS)
@@ -236,9 +211,7 @@ def test_every_script_of_the_documents_exists():
 
 @pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda mutant: mutant.name)
 def test_mutants_can_be_planted(mutant, tmp_path):
-    """Rationale: once the code has changed, a bug whose text is no longer there would be found at the next
-    `make mutants` only, and a test that was renamed as well. Expected: the text is replaced in the copy; the
-    tests exist (`make mutants` sees whether their parameters do)."""
+    """`make mutants` sees whether parameters of the tests exist."""
     copy = mutants.planted(tmp_path, mutant) / mutants.PACKAGE.name / mutant.file
     original = (mutants.PACKAGE / mutant.file).read_text()
     assert mutant.old not in copy.read_text() or mutant.old in mutant.new
@@ -254,7 +227,6 @@ def test_mutants_can_be_planted(mutant, tmp_path):
     [
         (0, "1 passed", True, "does not see the bug"),
         (1, "E   NameError: name 'x'", True, "fails by something else"),
-        (1, "E       assert 1 == 2", True, ""),
         (1, "E       AssertionError: ", True, ""),
         (4, "no such test", True, "not run"),
         (0, "1 passed", False, ""),
@@ -262,13 +234,12 @@ def test_mutants_can_be_planted(mutant, tmp_path):
     ],
 )
 def test_outcomes_of_mutants_are_judged(status, output, bug, fault):
-    """Expected: only a test that fails by an assertion sees a bug; without one it has to pass."""
     judged = mutants.judged(status, output, bug)
     assert judged.startswith(fault) and bool(judged) == bool(fault)
 
 
 def test_bugs_are_not_taken_for_mistakes():
-    """Expected: what neither a check of this project nor the system nor Mitsuba's parser raised is raised."""
+    """Only errors of this project's own types are about what a user gave."""
 
     def plugin(error):
         return RuntimeError(f"[parser.cpp:1] At x: Traceback (most recent call last):\n  File y\n{error}")
@@ -285,7 +256,6 @@ def test_bugs_are_not_taken_for_mistakes():
     ):
         with pytest.raises((ValueError, KeyError, RuntimeError)):
             mistakes.answered(bug)
-    # Only the errors of this project's own types are about what a user gave.
     with pytest.raises(ValueError, match="own"):
         mistakes.answered(lambda: raised(ValueError("own")))
     for error in (CommandError("own"), UsageError("own"), UnsupportedError("own")):
@@ -293,8 +263,7 @@ def test_bugs_are_not_taken_for_mistakes():
 
 
 def test_equal_time_of_a_scene_file(here, capsys):
-    """Rationale: only names in scenes/ were taken. Expected: a file with a reference of its own gives the
-    picture, and errors that are upper bounds, since its own is not known; one of another size is refused."""
+    """Errors are upper bounds where the reference's own is not known; one of another size is refused."""
     mi.set_variant("llvm_ad_rgb")
     scene = mi.load_file("room.xml")
     path = mi.load_dict({"type": "path", "max_depth": 3})
@@ -312,8 +281,7 @@ def test_equal_time_of_a_scene_file(here, capsys):
 
 
 def test_two_checkouts_are_compared(tmp_path, capsys):
-    """Expected: this checkout makes the same images as itself; one in which light subpaths are a hundredth as
-    bright does not, and that is the exit status."""
+    """This checkout, and one in which light subpaths are a hundredth as bright."""
     other = tmp_path / "other"
     shutil.copytree(SCRIPTS.parent / "integrators", other / "integrators")
     options = ["--scenes", "ring_caustic", "--spp", "4", "--pairs", "1", "--same"]

