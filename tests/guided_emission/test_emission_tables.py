@@ -1,8 +1,5 @@
-"""Guided emission: whatever the tables say, every place that asks for a density says the one sampled with.
-
-Tables are random, of neighbours that differ by up to 50. They change which subpaths are made and how much
-each carries, and so nothing on the mean.
-"""
+"""Guided emission: every strategy states the density sampled with. Tables are random, of neighbours that
+differ by up to 50."""
 
 import json
 from dataclasses import replace
@@ -24,14 +21,13 @@ COUNT, LEVEL = 200_000, 1e-4
 
 
 def random_tables(emitters, seed=1, side=0):
-    """Tables whose densities are between 1/50 and 1 of the largest, up to their mean."""
     side = side or side_of(sum(emitters.tables))
     densities = np.random.default_rng(seed).random((sum(emitters.tables), side, side)) ** 4 + 0.02
     return EmissionTables.of(densities / densities.mean(axis=(1, 2), keepdims=True), 0.5)
 
 
 def without_sky(tables, emitters):
-    """``tables`` with uniform ones for the sky, the emitter that has more than one."""
+    """With uniform tables for the sky, the emitter that has more than one."""
     densities = tables.densities()
     sky = next(i for i, count in enumerate(emitters.tables) if count > 1)
     first = sum(emitters.tables[:sky])
@@ -40,7 +36,6 @@ def without_sky(tables, emitters):
 
 
 def emissions(emitters, name="", seed=11):
-    """`COUNT` emissions, of all emitters."""
     u = [mi.Float(v) for v in np.random.default_rng(seed).random((4, COUNT), dtype=np.float32)]
     like = dr.zeros(mi.Interaction3f)
     like.time = mi.Float(0.3)
@@ -56,13 +51,12 @@ def column(x, count=COUNT):
 
 
 def passing(e, center, radius):
-    """Mask: emissions that pass a ball."""
+    """Emissions that pass a ball."""
     d, away = column(e.d), column(e.si.p) - np.array(center)[:, None]
     return np.linalg.norm(away - np.sum(away * d, axis=0) * d, axis=0) < radius
 
 
 def guidable():
-    """The emitters of `scene_parts` that have tables."""
     parts.register_plugins()
     return [name for name in parts.EMITTERS if parts.plugin_of(parts.EMITTERS[name]()) in GUIDED]
 
@@ -77,18 +71,14 @@ def scene_of(name, **others):
 
 
 def test_every_emitter_is_looked_at():
-    """Expected: all emitters that have tables are among those of this module."""
     with_tables = {name for name in parts.EMITTERS if sum(Emitters(scene_of(name)).tables)}
     assert with_tables == set(guidable())
 
 
 @pytest.mark.parametrize("name", guidable())
 def test_light_leaves_as_without_tables(name):
-    """Rationale: a weight that is not over the density sampled with would brighten some directions.
-
-    Expected: the light that leaves into each of 64 bins (of directions; of places seen along them, for light
-    from infinity) is that of emissions without tables. Statistic: a normal test per bin, Sidak, 1e-4.
-    """
+    """In each of 64 bins of directions (of places along them, for light from infinity). Normal test per bin,
+    Sidak, 1e-4."""
     emitters = Emitters(scene_of(name))
     bins, weights = [], []
     for seed, made in ((11, emitters), (12, random_tables(emitters).guided(emitters))):
@@ -110,11 +100,7 @@ def test_light_leaves_as_without_tables(name):
 
 @pytest.mark.parametrize("name", guidable())
 def test_all_strategies_state_one_density(name):
-    """Rationale: emission, t = 0, next-event estimation and hits ask in different ways.
-
-    Expected: for emissions that meet a plane, all state the density sampled with, but for those within
-    rounding of the edge of a cell (fewer than 1e-3; a texture's or a sun's edges: 1e-2).
-    """
+    """For emissions that meet a plane, but for those within rounding of the edge of a cell (1e-3)."""
     emitters = Emitters(scene_of(name))
     guided = random_tables(emitters).guided(emitters)
     e = emissions(guided, name)
@@ -134,7 +120,7 @@ DETAILS = {"small": 0.02, "middle": 2.0, "large": 4.0}
 
 
 def on_a_ground(radius, more=0):
-    """A ball on a large ground under a sun and a sky, and so many points that make tables small."""
+    """A ball on a large ground under a sun and a sky, and points that make tables small."""
     scene = {
         "type": "scene",
         "ground": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)},
@@ -150,9 +136,9 @@ def on_a_ground(radius, more=0):
 @pytest.mark.parametrize("more", [0, 130])
 @pytest.mark.parametrize("size", DETAILS)
 def test_details_beside_tables(size, more, only_sun):
-    """Rationale: a point on the disk of the details is not in the cell in which its numbers are. Expected:
-    emission states the density that all other strategies do, also where the sky's table is left alone.
-    """
+    """A point on the disk of the details is not in the cell of its numbers. Expected: one density for all
+    strategies, also where the sky's table is uniform, and the same light on the ball (five standard
+    errors)."""
     emitters = Emitters(on_a_ground(DETAILS[size], more))
     assert emitters.disks.details is not None
     tables = random_tables(emitters)
@@ -173,9 +159,8 @@ def test_details_beside_tables(size, more, only_sun):
 
 @pytest.mark.parametrize("name", [*guidable(), "small", "large"])
 def test_what_tables_change_of_a_density(name):
-    """Rationale: what a pilot learns from samples without tables is what they would change. Expected: the
-    density with tables is ``kept`` + ``scaled`` r times that without, but for the edges of cells.
-    """
+    """Expected: the density is ``kept`` + ``scaled`` r times that without tables, but for the edges of
+    cells."""
     scene = on_a_ground(DETAILS[name]) if name in DETAILS else scene_of(name)
     emitters = Emitters(scene)
     tables = random_tables(emitters)
@@ -195,7 +180,7 @@ def test_what_tables_change_of_a_density(name):
 
 
 def lit_from(name, guided, count=20_000):
-    """Next-event estimation for points about the emitter: its samples, the points, and what is hit there."""
+    """Next-event estimation for points about the emitter."""
     u = [mi.Float(v) for v in np.random.default_rng(4).random((5, count), dtype=np.float32)]
     at = dr.zeros(mi.SurfaceInteraction3f, count)
     at.p = mi.Point3f(u[0] - 0.5, u[1] + 1.2, u[2] - 0.5)
@@ -205,10 +190,8 @@ def lit_from(name, guided, count=20_000):
 
 @pytest.mark.parametrize("name", [n for n in guidable() if n != "timed_sunsky"])
 def test_next_event_estimation_and_hits_state_the_same(name):
-    """Expected: the ratio of densities that next-event estimation states is the one of what a ray from its
-    point hits there, and both change with the tables as the density of the cell says. Tolerance: 2e-3, for
-    all but the edges of cells, texels and the sun (2 %).
-    """
+    """Expected: next-event estimation states the ratio of densities of what its ray hits; both change with
+    the tables as the cell's density. To 2e-3, but for the edges of cells, texels and the sun (2 %)."""
     scene = scene_of(name)
     emitters = Emitters(scene)
     tables = random_tables(emitters)
@@ -243,10 +226,8 @@ def test_next_event_estimation_and_hits_state_the_same(name):
 
 @pytest.mark.parametrize("n", [[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, -0.0], [0.6, 0.8, 0.0]])
 def test_frames_do_not_depend_on_who_asks(n):
-    """Rationale: a frame made of a normal is mirrored by the sign of a zero, and a table with it.
-
-    Expected: the place of a direction is the same for directions and normals that differ by rounding.
-    """
+    """Rationale: a frame made of a normal is mirrored by the sign of a zero. Expected: one place for
+    directions that differ by rounding."""
     turn = mi.ScalarTransform4f().look_at([0, 0, 0], n, [0.3, 0.2, 0.9])
     lamp = {"type": "rectangle", "to_world": turn, "emitter": {"type": "area"}}
     sun = {"type": "directional", "direction": n}
@@ -262,7 +243,6 @@ def test_frames_do_not_depend_on_who_asks(n):
 
 
 def test_what_is_flat():
-    """Expected: rectangles, disks and meshes of one normal; not balls, cubes, and bent planes."""
     for kind in ("rectangle", "disk", "sphere", "cube", "cylinder"):
         assert is_flat(mi.load_dict({"type": kind})) == (kind in ("rectangle", "disk")), kind
     for name in ("flat mesh", "smooth mesh"):  # of many faces, without and with normals at vertices
@@ -280,9 +260,7 @@ def test_what_is_flat():
 
 
 def test_only_what_gains_is_looked_up():
-    """Rationale: looking densities up takes time at every vertex. Expected: of emitters whose tables are
-    uniform, no group has a guide, and a lamp beside a guided one emits as by itself.
-    """
+    """Looking densities up takes time at every vertex."""
     scene = scene_of("constant", more=parts.EMITTERS["rectangle"]())
     emitters = Emitters(scene)
     guided = without_sky(random_tables(emitters), emitters).guided(emitters)
@@ -292,7 +270,7 @@ def test_only_what_gains_is_looked_up():
 
 @pytest.mark.parametrize("radius, kept", [(0.02, True), (1.0, False)])
 def test_details_smaller_than_a_cell_keep_their_disk(radius, kept):
-    """Expected: emissions towards small things on a large ground are half of all, with tables as without."""
+    """Half of all emissions go towards small things on a large ground."""
     ground = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(10)}
     thing = {"type": "sphere", "center": [3, 2, radius], "radius": radius}
     sun = {"type": "directional", "direction": [0.1, 0.2, -1]}
@@ -306,7 +284,7 @@ def test_details_smaller_than_a_cell_keep_their_disk(radius, kept):
 
 
 def test_tables_come_back_from_json():
-    """Expected: the same tables; densities within half of a step of 2^(1/16), of mean 1."""
+    """Densities within half of a step of 2^(1/16)."""
     densities = np.random.default_rng(3).random((5, 8, 8)) + 0.1
     densities /= densities.mean(axis=(1, 2), keepdims=True)
     tables = EmissionTables.of(densities, 0.5)
@@ -318,7 +296,7 @@ def test_tables_come_back_from_json():
 
 @pytest.mark.parametrize("count", [0, 1, 17, 18, 38, 39, 153, 154, 612, 613])
 def test_sizes_of_tables(count):
-    """Expected: no more than `MOST_CELLS` cells, and the most that fit."""
+    """The most cells that fit."""
     side = side_of(count)
     if not 0 < count <= MOST_CELLS // SIDES[-1] ** 2:
         assert side == 0
@@ -329,9 +307,7 @@ def test_sizes_of_tables(count):
 
 @pytest.mark.parametrize("side", SIDES)
 def test_warped_numbers_are_distributed_as_the_tables_say(side):
-    """Expected: of stratified numbers each cell gets its share, within a few of `COUNT`; the stated density
-    is that of the cell in which the number is; the order of neighbours stays.
-    """
+    """Expected: stratified numbers, the stated density that of the cell; the order of neighbours stays."""
     emitters = Emitters(scene_of("rectangle"))
     tables = random_tables(emitters, side=side)
     guided = tables.guided(emitters)
@@ -352,7 +328,6 @@ def test_warped_numbers_are_distributed_as_the_tables_say(side):
 
 
 def test_a_copy_leaves_the_emitters_alone():
-    """Expected: emitters that tables were made for emit as before."""
     emitters = Emitters(scene_of("sphere"))
     before = column(emissions(emitters).pdf_second)
     guided = random_tables(emitters).guided(emitters)

@@ -1,9 +1,6 @@
-"""Paths that the kernel itself makes, vertex by vertex, with the weights that it gives them.
-
-The kernel runs unchanged, but its loops step by step, so that what it shows its observer can be kept. The
-densities of each path from both sides are asked of the scene anew: BSDFs by their ``pdf``, endpoints in
-closed form (`endpoints`).
-"""
+"""Paths that the kernel itself makes, vertex by vertex, with the weights that it gives them. The kernel runs
+unchanged, its loops step by step. Densities of each path from both sides are evaluated anew: BSDFs by their
+``pdf``, endpoints in closed form (`endpoints`)."""
 
 from __future__ import annotations
 
@@ -41,11 +38,8 @@ MOST_TURNED = 1e-3
 
 @dataclass
 class Point:
-    """A vertex of paths.
-
-    Position, geometric normal, densities of the directions to both neighbours, and whether its event is a
-    delta one.
-    """
+    """A vertex of paths: position, geometric normal, densities of the directions to both neighbours, whether
+    its event is a delta one."""
 
     p: np.ndarray
     n: np.ndarray
@@ -59,10 +53,8 @@ POINT = tuple(f.name for f in fields(Point))
 
 @dataclass
 class Walked:
-    """What a walk passed by, from vertex 1 on.
-
-    ``vertices``, directions ``d`` of the edges to them, `Point` where the walk went on; ``origin`` vertex 0.
-    """
+    """A walk from vertex 1 on: ``vertices``, directions ``d`` of the edges to them, `Point` where the walk
+    went on; ``origin`` vertex 0."""
 
     origin: object = None
     vertices: list = field(default_factory=list)
@@ -72,12 +64,9 @@ class Walked:
 
 @dataclass
 class Made:
-    """Paths that the kernel made with ``s`` light vertices, and the ``weights`` it gave them.
-
-    ``unsure`` counts those left out, where rounding decides which disk light from infinity has started on,
-    whether a point lies on a lamp, what the density of an environment map is at its poles, or what the
-    cosines of a short edge are (`MOST_TURNED`).
-    """
+    """Paths with ``s`` light vertices and their ``weights`` by the kernel. ``unsure`` counts those left out,
+    where rounding decides which disk light from infinity has started on, whether a point lies on a lamp, the
+    density of an environment map at its poles, or the cosines of a short edge (`MOST_TURNED`)."""
 
     s: int
     weights: np.ndarray
@@ -86,22 +75,19 @@ class Made:
 
 
 def rows(v) -> np.ndarray:
-    """A Dr.Jit vector as rows, a number as an array, in float64."""
     return float64(v).T
 
 
 def densities(si, to_light, to_camera):
-    """Solid-angle densities with which the BSDF at ``si`` samples each of two directions from the other.
-
-    The directions are local: ``to_camera``, then ``to_light``.
-    """
+    """Solid-angle densities with which the BSDF samples each of two local directions from the other:
+    ``to_camera``, then ``to_light``."""
     ctx, plugin = mi.BSDFContext(), si.bsdf()
     forward = plugin.pdf(ctx, bsdf.with_wi(si, to_light), to_camera)
     return forward, plugin.pdf(ctx, bsdf.with_wi(si, to_camera), to_light)
 
 
 class Tables:
-    """Densities of emission that tables guide, in closed form; frames and what is flat are the package's."""
+    """Densities of guided emission in closed form; frames and what is flat are the package's."""
 
     def __init__(self, scene, tables):
         self.tables, self.side = tables.densities(), tables.side
@@ -109,7 +95,7 @@ class Tables:
         self.emitters, self.counts, self.disks = world.objects, world.tables, world.disks
 
     def second(self, number, own, x1, d):
-        """That of x_1 from the emitter ``number``, whose ``own`` density it is without tables."""
+        """That of x_1 from the emitter ``number``, whose density without tables is ``own``."""
         emitter, name = self.emitters[number], self.emitters[number].class_name()
         shape, v = emitter.get_shape(), mi.Vector3f(*(mi.Float(np.float32(x)) for x in d.T))
         if not self.counts[number]:
@@ -140,10 +126,7 @@ class Tables:
 
 
 class Capture(Observer):
-    """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer.
-
-    `made` yields all paths.
-    """
+    """One run of the kernel over ``lanes`` pairs of subpaths, of which it is sink and observer."""
 
     def __init__(self, scene, integrator, lanes: int, seed: int):
         self.scene, self.lanes = scene, lanes
@@ -165,7 +148,6 @@ class Capture(Observer):
 
     @property
     def coefficients(self) -> Coefficients:
-        """With which the classes enter the weights."""
         kappa = self.kernel.kappa
         names = ("endpoints", "splat", "inner", "arrival")
         return Coefficients(*(float(np.array(getattr(kappa, name)).ravel()[0]) for name in names))
@@ -185,12 +167,10 @@ class Capture(Observer):
     # What the kernel shows: it has an observer, see `Observer`.
 
     def emitted(self, emission):
-        """Keep y_0."""
         dr.eval(emission)
         self.emission = emission
 
     def started(self, bound, side, walk):
-        """A subpath begins."""
         self.kernel, self.stream, self.walking = bound, side.stream, self.walked[side.name]
         self.walking.origin = mi.Point3f(walk.previous)
         dr.eval(self.walking.origin)
@@ -203,7 +183,6 @@ class Capture(Observer):
             self._keep_endpoint(1, 1, connection)
 
     def vertex(self, side, walk, vertex, step):
-        """A subpath has reached a vertex."""
         pair = (vertex.si.wi, step.wo) if side.adjoint else (step.wo, vertex.si.wi)
         asked = densities(vertex.si, *pair)
         dr.eval(vertex, step, asked, walk)
@@ -226,11 +205,10 @@ class Capture(Observer):
     alpha = False
 
     def begin(self):
-        """Nothing found yet."""
         return mi.Float(0)
 
     def add(self, kernel_, c, total, start, shared):
-        """Keep s = 0 and s = 1."""
+        """s = 0 and s = 1."""
         self._keep(0 if c.kind == "hit" else 1, len(self.walking.vertices) + 1, c)
         return total
 
@@ -239,12 +217,11 @@ class Capture(Observer):
         return total, Counters()
 
     def splat(self, kernel_, c, shared, stream):
-        """Keep (1,1), t = 1 and t = 0."""
+        """(1,1), t = 1 and t = 0."""
         self._keep(len(self.walked["light"].vertices) + 1, int(c.t[0]), c)
         return Counters()
 
     def end(self, *_):
-        """Nothing to add up."""
         return Counters()
 
     def _keep(self, s, t, c):
@@ -292,10 +269,8 @@ class Capture(Observer):
         return Made(s, weights[sure], paths.of(sure), int((~sure).sum()))
 
     def _paths(self, index, stacked, d):
-        """The `Paths` through vertices along the directions ``d``; and where their densities are certain.
-
-        ``stacked``: fields of `Point` side by side.
-        """
+        """The `Paths` through vertices (``stacked``: fields of `Point` side by side) along the directions
+        ``d``; and where their densities are certain."""
         x, n, *pdfs = stacked
         kind = np.array([lamp.kind for lamp in self.lamps])[index]
         infinite = (kind == ENVIRONMENT) | (kind == DIRECTIONAL)
@@ -335,7 +310,6 @@ class Capture(Observer):
         return first, second, direct
 
     def _index(self, s, t):
-        """Of the emitter at x_0."""
         if s >= 2 or (s, t) == (1, 1):
             found = np.array(self.emission.index)
         elif s == 1:
@@ -380,7 +354,6 @@ class Capture(Observer):
         return [*first, *middle, *last], [*light.d[: max(s - 1, 0)], *between, *back]
 
     def _free(self, p, n=(0, 0, 0)) -> Point:
-        """An endpoint."""
         zeros = np.zeros(self.lanes)
         return Point(self._wide(rows(p)), self._wide(rows(n)), zeros, zeros, zeros.astype(bool))
 
@@ -401,12 +374,9 @@ TOLERANCE = 1e-3
 
 @dataclass
 class Weighed:
-    """What the weights of ``paths`` of the kernel are, with those of other strategies by the recursion.
-
-    ``bad`` paths have a weight that is negative, above 1 or not finite, ``off`` ones a sum that is not 1;
-    ``wrong``: weights by the kernel that differ from those by explicit densities, ``differ`` the largest
-    difference; ``unsure`` see `Made`.
-    """
+    """``bad`` paths have a weight that is negative, above 1 or not finite, ``off`` ones a sum, with the
+    weights of other strategies by the recursion, that is not 1; ``wrong``: weights by the kernel that differ
+    from those by explicit densities, ``differ`` the largest difference; ``unsure`` see `Made`."""
 
     paths: int = 0
     bad: int = 0
@@ -416,7 +386,6 @@ class Weighed:
     differ: float = 0.0
 
     def add(self, capture: Capture, heuristic: str) -> None:
-        """Add the paths of a run."""
         for m in capture.made():
             if not len(m.weights):
                 continue

@@ -1,7 +1,4 @@
-"""Random chains of densities, and the weights of all strategies by the recursion.
-
-What tests/transport/test_oracle.py and the stress cases share; the truth is in `oracle`.
-"""
+"""Random chains of densities, and the weights of all strategies by the recursion."""
 
 from __future__ import annotations
 
@@ -29,12 +26,8 @@ COEFFICIENTS = {
 
 
 def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
-    """``n`` random paths of ``k`` edges.
-
-    Densities spread over ``2 decades`` orders of magnitude, squared distances over ``2 geometry``, a share
-    ``delta`` of delta vertices, all kinds of emitters and both kinds of sensors. All numbers are float32
-    exactly.
-    """
+    """Densities spread over ``2 decades`` orders of magnitude, squared distances over ``2 geometry``, a share
+    ``delta`` of delta vertices, all kinds of emitters and sensors. All numbers are float32 exactly."""
 
     def spread(shape, width):
         return (10.0 ** rng.uniform(-width, width, shape)).astype(np.float32)
@@ -71,10 +64,8 @@ def random_paths(rng, n, k, decades=3.0, geometry=1.0, delta=0.2) -> Paths:
 
 
 def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndarray:
-    """Weights of all strategies by ``mis.py``, shape (n, k + 2); meaningful where in use.
-
-    With ``eta``, see `oracle.log_merges`, those of the k - 1 merges follow.
-    """
+    """Weights of all strategies by ``mis.py``, (n, k + 2); meaningful where in use. With ``eta``, see
+    `oracle.log_merges`, those of the k - 1 merges follow."""
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
     discs = None if eta is None else [mi.Float(x) for x in eta.astype(np.float32).T]
@@ -90,10 +81,8 @@ def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndar
 
 @dataclass
 class Columns:
-    """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex where `Paths` has columns.
-
-    Masks of the kinds of emitters in place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`.
-    """
+    """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex; masks of the kinds of emitters in
+    place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`."""
 
     k: int
     dist2: list
@@ -117,8 +106,6 @@ class Columns:
 
     @staticmethod
     def of(paths: Paths) -> Columns:
-        """Those of ``paths``."""
-
         def number(x):
             with np.errstate(over="ignore"):
                 return mi.Float(x.astype(np.float32))
@@ -149,10 +136,8 @@ class Columns:
 
 
 class Recursion:
-    """The partial sums along both subpaths of each path, and the weight of each strategy from them.
-
-    In the order of calls of ``walk.py`` and ``techniques.py``.
-    """
+    """Partial sums along both subpaths of each path, and the weight of each strategy from them, in the order
+    of calls of ``walk.py`` and ``techniques.py``."""
 
     def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
         self.path, self.kappa, self.h, self.eta = path, kappa, heuristic, eta
@@ -179,10 +164,8 @@ class Recursion:
         return mis.Partial(after.d_vcm, after.d_vc, *merges)
 
     def _along_light(self):
-        """The partial sums at y_e = x_e of the light subpath, and those with which the last edge sets out.
-
-        As in subpaths.light_subpath, walk._vertex and _scatter.
-        """
+        """At y_e = x_e, and those with which the last edge sets out (subpaths.light_subpath, walk._vertex and
+        _scatter)."""
         x, h = self.path, self.h
         inverse = dr.rcp(x.first * x.second)
         start = dr.select(x.unhittable, 0, h.start(x.cos_light[0] * inverse))
@@ -201,7 +184,7 @@ class Recursion:
         return found, partial
 
     def _along_camera(self):
-        """Camera subpath: the partial sums at z_e = x_{k-e}."""
+        """At z_e = x_{k-e}."""
         x, h, k = self.path, self.h, self.path.k
         from_lens = h.start(x.cos_camera[k - 1] / (x.lens_pdf * x.sensor_pdf))
         arrival = h.scale(from_lens, self.arrival)
@@ -253,7 +236,7 @@ class Recursion:
         return mis.older_merges(self.h, partial, self.h.scale(partial.d_vcm, coefficient), pdf)
 
     def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
-        """Merges at the vertices of a subpath that is connected at x_i; coefficients of rivals."""
+        """Merges at the vertices of a subpath connected at x_i; coefficients of rivals."""
         if self.eta is None:
             return 0
         return mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, own, self.h.start(self.eta[i]))

@@ -1,7 +1,5 @@
-"""Densities of emitters and cameras in closed form, for paths as arrays: rows are paths, float64.
-
-Independent of the package, but for the disks on which light from infinity starts: these it may choose.
-"""
+"""Densities of emitters and cameras in closed form: rows are paths, float64. Independent of the package, but
+for the disks on which light from infinity starts."""
 
 from __future__ import annotations
 
@@ -30,23 +28,18 @@ NEAR_POLE = 0.01
 
 
 def dot(a, b):
-    """Of the rows of two arrays."""
     return (a * b).sum(-1)
 
 
 def length2(a):
-    """Squared length of the rows."""
     return dot(a, a)
 
 
 @dataclass
 class Lamp:
-    """An emitter, as far as the densities of its points and directions ask.
-
-    Its ``kind`` and ``probability`` of being chosen, ``area`` of its shape, ``center`` and ``radius`` of a
-    sphere that shines outwards (0 of other shapes), solid angle ``cone`` into which it shines from a point,
-    direction of an environment map's ``pole``.
-    """
+    """``probability`` of being chosen, ``area`` of its shape, ``center`` and ``radius`` of a sphere that
+    shines outwards (0 of other shapes), solid angle ``cone`` into which it shines from a point, direction of
+    an environment map's ``pole``."""
 
     emitter: mi.Emitter
     kind: int
@@ -97,16 +90,12 @@ class Lamp:
         return self.probability * by_area
 
     def _sin2(self, x1):
-        """Squared sine of half the angle under which a sphere is seen."""
+        """Of half the angle under which a sphere is seen."""
         return self.radius**2 / length2(x1 - self.center)
 
     def unsure(self, x1, d):
-        """Mask: rounding decides the density.
-
-        It does so at the rim of a sphere, of whether it is seen from outside, and near the poles of an
-        environment map: the angle to a pole comes from its cosine, and the density is off by 6e-8 over its
-        square.
-        """
+        """Rounding decides the density: at the rim of a sphere of whether it is seen from outside, and near
+        the poles of an environment map, where the density is off by 6e-8 over the squared angle."""
         if self.pole is not None:
             return 1 - np.square(d @ self.pole) < NEAR_POLE**2
         return self._sin2(x1) > 1 - 1e-4 if self.radius else np.zeros(len(x1), dtype=bool)
@@ -114,25 +103,20 @@ class Lamp:
 
 @dataclass
 class Disks:
-    """Where light from infinity starts: disks that are the outlines of ``spheres``.
-
-    Each of the spheres is (centre, radius, share); a single one is taken to be passed by all light.
-    """
+    """Where light from infinity starts: outlines of ``spheres`` (centre, radius, share); a single one is
+    taken to be passed by all light."""
 
     spheres: list
 
     def passes(self, x, d):
-        """For each sphere: masks of lines that meet it, and of those whose passing rounding decides.
-
-        The lines lead through ``x`` along ``d``; rounding decides close to the rim.
-        """
+        """For each sphere: lines through ``x`` along ``d`` that meet it, and those so close to the rim that
+        rounding decides."""
         for center, radius, _ in self.spheres:
             away = x - center
             miss = np.sqrt(np.maximum(length2(away - dot(away, d)[:, None] * d), 0))
             yield miss <= radius, np.abs(miss - radius) < 1e-3 * radius
 
     def density(self, x, d):
-        """Per area across ``d``."""
         passed = [met for met, _ in self.passes(x, d)]
         if len(passed) == 1:
             passed = [np.ones(len(x), dtype=bool)]
@@ -146,12 +130,10 @@ class Disks:
         return met & (dot(x - center, d) >= -radius)
 
     def unsure(self, x, d):
-        """Where rounding decides."""
         return np.any([rim for _, rim in self.passes(x, d)], axis=0)
 
 
 def disks_of(found) -> Disks | None:
-    """From the package's own."""
     if found is None:
         return None
     spheres = [s for s in (found.scene, found.details) if s is not None]
@@ -162,7 +144,7 @@ def disks_of(found) -> Disks | None:
 
 
 def lamps_of(scene) -> list[Lamp]:
-    """The scene's emitters, in the package's order."""
+    """In the package's order."""
     lamps = in_order(scene)
     weights = np.array([float(np.array(e.sampling_weight()).ravel()[0]) for e in lamps])
     return [_lamp(e, p) for e, p in zip(lamps, (weights / weights.sum()).tolist(), strict=True)]
@@ -192,10 +174,8 @@ def _faces_outwards(sphere, center) -> bool:
 
 @dataclass
 class Camera:
-    """A perspective camera, or with a ``radius`` of its lens a thin lens.
-
-    Optical ``axis``, ``area`` of the film at distance 1.
-    """
+    """A perspective camera, or with a ``radius`` of its lens a thin lens; ``area`` of the film at distance
+    1."""
 
     axis: np.ndarray
     area: float

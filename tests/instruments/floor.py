@@ -1,10 +1,7 @@
-"""Kernel time over its floor: the very rays of a pass, replayed by themselves.
-
-The loops of a pass are run step by step, and every call that traces rays is kept: one per kind and bounce
-(and camera subpath of a light subpath), with the lanes' masks. Each is then replayed as a kernel of its own,
-closest hits with ``compute_surface_interaction``. The floor is the time of these kernels; the pass is
-measured as it is, one kernel, with the same plan and seed. Both sides alternate.
-"""
+"""Kernel time over its floor: the very rays of a pass, replayed by themselves. The loops of a pass are run
+step by step, every call that traces rays is kept with its masks, and replayed as a kernel of its own: closest
+hits with ``compute_surface_interaction``. The pass is measured as it is, one kernel, with the same plan and
+seed. Both sides alternate."""
 
 from __future__ import annotations
 
@@ -27,10 +24,7 @@ SPP = 16
 
 @contextlib.contextmanager
 def recorded(calls: list):
-    """Scenes note in ``calls`` what they are asked to trace.
-
-    As (ray, active, coherent), the last None for shadow rays.
-    """
+    """Scenes note in ``calls`` what they trace: (ray, active, coherent), the last None for shadow rays."""
     closest, shadow = mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test
 
     def note(ray, active, coherent):
@@ -54,7 +48,6 @@ def recorded(calls: list):
 
 
 def kernel_seconds(work) -> float:
-    """Execution time of the kernels that ``work`` runs."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         work()
@@ -75,7 +68,6 @@ class Pass:
         self._path = mi.load_dict({"type": "path", "max_depth": file.max_depth})
 
     def trace(self):
-        """Trace the pass as one kernel."""
         render = self._render
         seed = dr.opaque(mi.UInt32, 1)
         drawn = points.Points(render.settings.points, seed)
@@ -83,7 +75,6 @@ class Pass:
         render.accumulator.evaluate(counts)
 
     def trace_path(self):
-        """Render as many samples with Mitsuba's `path`."""
         dr.eval(mi.render(self._scene, integrator=self._path, spp=SPP))
 
     def rays(self) -> list:
@@ -94,7 +85,7 @@ class Pass:
         return calls
 
     def replay(self, calls):
-        """Trace the recorded rays, a kernel for each call."""
+        """A kernel for each call."""
         for ray, active, coherent in calls:
             if coherent is None:
                 dr.eval(self._scene.ray_test(ray, active=active))
@@ -106,11 +97,8 @@ class Pass:
 
 
 def measure(file: SceneFile, rounds: int, parameters=None, of_path: bool = False) -> list[float]:
-    """Kernel time over the floor, a value per round.
-
-    ``of_path``: that of Mitsuba's `path`, over the same floor. (Where the pass is path tracing alone, `path`
-    traces about the same rays.)
-    """
+    """Kernel time over the floor, a value per round; ``of_path``: that of Mitsuba's `path`, over the same
+    floor."""
     # Kernels cannot be recorded as a whole any more where loops were run step by step.
     calls = Pass(file, parameters or {}).rays()
     gc.collect()

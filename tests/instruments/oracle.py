@@ -1,21 +1,12 @@
-"""A slow, obvious oracle for the weights: every density of every strategy, written out.
-
-E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), section 10.2: a path x_0 ... x_k
-of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s.
-Each makes the first s vertices from the light and the others from the camera, so its density is
-
-    p_s = light[0] ... light[s-1] * camera[s] ... camera[k]
-
-with the arrays ``light`` and ``camera`` below: densities of each vertex from either side. Nothing is
-recursive here and nothing is shared with the code under test. Arithmetic is in float64 and in logarithms
-(products of twenty densities over 60 orders of magnitude leave the range of float64).
-
-In media every vertex that is sampled has the density T c besides: T the transmittance of the edge that it is
-sampled along, c the extinction at a vertex in a medium (1 on surfaces, at emitters and sensors). A joined
-edge is not sampled. Cosines of vertices in media are 1 (M. Raab, D. Seibert, A. Keller 2008).
-
-Edge i joins x_i and x_{i+1}. All arrays have one row per path.
-"""
+"""A slow oracle for the weights: every density of every strategy, written out. E. Veach, "Robust Monte Carlo
+Methods for Light Transport Simulation" (1997), section 10.2: a path x_0 ... x_k of k edges, x_0 on an emitter
+and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s, of density p_s = light[0] ...
+light[s-1] * camera[s] ... camera[k], products of densities of each vertex from either side. Nothing is
+recursive and nothing is shared with the code under test. Logarithms: products of twenty densities over 60
+orders of magnitude leave the range of float64. In media every sampled vertex has the density T c besides: T
+the transmittance of the edge that it is sampled along, c the extinction (1 on surfaces, at emitters and
+sensors); a connecting edge is not sampled; cosines are 1 (M. Raab, D. Seibert, A. Keller 2008). Edge i joins
+x_i and x_{i+1}. Arrays have one row per path."""
 
 from __future__ import annotations
 
@@ -28,21 +19,15 @@ AREA, POSITION, ENVIRONMENT, DIRECTIONAL = range(4)
 
 @dataclass
 class Paths:
-    """``n`` paths of ``k`` edges.
-
-    ``dist2`` (n, k): squared length of the edges. ``cos_light`` (n, k): absolute geometric cosine
-    of edge i at x_i; ``cos_camera`` (n, k): at x_{i+1}. ``to_camera``, ``to_light`` (n, k + 1):
-    solid-angle densities of sampling x_{i+1} and x_{i-1} at x_i, used for 0 < i < k. ``delta``
-    (n, k + 1): the event at x_i is a delta event; its densities are not read.
-
-    ``kind`` (n,) of the emitter. ``first``, ``second``: density of x_0 and of the direction to x_1
-    in emission (at infinity: of the direction, solid angle, and of the point on a disk across it).
-    ``direct``: density of x_0 by next-event estimation from x_1, solid angle at x_1 (probability
-    for delta emitters). ``lens``: whether the sensor has area; ``lens_pdf`` area density of x_k on
-    it (1 without); ``sensor_pdf``: solid-angle density of the direction to x_{k-1}.
-
-    In media (else None) ``transmittance`` (n, k) of the edges, ``extinction`` (n, k + 1): c of the vertices.
-    """
+    """``n`` paths of ``k`` edges. ``dist2`` (n, k): squared length of the edges; ``cos_light`` (n, k):
+    absolute geometric cosine of edge i at x_i, ``cos_camera`` at x_{i+1}; ``to_camera``, ``to_light`` (n, k +
+    1): solid-angle densities of sampling x_{i+1} and x_{i-1} at x_i, used for 0 < i < k and where the event
+    is not ``delta``. ``kind`` (n,) of the emitter. ``first``, ``second``: density of x_0 and of the direction
+    to x_1 in emission (at infinity: of the direction, solid angle, and of the point on a disk across it).
+    ``direct``: density of x_0 by next-event estimation from x_1, solid angle at x_1 (probability for delta
+    emitters). ``lens``: whether the sensor has area; ``lens_pdf`` area density of x_k on it (1 without);
+    ``sensor_pdf``: solid-angle density of the direction to x_{k-1}. In media (else None) ``transmittance``
+    (n, k) of the edges, ``extinction`` (n, k + 1) of the vertices."""
 
     dist2: np.ndarray
     cos_light: np.ndarray
@@ -66,7 +51,6 @@ class Paths:
         return self.dist2.shape[1]
 
     def of(self, chosen) -> Paths:
-        """Those that an index or a mask has ``chosen``."""
         columns = (getattr(self, f.name) for f in fields(self))
         return Paths(*(None if x is None else x[chosen] for x in columns))
 
@@ -78,21 +62,18 @@ class Paths:
 
     @property
     def infinite(self):
-        """Mask: x_0 is a direction."""
         return (self.kind == ENVIRONMENT) | (self.kind == DIRECTIONAL)
 
     @property
     def delta_emitter(self):
-        """Mask: no camera subpath can hit the emitter."""
+        """No camera subpath can hit the emitter."""
         return (self.kind == POSITION) | (self.kind == DIRECTIONAL)
 
 
 @dataclass(frozen=True)
 class Coefficients:
-    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1.
-
-    ``splat_count``: that of t = 1 where merges are compared with it.
-    """
+    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1. ``splat_count``: that of t = 1
+    where merges are compared with it."""
 
     endpoints: float = 1.0
     splat: float = 1.0
@@ -101,7 +82,6 @@ class Coefficients:
     splat_count: float = 1.0
 
     def of(self, s: int, k: int) -> float:
-        """kappa of the strategy (s, k + 1 - s)."""
         t = k + 1 - s
         if s == 0:
             return 1.0
@@ -115,11 +95,8 @@ class Coefficients:
 
 
 def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Logarithms of the densities of each vertex.
-
-    When sampled from the light and from the camera, shapes (n, k + 1), and of x_0 by next-event estimation,
-    (n,); area measure, at infinity solid angle.
-    """
+    """Logarithms of the densities of each vertex when sampled from the light and from the camera, (n, k + 1),
+    and of x_0 by next-event estimation, (n,); area measure, at infinity solid angle."""
     k, n = paths.k, len(paths.kind)
     names = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
     names += ("first", "second", "direct", "lens_pdf", "sensor_pdf")
@@ -162,7 +139,7 @@ def log_steps(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def log_densities(paths: Paths) -> np.ndarray:
-    """log p_s for s = 0 ... k + 1, shape (n, k + 2); -inf where the strategy cannot make the path."""
+    """log p_s, (n, k + 2); -inf where the strategy cannot make the path."""
     k, n = paths.k, len(paths.kind)
     light, camera, direct = log_steps(paths)
     p = np.empty((n, k + 2))
@@ -185,11 +162,8 @@ def log_densities(paths: Paths) -> np.ndarray:
 
 
 def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
-    """log n p of merging at x_1 ... x_{k-1}, shape (n, k - 1); -inf at delta events.
-
-    Both subpaths make x_m, and the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons'
-    subpaths times its area.
-    """
+    """log n p of merging at x_1 ... x_{k-1}, (n, k - 1); -inf at delta events. Both subpaths make x_m, and
+    the photon has to be in the disc: ``eta`` (n, k + 1) is the number of photons' subpaths times its area."""
     light, camera, _ = log_steps(paths)
     p = np.empty((len(paths.kind), max(paths.k - 1, 0)))
     for m in range(1, paths.k):
@@ -199,10 +173,7 @@ def log_merges(paths: Paths, eta: np.ndarray) -> np.ndarray:
 
 
 class Explicit:
-    """All strategies of ``paths`` under ``coefficients``.
-
-    ``size``: log kappa p, (n, k + 2); ``used``: where that is finite.
-    """
+    """All strategies of ``paths``. ``size``: log kappa p, (n, k + 2); ``used``: where that is finite."""
 
     def __init__(self, paths: Paths, coefficients: Coefficients):
         kappa = np.array([coefficients.of(s, paths.k) for s in range(paths.k + 2)])
@@ -210,20 +181,12 @@ class Explicit:
             self._take(log_densities(paths) + np.log(kappa))
 
     def _take(self, size):
-        """Keep the logarithms of kappa p."""
         self.size, self.used = size, np.isfinite(size)
         best = self.size.max(1, keepdims=True, initial=-1e300)
         self._ratio = np.where(self.used, np.exp(np.minimum(self.size - best, 0)), 0)
 
     def weights(self, heuristic: str):
-        """Weights in the shape of ``size``, zero where a strategy is not in use."""
-        ratio = self._ratio
-        if heuristic == "balance":
-            part = ratio
-        elif heuristic == "power":
-            part = ratio**2
-        else:
-            raise ValueError(heuristic)
+        part = self._ratio ** {"balance": 1, "power": 2}[heuristic]
         total = part.sum(1, keepdims=True)
         return part / np.where(total > 0, total, 1)
 
@@ -237,13 +200,10 @@ def _combined(log_terms, heuristic: str):
 
 
 class Merged(Explicit):
-    """All strategies of ``paths``, with merges in further columns, see `mis`.
-
-    S is the sum of kappa p of all strategies but merges, V that of the merges that have at least ``least``
-    (B) times that of the connection of either edge at their vertex, where t = 1 has `splat_count` for kappa;
-    a path is ``merged`` if V >= B S. ``log_s``, ``log_v``: logarithms of S and V; ``near``: mask, a
-    comparison is closer than 0.1 %, so that rounding may decide it.
-    """
+    """With merges in further columns, see `mis`. S is the sum of kappa p of all strategies but merges, V that
+    of the merges that have at least ``least`` (B) times that of the connection of either edge at their
+    vertex, where t = 1 has `splat_count` for kappa; a path is ``merged`` if V >= B S. ``log_s``, ``log_v``:
+    their logarithms; ``near``: a comparison is closer than 0.1 %, so that rounding may decide it."""
 
     def __init__(self, paths: Paths, coefficients: Coefficients, eta, least: float, heuristic: str):
         super().__init__(paths, coefficients)
@@ -264,16 +224,14 @@ class Merged(Explicit):
 
 
 class Guided(Explicit):
-    """All strategies of ``paths``, with photon guiding through near-specular events, see `sds`.
-
-    Events with at least the density ``least`` from both sides count as specular beside delta ones. ``sds``:
-    mask of the paths of three or more edges, not only of delta events, of which no edge is between two other
-    vertices whose connection is in use. They have s = 0 and s = 1, and the same two, in further columns, for
-    each vertex x_2 ... x_{k-1} with a guided direction: that of the first vertex that is not specular, seen
-    from the emitter; without one (``pure``) those of all that are not delta, behind a specular event or an
-    edge that no strategy connects. ``guide`` (n, k + 1): density of that direction at each vertex. With
-    ``least`` infinite delta events alone are specular, and t = 0 takes part.
-    """
+    """With photon guiding through near-specular events, see `sds`. Events with at least the density ``least``
+    from both sides count as specular beside delta ones. ``sds``: paths of three or more edges, not only of
+    delta events, of which no edge is between two other vertices whose connection is in use. They have s = 0
+    and s = 1, and the same two, in further columns, for each vertex x_2 ... x_{k-1} with a guided direction:
+    that of the first vertex that is not specular, seen from the emitter; without one (``pure``) those of all
+    that are not delta, behind a specular event or an edge that no strategy connects. ``guide`` (n, k + 1):
+    density of that direction at each vertex. With ``least`` infinite delta events alone are specular, and t =
+    0 takes part."""
 
     def __init__(self, paths: Paths, coefficients: Coefficients, guide, least: float):
         super().__init__(paths, coefficients)

@@ -1,10 +1,7 @@
 """A path found anew from its vertices, with Mitsuba's own calls alone, and the densities of all strategies.
-
-A check of what `recording` says of a path, and the answer to whether another strategy would find it: rays are
-aimed at the next vertex where a strategy may join vertices, and go where the BSDF sends them at delta events.
-Densities are written out one by one, by `oracle`; those of emitters are the plugin's, but of directional ones
-the closed form of `endpoints`.
-"""
+Rays are aimed at the next vertex where a strategy may connect vertices, and go where the BSDF sends them at
+delta events. Densities by `oracle`; those of emitters are the plugin's, but of directional ones the closed
+form of `endpoints`."""
 
 from __future__ import annotations
 
@@ -33,13 +30,10 @@ class Lost(ValueError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    """``f`` of a path and the densities of its k + 2 strategies.
-
-    ``f``: three colours, without the factors that change directions to areas. Of the strategies, s = 0 first,
-    ``log_p`` over these factors (alone they leave floating point in long paths) as the weights compare them,
-    and ``log_turned``, the logarithm of what their delta events on the light side add to f / p: these count
-    in solid angle on the light's side, a light subpath has them on the camera's.
-    """
+    """``f``: three colours, without the factors that change directions to areas. Of the k + 2 strategies, s =
+    0 first, ``log_p`` over these factors as the weights compare them, and ``log_turned``, the logarithm of
+    what their delta events on the light side add to f / p: these count in solid angle on the light's side, a
+    light subpath has them on the camera's."""
 
     f: np.ndarray
     log_p: np.ndarray
@@ -54,10 +48,7 @@ class Rebuilt:
         return _ratios(self.log_p - self.log_turned, s)
 
     def compared(self, s: int) -> np.ndarray:
-        """Densities of all strategies over that of one as the weights see them.
-
-        These take both solid angles of a refraction for equal (Georgiev, eqs. 53, 54).
-        """
+        """As the weights see them: both solid angles of a refraction are equal (Georgiev, eqs. 53, 54)."""
         return _ratios(self.log_p, s)
 
 
@@ -67,12 +58,9 @@ def _ratios(log_p, s: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Event:
-    """What happens at a vertex.
-
-    f cos (of delta events over their probability), densities of going on to the light and to the camera,
+    """f cos (of delta events over their probability), densities of going on to the light and to the camera,
     cosines with the geometric normal on the two sides, solid angle of a delta event on the camera's side over
-    that on the light's (``turned``).
-    """
+    that on the light's (``turned``)."""
 
     value: np.ndarray
     to_light: float
@@ -84,12 +72,8 @@ class _Event:
 
 @dataclass(frozen=True)
 class _Source:
-    """The emitter's end of a path.
-
-    ``radiance`` (irradiance of a directional one), ``kind`` as in `oracle`, cosine with the geometric normal,
-    and densities: ``first`` and ``second`` of x_0 and x_1 in emission, ``direct`` of x_0 in next-event
-    estimation, as in `oracle.Paths`.
-    """
+    """The emitter's end: ``radiance`` (irradiance of a directional one), cosine with the geometric normal;
+    ``kind`` and densities as in `oracle.Paths`."""
 
     radiance: np.ndarray
     kind: int
@@ -100,10 +84,8 @@ class _Source:
 
 
 def rebuild(scene, emitters, path) -> Rebuilt:
-    """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`.
-
-    In scenes with media none is found.
-    """
+    """The `recording.Path` found anew; ``emitters`` of the render know their densities. Raises `Lost`, always
+    in media."""
     for i in range(1, len(path.p) - 1):
         if not path.shapes[i]:
             raise Lost(f"vertex {i} lies in a medium, where paths are not followed")
@@ -150,7 +132,6 @@ def _follow(scene, path):
 
 
 def _hit_source(scene, emitters, path, end) -> _Source:
-    """Of an emitter that the last ray has met."""
     radiance = np.array(end.emitter(scene).eval(end), dtype=float).ravel()
     cos = 1.0 if path.infinite else float(dr.abs(dr.dot(end.n, end.to_world(end.wi)))[0])
     densities = emitters.hit_densities(end, _point(path.p[-2]), mi.Bool(True))
@@ -163,7 +144,7 @@ def _hit_source(scene, emitters, path, end) -> _Source:
 
 
 def _directional_source(scene, emitters, path) -> _Source:
-    """Of a directional emitter, which no ray can meet: by its direction."""
+    """By its direction: no ray can meet it."""
     it = dr.zeros(mi.Interaction3f)
     it.p = _point(path.p[-2])
     for lamp in endpoints.lamps_of(scene) if path.infinite else ():
@@ -182,7 +163,6 @@ def _directional_source(scene, emitters, path) -> _Source:
 
 
 def _direction(path, i: int):
-    """From vertex ``i`` to the next."""
     last = path.infinite and i == len(path.p) - 2
     d = path.p[-1] if last else path.p[i + 1] - path.p[i]
     return d / np.linalg.norm(d)
@@ -217,7 +197,7 @@ def _scatter(si, d, delta: bool, i: int):
 
 
 def _lobe(bsdf, si, wo, i: int):
-    """Direction and weight of the delta lobe that leads along ``wo``."""
+    """Direction and weight of the delta lobe along ``wo``."""
     found = draws.draw(bsdf, si, mi.Float(LOBES), mi.Point2f(0.5), mi.Bool(True))
     bs, weight = found.bs, found.weight
     leads = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) & (dr.dot(bs.wo, wo) > SAME_DIRECTION)
@@ -233,10 +213,8 @@ def _lobe(bsdf, si, wo, i: int):
 
 
 def _turned(si, bs):
-    """Solid angle on the camera's side of a delta event over that on the light's.
-
-    Refraction keeps eta^2 |m.w| dw, m the normal about which it refracts (along eta_c c + eta_l l).
-    """
+    """Solid angle on the camera's side of a delta event over that on the light's. Refraction keeps eta^2
+    |m.w| dw, m the normal about which it refracts (along eta_c c + eta_l l)."""
     m = si.wi + bs.eta * bs.wo  # bs.eta = eta_l / eta_c
     ratio = dr.square(bs.eta) * dr.abs(dr.dot(m, bs.wo) / dr.dot(m, si.wi))
     refracted = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaTransmission) & (dr.abs(bs.eta - 1) > 1e-5)
@@ -244,10 +222,8 @@ def _turned(si, bs):
 
 
 def _densities(scene, path, events, source):
-    """What the oracle asks for, with the first vertex on the emitter, and log of the sensor's importance.
-
-    Its cosine and the density of its point are included in the importance.
-    """
+    """What the oracle needs, and log of the sensor's importance, which includes its cosine and the density of
+    its point."""
     sensor = scene.sensors()[0]
     lens, lens_pdf = sensor.class_name() == "ThinLensCamera", 1.0
     if lens:
@@ -282,9 +258,8 @@ def _densities(scene, path, events, source):
 
 
 def _point(p):
-    return dr.opaque(
-        mi.Point3f, [float(x) for x in p]
-    )  # a literal would make each vertex a kernel of its own
+    # A literal would make each vertex a kernel of its own.
+    return dr.opaque(mi.Point3f, [float(x) for x in p])
 
 
 def _vector(d):

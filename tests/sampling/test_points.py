@@ -14,7 +14,7 @@ POINT, DIRECTION = (Purpose.EMISSION_POINT, 0), (Purpose.EMISSION_DIRECTION, 0)
 
 
 def drawn(side, draws, samples: int, seeds: int) -> np.ndarray:
-    """The draws of one pixel's samples under many seeds, of variance 1: (draws, seeds, samples, 2)."""
+    """One pixel's samples under many seeds, of variance 1: (draws, seeds, samples, 2)."""
     seed = dr.repeat(dr.arange(mi.UInt32, seeds), samples)
     index = dr.tile(dr.arange(mi.UInt32, samples), seeds)
     points = Points("sobol", seed)
@@ -43,10 +43,9 @@ def drawn(side, draws, samples: int, seeds: int) -> np.ndarray:
     ],
 )
 def test_draws_of_one_contribution_are_joint(side, first, second):
-    """Rationale: which draws share a shuffle, and with which map, decides how noisy products of them are; a
-    mistake would bias nothing. Expected: n Var of the mean of z z' over a pixel's n = 64 samples, z one
-    coordinate of each draw, averaged over the coordinates: below 0.4, where independent draws have 1 and
-    draws with shuffles of their own 1.58. Over 2,000 seeds one has a relative deviation of 3 %."""
+    """Expected: n Var of the mean of z z' over n = 64 samples, z one coordinate of each draw, averaged over
+    the coordinates, below 0.4 (independent draws have 1, own shuffles 1.58). Over 2,000 seeds one has a
+    relative deviation of 3 %."""
     a, b = drawn(side, [first, second], 64, 2000)
     products = [((a[..., i] * b[..., j]).mean(axis=1) ** 2).mean() * 64 for i in (0, 1) for j in (0, 1)]
     assert np.mean(products) < 0.4, products
@@ -54,9 +53,8 @@ def test_draws_of_one_contribution_are_joint(side, first, second):
 
 @pytest.mark.parametrize("side", ["camera", "light"])
 def test_draws_of_one_sample_are_independent(side):
-    """Rationale: joint draws share digits; were any two of them scrambled alike, the image would be biased.
-    Expected: over 40,000 seeds all draws of one sample are uncorrelated, coordinate by coordinate, and so
-    are their signs about 1/2. Tolerance: 5 / sqrt(40,000), with 2,016 pairs a chance of 1e-3 to fail."""
+    """Rationale: joint draws share digits. Expected: coordinates of all draws and their signs about 1/2 are
+    uncorrelated. Tolerance: 5 / sqrt(40,000), with 2,016 pairs a chance of 1e-3."""
     draws = [(purpose, vertex) for purpose in STRATIFIED[side] for vertex in (0, 1, 2, 3)]
     z = drawn(side, draws, 1, 40000)[:, :, 0].transpose(0, 2, 1).reshape(2 * len(draws), -1)
     for values in (z, np.sign(z)):
@@ -66,10 +64,9 @@ def test_draws_of_one_sample_are_independent(side):
 
 
 def test_samples_beyond_the_range_of_32_bits():
-    """Rationale: 1920x1080 pixels at 4,096 samples are 2^33 (mitsuba3 #1353, #1335, #432: others crashed
-    or repeated themselves past 2^32). Expected: the last pixel's samples have the exact numbers in the
-    image's sequence, none of 4,096 is drawn again 2^32 samples before, and their points are as even as any
-    pixel's: one in each cell of 64 x 64."""
+    """1920x1080 pixels at 4,096 samples are 2^33 (mitsuba3 #1353, #1335, #432). Expected: the last pixel's
+    samples have their numbers in the sequence, none is drawn again 2^32 samples before, one in each cell of
+    64 x 64."""
     pixels, spp = 1920 * 1080, 4096
     place = batch.Places(SimpleNamespace(camera=None), batch.Batch(pixels - 1, 1, 0, spp), spp)
     slot = dr.arange(mi.UInt32, spp)

@@ -9,10 +9,8 @@ SIZES = (0.0, 1.0, 0.0, 2.0, 5.0, 0.0)
 
 
 def test_candidates_are_drawn_in_proportion_to_their_size():
-    """Expected: each candidate is drawn by a share of 2^16 evenly spaced numbers that is its size over the
-    total, and what is left of these numbers is evenly spaced: as many in each of 16 bins. To 1e-3, for the
-    granularity of 2^16 numbers, most of which pass four decisions in single precision.
-    """
+    """Expected: shares of 2^16 evenly spaced numbers, and what is left of these is evenly spaced: in 16 bins.
+    To 1e-3: most pass four decisions in single precision."""
     count = 1 << 16
     u = (dr.arange(mi.Float, count) + 0.5) / count
     total, chosen = mi.Float(0), dr.full(mi.UInt32, len(SIZES), count)
@@ -29,6 +27,5 @@ def test_candidates_are_drawn_in_proportion_to_their_size():
 
 
 def test_nothing_is_drawn_of_nothing():
-    """Expected: candidates of size 0 alone are not taken, and the random number is kept."""
     total, take, u = offer(mi.Float(0), mi.Float(0), mi.Float(0.25))
     assert total[0] == 0 and not take[0] and u[0] == 0.25

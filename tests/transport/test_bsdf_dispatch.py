@@ -8,6 +8,8 @@ from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import bsdf
 from rendered import same
 
+import scenes
+
 KINDS = [
     {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.4}},
     {"type": "roughconductor", "alpha": 0.3},
@@ -19,14 +21,11 @@ DIFFUSE, CONDUCTOR, GLASS, TWOSIDED, BLEND = range(len(KINDS))
 
 
 def beads(kinds, copies=0):
-    """A floor, a lamp and balls with BSDFs of these ``kinds``; ``copies`` (instances) of a ball far away."""
+    """Balls with these BSDFs; ``copies`` (instances) of a ball far away."""
     at = mi.ScalarTransform4f()
-    place = at.look_at([0, -3, 2], [0, 0, 0.2], [0, 0, 1])
-    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
-    scene = {"type": "scene", "sensor": {"type": "perspective", "to_world": place, "film": film}}
-    scene["floor"] = {"type": "rectangle", "to_world": at.scale(2)}
-    glow = {"type": "area", "radiance": {"type": "rgb", "value": 9.0}}
-    scene["lamp"] = {"type": "sphere", "center": [0, 0, 2], "radius": 0.3, "emitter": glow}
+    view = scenes.camera(origin=(0, -3, 2), target=(0, 0, 0.2), up=(0, 0, 1), fov=39)
+    lamp = {"type": "sphere", "center": [0, 0, 2], "radius": 0.3, "emitter": scenes.area(9.0)}
+    scene = {"type": "scene", "sensor": view, "floor": scenes.square(size=2), "lamp": lamp}
     for number, kind in enumerate(kinds):
         place = [-1 + 0.5 * (number % 5), -1 + 0.5 * (number // 5), 0.2]
         scene[f"ball{number}"] = {"type": "sphere", "center": place, "radius": 0.2, "bsdf": dict(KINDS[kind])}
@@ -55,16 +54,15 @@ PLAIN = [DIFFUSE, CONDUCTOR, GLASS] * 4
     ids=["plain", "few", "one nested", "many nested", "a blend", "instances"],
 )
 def test_who_calls(kinds, copies, expected):
-    """Rationale: Mitsuba's virtual calls are recorded faster, but visit BSDFs that no ray hits, and a blend
-    is sampled by its parts. Expected: they are used for many BSDFs without corrections, beside few that no
-    ray hits: nested ones, and that of each instance."""
+    """Mitsuba's virtual calls are recorded faster, but visit BSDFs that no ray hits, and sample a blend as a
+    whole. Expected: they are used for many BSDFs without corrections, beside few that no ray hits."""
     scene = beads(kinds, copies)
     assert PreparedScene(scene, scene.sensors()[0]).traits.dispatch.by_mitsuba == expected
 
 
 def test_both_ways_of_calling_give_one_image(monkeypatch):
-    """Expected: the same image by Mitsuba's virtual calls and by calls through Python, and beside another
-    scene, which Mitsuba's calls visit. Tolerance: kernels of their own may round otherwise, `same`."""
+    """Also beside another scene, which Mitsuba's calls visit. Kernels of their own may round otherwise,
+    `same`."""
     scene, images = beads(PLAIN), []
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 1, "connections": "all"})
     for unhit in (bsdf._UNHIT, -1, bsdf._UNHIT):
@@ -77,8 +75,7 @@ def test_both_ways_of_calling_give_one_image(monkeypatch):
 
 @pytest.mark.parametrize("adjoint", [False, True])
 def test_a_sample_is_one_question(adjoint, monkeypatch):
-    """Rationale: each question is recorded for every BSDF. Expected: one, of a light subpath too, whose
-    sample is evaluated from its other end."""
+    """Each is recorded for every BSDF; of a light subpath's sample, evaluated from its other end, too."""
     count, call = [], bsdf.BSDFDispatch.__call__
     monkeypatch.setattr(bsdf.BSDFDispatch, "__call__", lambda *args: (count.append(1), call(*args))[1])
     scene = beads(PLAIN)

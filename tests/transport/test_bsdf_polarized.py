@@ -95,7 +95,7 @@ def _polarized():
 
 
 def surface(make):
-    """A BSDF's traits, and points of a rectangle that has it, seen from directions all around."""
+    """A BSDF's traits, and points of a rectangle seen from directions all around."""
     shape = mi.load_dict(
         {
             "type": "rectangle",
@@ -123,7 +123,7 @@ def matrices(value):
 
 
 def difference(a, b):
-    """Largest difference of the entries of two stacks of matrices, each over its intensity."""
+    """Largest difference of the entries, each over its intensity."""
     a, b = (m / m[:, :1, :1] for m in (a, b))
     return np.abs(a - b).max((1, 2))
 
@@ -140,9 +140,8 @@ def drawn(make, sample):
 
 @pytest.mark.parametrize("name", SMOOTH)
 def test_evaluations_are_of_light_from_either_side(name):
-    """Rationale: light subpaths see a BSDF from the light's side. Expected: the matrix that they evaluate is
-    that of a camera vertex with the two directions swapped, times the adjoint factor, to rounding.
-    """
+    """Expected: the matrix that light subpaths evaluate is that of a camera vertex with the directions
+    swapped, times the adjoint factor, to rounding."""
     traits, shape, si = surface(SMOOTH[name])
     other = directions(np.random.default_rng(4))
     ours = evaluate_adjoint(shape.bsdf(), si, other, mi.Bool(True), traits)
@@ -158,12 +157,9 @@ def test_evaluations_are_of_light_from_either_side(name):
 
 @pytest.mark.parametrize("name", DELTA)
 def test_delta_events_are_of_light_from_either_side(name):
-    """Rationale: a matrix is no number, that of the way back is another one, and Mitsuba samples events from
-    one end. Expected: the matrix of a light subpath's event, made at l towards c, is in proportion to that
-    which Mitsuba's ``sample`` gives a camera subpath for the event from c to l, to rounding. (Events that the
-    latter does not make, of other lobes or under maps from one end alone, are left out.) The
-    intensity is that of the variant that is not polarized, of the same numbers.
-    """
+    """Expected: the matrix of a light subpath's event, made at l towards c, is in proportion to that of
+    Mitsuba's ``sample`` from c to l, to rounding (events that the latter does not make are left out); the
+    intensity is that of the variant that is not polarized."""
     step, shape, si, numbers = drawn(DELTA[name], sample_adjoint)
     back = bsdf.with_wi(si, step.wo)
     bs, weight = shape.bsdf().sample(mi.BSDFContext(), back, *numbers)
@@ -181,9 +177,7 @@ def test_delta_events_are_of_light_from_either_side(name):
 
 @pytest.mark.parametrize("name", ["retarder", "dielectric"])
 def test_light_of_the_way_back_has_another_matrix(name):
-    """Rationale: the tests above are worth nothing where the matrices of both ways are the same. Expected:
-    they differ by more than a twentieth of the intensity for most directions.
-    """
+    """The tests above are worth nothing where the matrices of both ways are the same."""
     light, *_ = drawn(DELTA[name], sample_adjoint)
     camera, *_ = drawn(DELTA[name], bsdf.sample)
     ours, theirs = matrices(light.weight), matrices(camera.weight)

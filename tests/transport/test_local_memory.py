@@ -20,7 +20,7 @@ for parameters, stored in %s:
 
 
 def means(edit, parameters):
-    """Of images of these parameters, each with its `settings.Internals.stored_vertices`."""
+    """Of images of these parameters, each with its ``stored_vertices``."""
     code = CODE % (edit, repr(parameters))
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr[-2000:]
@@ -28,10 +28,8 @@ def means(edit, parameters):
 
 
 def test_sizes_of_local_memory_are_kernels_of_their_own():
-    """Rationale: Dr.Jit's kernel cache does not tell sizes of local memory apart; a kernel for few
-    vertices must not serve a render with many (it crashed). Expected: small, large and small again run,
-    and the same parameters give the same mean. Tolerance: 1e-4, the order of atomic sums.
-    """
+    """Rationale: Dr.Jit's kernel cache does not tell sizes of local memory apart; a kernel for few vertices
+    must not serve a render with many. Tolerance: 1e-4, the order of atomic sums."""
     small, large = ({"max_depth": 3}, 2), ({"max_depth": 90}, 90)
     a, b, c, d = means("", [small, large, small, large])
     assert a == pytest.approx(c, rel=1e-4) and b == pytest.approx(d, rel=1e-4)
@@ -40,10 +38,8 @@ def test_sizes_of_local_memory_are_kernels_of_their_own():
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_samples():
-    """Rationale: passes bound what a launch holds. Expected: a process that renders 1920x1080 at
-    depth 8 stays below 1.5 GiB (the budget stated in the README; measured 0.75), and with three times
-    the samples it needs no more. Tolerance: 5 %, what the allocator rounds.
-    """
+    """Expected: 1920x1080 at depth 8 stays below 1.5 GiB (the README's budget; measured 0.75), and three
+    times the samples need no more (5 %: what the allocator rounds)."""
     code = """
 import sys
 import mitsuba_bdpt, mitsuba as mi
@@ -62,11 +58,9 @@ print(memory.peak())
 
 
 def test_lanes_that_skip_vertices_keep_their_own():
-    """Rationale: an index of width 1 into local memory is taken for the same in all lanes; lanes that
-    skip a delta vertex then write to other lanes' slots (it crashed, or was wrong). Expected: a glass and
-    a mirror box, where lanes skip different vertices, give the mean of path tracing alone. Tolerance: 3 %,
-    some five standard errors of the difference.
-    """
+    """Rationale: an index of width 1 into local memory is taken for the same in all lanes; lanes that skip a
+    delta vertex then write to other lanes' slots. Expected: path tracing's mean, within 3 % (five standard
+    errors)."""
     edit = 'd["small-box"]["bsdf"] = {"type": "dielectric"}; d["large-box"]["bsdf"] = {"type": "conductor"}'
     a, b = means(edit, [({"max_depth": 6}, 6), ({"max_depth": 6, "light_paths": 0}, 6)])
     assert a == pytest.approx(b, rel=0.03)

@@ -14,16 +14,14 @@ def statistics(scene, spp=64, **parameters):
 
 @pytest.mark.parametrize("skip", ["none", "auto"])
 def test_segments_are_rays_where_nothing_is_passed(skip):
-    """Expected: in a foggy room without null surfaces as many segments as rays, of whatever kind."""
     found = statistics(parts.foggy(), skip=skip)
     assert found["media"] == {"segments": sum(found["rays"].values()), "collisions": 0}
     assert found["rays"]["shadow_s1"] and (found["rays"]["shadow_inner"] or skip == "auto")
 
 
 def test_null_surfaces_cut_edges_into_segments():
-    """Expected: three segments of each ray of a sensor that looks through the middle of a ball with a null
-    boundary, whose fog nothing collides in, at a plate behind it that emits.
-    """
+    """Three segments of each ray through the middle of a ball with a null boundary, whose fog nothing
+    collides in."""
     scene = {
         "type": "scene",
         "sensor": parts.sensor(origin=(0, 0, 3), target=(0, 0, 0), fov=0.1, size=4),
@@ -41,13 +39,10 @@ def test_null_surfaces_cut_edges_into_segments():
 
 @pytest.mark.parametrize("way", ["flights", "joins"])
 def test_collisions_of_a_grid(way):
-    """Rationale: delta tracking counts collisions of flights, ratio tracking those of joins. A grid of
-    majorant 1.2, whose extinction is half of it on the way through its middle (of length 1), before a sensor
-    that looks at the sky, or before the point lamp that lights a far plate that it sees. Expected: 1.2
-    collisions of a join; 2 (1 - e^-.6) of a flight, of which half end it; within five standard errors (the
-    second moment is that of Poisson's distribution at most; one in a thousand rays that the plate reflects
-    meets the grid too).
-    """
+    """Delta tracking counts collisions of flights, ratio tracking those of connections. A grid of majorant
+    1.2, whose extinction is half of it on a way of length 1. Expected: 1.2 collisions of a connection; 2 (1 -
+    e^-.6) of a flight, of which half end it; within five standard errors (second moment at most Poisson's;
+    one in a thousand rays that the plate reflects meets the grid too)."""
     values = np.broadcast_to([0.0, 1.0], (2, 2, 2))
     medium = parts.grid(values, [-0.5, -0.5, -0.5], 1.0, 1.2, 0.0)
     scene = {"type": "scene", "box": parts.box([-0.5] * 3, 1.0, interior=medium)}
@@ -67,5 +62,4 @@ def test_collisions_of_a_grid(way):
 
 
 def test_scenes_without_media_have_none():
-    """Expected: no entry in the statistics."""
     assert "media" not in statistics(parts.room())

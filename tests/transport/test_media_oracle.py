@@ -1,9 +1,5 @@
-"""The weights in media against explicit densities, with transmittances and extinctions written out.
-
-The oracle (`instruments.oracle`) has T of every edge and c = sigma_t of every volume vertex in each density;
-the recursion has T~ of the joining edge alone. As in ``test_oracle.py``: first arithmetic, then the unchanged
-kernel in a real scene, vertex by vertex.
-"""
+"""The weights in media against explicit densities: the oracle has T of every edge and c = sigma_t of every
+volume vertex in each density, the recursion T~ of the joining edge alone."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ from instruments.oracle import AREA, POSITION
 
 
 def in_media(rng, paths, decades):
-    """``paths`` with random transmittances and extinctions; half of the inner vertices lie in a volume."""
+    """With random transmittances and extinctions; half of the inner vertices lie in a volume."""
     n, k = paths.dist2.shape
     paths.transmittance = (10 ** -rng.uniform(0, decades, (n, k))).astype(np.float32)
     volume = rng.random((n, k + 1)) < 0.5
@@ -43,12 +39,9 @@ def in_media(rng, paths, decades):
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", ["n1c1", "odd", "n1c0-half", "n0c0"])
 def test_recursion_with_transmittances(name, classes):
-    """Rationale: all extinctions cancel, and all transmittances but that of the joining edge.
-
-    500 random paths each of k = 1 ... 7 edges, transmittances of 1e-4 to 1, extinctions of 1e-3 to 1e3,
-    otherwise as `test_oracle.test_recursion_agrees_with_explicit_densities`. Expected: every weight is the
-    oracle's to 1e-4 of its own size, and the weights of a path sum to 1 within 1e-4.
-    """
+    """All extinctions cancel, and all transmittances but that of the joining edge. 500 random paths each of k
+    = 1 ... 7 edges, transmittances of 1e-4 to 1, extinctions of 1e-3 to 1e3; tolerances as of
+    `test_oracle.test_recursion_agrees_with_explicit_densities`."""
     rng = np.random.default_rng(1)
     for k in range(1, 8):
         paths = in_media(rng, random_paths(rng, 500, k), 4)
@@ -65,7 +58,6 @@ LANES, DEPTH = 512, 4
 
 
 def hg(cos):
-    """Density of directions at the angle of this cosine to the one that light travels in."""
     return (1 - G * G) / (4 * np.pi * (1 + G * G - 2 * G * cos) ** 1.5)
 
 
@@ -76,10 +68,8 @@ def cloud():
 
 
 class SensorPoints:
-    """Where the sensor was joined and hit, of which a `recording.Recorder` has no record for t = 0 and (1,1).
-
-    Stands before a kernel's sensor.
-    """
+    """Stands before a kernel's sensor: its points, of which a `recording.Recorder` has none for t = 0 and
+    (1,1)."""
 
     def __init__(self, sensor):
         self._sensor, self._joined, self._hit = sensor, [], []
@@ -103,7 +93,6 @@ class SensorPoints:
         return recording.float64(p + dr.zeros(mi.Point3f, LANES))
 
     def completed(self, path, lane: int):
-        """``path`` with its point on the sensor."""
         if (path.s, path.t) == (1, 1):
             found = [to[:, lane] for p, to in self._joined if (p[:, lane] == path.p[1]).all()]
         elif path.t == 0:
@@ -114,7 +103,7 @@ class SensorPoints:
 
 
 def recorded(scene, integrator):
-    """All paths that one run of the kernel makes, and the extinction (1 / scene unit) of T~."""
+    """All paths of one run of the kernel, and the extinction (1 / scene unit) of T~."""
     render = rendering.Render(scene, scene.sensors()[0], integrator.settings, 5, 1)
     pixels = int(np.prod(render.kernel.camera.region.size))
     samples = -(-LANES * render.plan.camera_paths_per_light_path // pixels)
@@ -140,7 +129,7 @@ def normals(p, shape, light):
 
 
 def explicit_paths(made, scene, sigma):
-    """The densities of these paths of one length, vertices from the emitter on, in fog of ``sigma``."""
+    """Densities of paths of one length, vertices from the emitter on."""
     light, camera = endpoints.lamps_of(scene)[0], endpoints.Camera.of(scene.sensors()[0])
     if light.kind == POSITION:
         light.center = np.zeros(3)
@@ -188,17 +177,11 @@ def explicit_paths(made, scene, sigma):
     [*itertools.product(["lamp", "point", "lens"], ["balance", "power"]), ("cloud", "balance")],
 )
 def test_kernel_in_fog_agrees_with_explicit_densities(kind, heuristic):
-    """Rationale: right arithmetic with the wrong T~, cosine or medium is still wrong.
-
-    A room of gray fog (sensor and lamp in it, hg), all strategies, each lane's paths of up to 4 edges as the
-    unchanged kernel makes them; their densities are written out from the positions of their vertices. In a
-    cloud, whose transmittance is known in expectation only, T~ is that of its mean extinction.
-    Expected: every weight is the oracle's to 2e-3 of its own size plus 1e-4, but for 1 % of the paths of each
-    strategy and one: positions are float32, near walls cosines are few digits of them, and at a lamp's rim
-    rounding decides which density it has. With vertices in the fog there are at least 100 paths of s = 1, of
-    t = 1 and of inner joins each, 8 of s = 0 (none, of a point lamp); with a (large) lens 8 of t = 0 with and
-    8 without, and 100 of (1,1).
-    """
+    """A room of gray fog (sensor and lamp in it, hg); densities are written out from the positions of the
+    vertices of each lane's paths. In a cloud T~ is that of its mean extinction. Expected: every weight to
+    2e-3 of its own size plus 1e-4, but for 1 % of the paths of each strategy and one: near walls cosines are
+    few digits of float32 positions, and at a lamp's rim rounding decides. At least so many paths of each
+    strategy with vertices in the fog as below."""
     camera = parts.thinlens if kind == "lens" else parts.sensor
     light = parts.point() if kind == "point" else parts.lamp()
     medium = cloud() if kind == "cloud" else parts.fog(SIGMA, 0.9, G)

@@ -9,7 +9,7 @@ from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import draws, near_specular
 from mitsuba_bdpt.transport.near_specular import NARROW
 
-T = mi.ScalarTransform4f
+import scenes
 
 
 def uncached(bsdf, name, find):
@@ -17,7 +17,6 @@ def uncached(bsdf, name, find):
 
 
 def found_in(bsdf):
-    """Whether ``bsdf`` has a near-specular lobe."""
     family = draws.family([bsdf])
     return any(b is bsdf for b, _ in near_specular.near_specular(family, uncached))
 
@@ -113,13 +112,11 @@ SHARP = {
 
 @pytest.mark.parametrize("name", BROAD)
 def test_broad_lobes_are_not_near_specular(name):
-    """Expected: neither are delta lobes, and lobes of Mitsuba's default roughness."""
     assert not found_in(mi.load_dict(BROAD[name]()))
 
 
 @pytest.mark.parametrize("name", SHARP)
 def test_sharp_lobes_are_near_specular(name):
-    """Expected: also those of nested BSDFs, and where one texel of a texture is smooth."""
     assert found_in(mi.load_dict(SHARP[name]()))
 
 
@@ -145,10 +142,9 @@ LADDER = [0.001, 0.003, 0.01, 0.03, 0.1, 0.3]
     ids=lambda kind: kind[0],
 )
 def test_densities_by_parameters_are_those_of_samples(kind, alpha):
-    """Rationale: the parameters' meaning is written down twice, in Mitsuba and here. Expected: the density
-    along the normal is the largest of samples at normal incidence, within a factor of 1.1 (the samples do
-    not meet the axis of the lobe exactly) below and 3 above (the share of the lobe among others is left out;
-    the clearcoat's bound is 4 times too large)."""
+    """The density along the normal is the largest of samples at normal incidence, to 1.1 below (samples do
+    not meet the lobe's axis exactly) and 3 above (the lobe's share among others is left out; the clearcoat's
+    bound is 4 times too large)."""
     bsdf = mi.load_dict(kind[1](alpha))
     si = near_specular.spread_interactions(1 << 14)
     si.wi = mi.Vector3f(0, 0, dr.sign(si.wi.z))
@@ -162,7 +158,7 @@ def test_densities_by_parameters_are_those_of_samples(kind, alpha):
 
 
 class Sharp(mi.BSDF):
-    """A diffuse BSDF that claims a density, in place of a sharp lobe."""
+    """A diffuse BSDF that claims a density."""
 
     def __init__(self, props):
         mi.BSDF.__init__(self, props)
@@ -184,19 +180,17 @@ class Sharp(mi.BSDF):
 
 
 def test_a_class_without_known_parameters_is_sampled():
-    """Expected: its largest density decides."""
     mi.register_bsdf("test_sharp", Sharp)
     assert found_in(mi.load_dict({"type": "test_sharp"}))
     assert not found_in(mi.load_dict({"type": "test_sharp", "largest": 2.0}))
 
 
 def scene_of(**bsdfs):
-    film = {"type": "hdrfilm", "width": 4, "height": 4}
     balls = {
         name: {"type": "sphere", "center": [3 * i, 0, 0], "id": name, "bsdf": bsdf}
         for i, (name, bsdf) in enumerate(bsdfs.items())
     }
-    scene = {"type": "scene", "lamp": {"type": "point"}, "eye": {"type": "perspective", "film": film}}
+    scene = {"type": "scene", "lamp": {"type": "point"}, "eye": scenes.camera(size=4)}
     return mi.load_dict(scene | balls, optimize=False)
 
 
@@ -207,8 +201,7 @@ def found(scene):
 
 
 def test_edits_are_seen():
-    """Expected: shapes are named whose BSDF is near-specular now, by texture, number or a nested BSDF, and
-    of a class whose densities are sampled, and cached."""
+    """By texture, number or a nested BSDF, and of a class whose densities are sampled, and cached."""
     mi.register_bsdf("test_sharp", Sharp)
     scene = scene_of(
         wall={"type": "diffuse"},
@@ -236,8 +229,8 @@ def test_edits_are_seen():
 
 
 def test_no_kernel_and_no_samples_without_sharp_lobes():
-    """Rationale: each render of each scene asks. Expected: of a hundred materials whose parameters are known
-    no kernel is compiled or launched."""
+    """Each render needs it: none of a hundred materials whose parameters are known compiles or launches a
+    kernel."""
     kinds = [metal(0.3), principled(0.5), glass(0.5), {"type": "dielectric"}]
     materials = [mi.load_dict(kinds[i % 4] | {"id": f"b{i}"}) for i in range(100)]
     materials += [mi.load_dict(bsdf) for bsdf in (metal(speck(0.3)), {"type": "roughplastic"})]
@@ -249,6 +242,5 @@ def test_no_kernel_and_no_samples_without_sharp_lobes():
 
 
 def test_the_threshold_is_the_density():
-    """Expected: alpha just below and above that of the threshold."""
     alpha = (4 * np.pi * NARROW) ** -0.5
     assert found_in(mi.load_dict(metal(alpha * 0.99))) and not found_in(mi.load_dict(metal(alpha * 1.01)))

@@ -1,15 +1,8 @@
-"""The weights: the recursion of the core against explicit densities (Veach's ratios).
-
-* `test_recursion_*`: ``mis.py`` alone, called in the order in which ``walk.py`` and ``techniques.py`` call
-  it, on random numbers of any size.
-* `test_kernel_*`: the unchanged kernel in a scripted world. The scene, the BSDFs, the emitters and the sensor
-  are stand-ins that walk each lane along a path drawn beforehand and answer with densities drawn beforehand;
-  positions and normals are real, so that cosines, distances and shading frames are the core's own work. That
-  every call gets the right vertex, direction, cosine, coefficient and mask is what this layer tests.
-
-That densities of one path from both of its ends are equal in real scenes is tested in ``tests/emitters`` and
-``tests/sensors``; statistics of whole images in ``test_strategies.py``.
-"""
+"""The weights: the recursion of the core against explicit densities (Veach's ratios). ``test_recursion_*``:
+``mis.py`` alone, on random numbers. ``test_kernel_*``: the unchanged kernel in a scripted world, whose
+stand-ins walk each lane along a path drawn beforehand and answer with densities drawn beforehand; positions
+and normals are real. Densities of real scenes: ``tests/emitters``, ``tests/sensors``; images:
+``test_strategies.py``."""
 
 from __future__ import annotations
 
@@ -56,7 +49,6 @@ from instruments.oracle import AREA, ENVIRONMENT, POSITION, Coefficients
 
 
 def check(paths, kappa, name, weights, relative):
-    """Compare with the oracle."""
     explicit = oracle.Explicit(paths, kappa)
     weights = np.where(explicit.used, weights, 0)
     assert np.isfinite(weights).all()
@@ -71,9 +63,8 @@ def check(paths, kappa, name, weights, relative):
 @pytest.mark.parametrize("classes", COEFFICIENTS)
 def test_recursion_agrees_with_explicit_densities(name, classes):
     """1,000 random paths each of k = 1 ... 8 edges, densities over 6 orders of magnitude, a fifth of the
-    vertices delta, all kinds of emitters and sensors; every strategy. Tolerance: float32 sums of positive
-    terms, some ten roundings of 6e-8 per vertex.
-    """
+    vertices delta, all kinds of emitters and sensors. Tolerance: float32 sums of positive terms, some ten
+    roundings of 6e-8 per vertex."""
     rng = np.random.default_rng(1)
     for k in range(1, 9):
         paths = random_paths(rng, 1000, k)
@@ -85,15 +76,9 @@ def test_recursion_agrees_with_explicit_densities(name, classes):
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", COEFFICIENTS)
 def test_recursion_with_merges(name, classes, least, monkeypatch):
-    """Rationale: S and V are sums over all vertices, and every strategy knows a part of them: two further
-    floats must say what the explicit densities say, and whether the path is merged. 1,000 random paths each
-    of k = 2 ... 7 edges, a fifth of the vertices delta, eta spread over six orders of magnitude; B = 0 merges
-    at all vertices that are not delta (the whole of Georgiev's method).
-
-    Expected: every weight, of merges too, is the oracle's to 1e-4 of its own size, and those of a path sum to
-    1 within 1e-4; paths that are not merged have the weights that they have without merging, to the bit. Left
-    out: paths (about 1 %) on which a comparison is closer than 0.1 %, which rounding may decide either way.
-    """
+    """As above, eta over six orders of magnitude; B = 0 merges at all vertices that are not delta (the whole
+    of Georgiev's method). Paths that are not merged have their weights without merging, to the bit. Left out:
+    paths (1 %) on which a comparison is closer than 0.1 %, which rounding may decide either way."""
     monkeypatch.setattr(mis, "MERGE_DOMINATED", least)
     rng, total, plain = np.random.default_rng(6), 0, 0
     for k in range(2, 8):
@@ -123,13 +108,9 @@ def test_recursion_with_merges(name, classes, least, monkeypatch):
 @pytest.mark.parametrize("name", settings.HEURISTICS)
 @pytest.mark.parametrize("classes", ["n1c1", "odd", "n0c0"])
 def test_recursion_extreme_densities(name, classes):
-    """Rationale: no overflow, no underflow and no inf * 0 with densities from 1e-30 to 1e30.
-
-    Every density is 1e-30, 1e30, 1 or log-uniform between them, cosines down to 1e-3. Expected: no
-    weight is NaN or outside [0, 1], k = 1 ... 8. The one clamp (partial sums saturate at 1e37)
-    makes weights inexact where the true ratio passes 1e37 on the way, so equality is asked only of
-    paths of one and two edges whose densities but one are moderate: there no ratio passes 1e34.
-    """
+    """No overflow, underflow or inf * 0: densities are 1e-30, 1e30, 1 or log-uniform between, cosines down to
+    1e-3. Partial sums saturate at 1e37: equality is asked only of paths of one and two edges whose densities
+    but one are moderate, where no ratio passes 1e34."""
     rng = np.random.default_rng(2)
     kappa = COEFFICIENTS[classes]
     for k in range(1, 9):
@@ -152,11 +133,8 @@ def test_recursion_extreme_densities(name, classes):
 
 
 class World:
-    """Random paths in space, and stand-ins for everything that the kernel asks.
-
-    ``paths`` holds the densities; its distances and cosines are replaced by those of the random
-    positions and normals here, computed in float64.
-    """
+    """Random paths in space, and stand-ins for everything that the kernel asks. Distances and cosines of
+    ``paths`` are those of random positions and normals, in float64."""
 
     def __init__(self, rng, n, k, lens, delta=0.2):
         self.rng, self.n, self.k, self.lens = rng, n, k, lens
@@ -233,7 +211,7 @@ class World:
 
 @cache
 def interaction_kind(variant):
-    """A surface interaction of this, the current variant, whose BSDF is scripted."""
+    """A surface interaction of the current variant whose BSDF is scripted."""
 
     class Interaction(mi.SurfaceInteraction3f):
         def bsdf(self, *_):
@@ -242,8 +220,13 @@ def interaction_kind(variant):
     return Interaction
 
 
+def lobe(which, flag):
+    """``flag`` in the lanes ``which``, delta reflection in the others."""
+    return dr.select(mi.Bool(which), *(mi.UInt32(int(x)) for x in (flag, mi.BSDFFlags.DeltaReflection)))
+
+
 class Scattering:
-    """The BSDF at x_i: value 1, or matrices, and densities from the script, by the direction asked for."""
+    """The BSDF at x_i: value 1, or matrices, and densities from the script, by the direction."""
 
     def __init__(self, world, i):
         self.world, self.i = world, i
@@ -259,13 +242,10 @@ class Scattering:
 
     def _pdf(self, si, wo):
         paths = self.world.paths
-        return self._choose(
-            si, wo, self.world.f(paths.to_camera[:, self.i]), self.world.f(paths.to_light[:, self.i])
-        )
+        return self._choose(si, wo, *(self.world.f(x[:, self.i]) for x in (paths.to_camera, paths.to_light)))
 
     def _value(self, si, wo):
-        """1, or the matrix of light that arrives from ``wo`` and leaves to ``si.wi``, in local
-        coordinates."""
+        """1, or the local matrix of light that arrives from ``wo`` and leaves to ``si.wi``."""
         if not mi.is_polarized:
             return mi.Spectrum(1)
         to_camera = self._choose(si, si.wi, mi.Float(1), mi.Float(0)) > 0
@@ -282,11 +262,7 @@ class Scattering:
 
     def flags(self):
         joinable = ~self.world.paths.delta[:, self.i] | self.world.mixed[:, self.i]
-        return dr.select(
-            mi.Bool(joinable),
-            mi.UInt32(int(mi.BSDFFlags.Smooth)),
-            mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
-        )
+        return lobe(joinable, mi.BSDFFlags.Smooth)
 
     def pdf(self, ctx, si, wo, active=True):
         return self._pdf(si, wo)
@@ -305,11 +281,7 @@ class Scattering:
         # Probabilities of delta events mean nothing to the weights.
         bs.pdf = dr.select(delta, 0.125, self._pdf(si, bs.wo))
         bs.eta = mi.Float(1)
-        bs.sampled_type = dr.select(
-            delta,
-            mi.UInt32(int(mi.BSDFFlags.DeltaReflection)),
-            mi.UInt32(int(mi.BSDFFlags.GlossyReflection)),
-        )
+        bs.sampled_type = lobe(~delta, mi.BSDFFlags.GlossyReflection)
         return bs, self._value(si, bs.wo)
 
 
@@ -346,7 +318,7 @@ class Scene:
 
 
 class Lights:
-    """Stand-in for `emitters.Emitters`: the interface with the script's densities."""
+    """Stand-in for `emitters.Emitters`."""
 
     def __init__(self, world):
         w, paths = world, world.paths
@@ -355,6 +327,8 @@ class Lights:
         self.infinite, self.delta = mi.Bool(paths.infinite), mi.Bool(paths.delta_emitter)
         self.first, self.second, self.direct = w.f(paths.first), w.f(paths.second), w.f(paths.direct)
         self.cos, self.dist2 = w.f(paths.cos_light[:, 0]), w.f(paths.dist2[:, 0])
+        at_point = dr.select(self.at, self.direct * self.dist2, self.direct)
+        self.complete = dr.select(self.area, self.direct * self.cos, at_point)
 
     def sample_emission(self, *_):
         w = self.world
@@ -374,9 +348,7 @@ class Lights:
         )
 
     def connection_density(self, emission, si, active):
-        return dr.select(
-            self.area, self.direct * self.cos, dr.select(self.at, self.direct * self.dist2, self.direct)
-        )
+        return self.complete
 
     at_infinity = True
 
@@ -400,15 +372,6 @@ class Lights:
 
     def sample_direct(self, si, u, active):
         w = self.world
-        ratio = (
-            self.first
-            * self.second
-            / dr.select(
-                self.area,
-                self.direct * self.cos,
-                dr.select(self.at, self.direct * self.dist2, self.direct),
-            )
-        )
         return emitters.Direct(
             weight=mi.Spectrum(1),
             pdf_w=self.direct,
@@ -416,7 +379,7 @@ class Lights:
             anchor=rays.free_anchor(w.point(0)),
             infinite=self.infinite,
             delta=self.delta,
-            emission_ratio=ratio,
+            emission_ratio=self.first * self.second / self.complete,
         )
 
 
@@ -542,7 +505,7 @@ class Inputs(SimpleNamespace):
 
 
 class Guide(guided_hits.Guiding):
-    """Guides every path along itself, with the ``density`` (n, k + 1) from the script at each vertex."""
+    """Guides every path along itself, with ``density`` (n, k + 1) at each vertex."""
 
     def __init__(self, world, density, near_specular):
         super().__init__(self, near_specular)
@@ -577,12 +540,10 @@ class Guide(guided_hits.Guiding):
 def kernel_weights(
     world: World, kappa: Coefficients, name: str, monkeypatch, merges=None, guide: Guide | None = None
 ) -> np.ndarray:
-    """Weights of all strategies of the world's paths, by the unchanged kernel.
-
-    With ``merges``, a `merging.Merging` without photons, those of the k - 1 merges follow, and `World.merged`
-    has what was merged. With a ``guide`` those of guided s = 0 and s = 1 follow, see `oracle.Guided`; all are
-    0 where inactive.
-    """
+    """Weights of all strategies of the world's paths, by the unchanged kernel. With ``merges``, a
+    `merging.Merging` without photons, those of the k - 1 merges follow, and `World.merged` has what was
+    merged. With a ``guide`` those of guided s = 0 and s = 1 follow, see `oracle.Guided`; all are 0 where
+    inactive."""
     k, scene = world.k, world.scene
     u32, f = mi.UInt32, mi.Float
     plan = SimpleNamespace(
@@ -720,7 +681,7 @@ class Unaimed:
 
 
 def traced_photons(world: World, k_, merges, shared, monkeypatch):
-    """The photons of one light subpath for each path, traced, sorted and kept by the unchanged code."""
+    """The photons of one light subpath for each path, by the unchanged code."""
     from mitsuba_bdpt.merging import passes  # a component, see test_components
 
     with monkeypatch.context() as patch:
@@ -732,7 +693,7 @@ def traced_photons(world: World, k_, merges, shared, monkeypatch):
 
 
 def record_merges(world: World, monkeypatch):
-    """Keep in ``world.merged`` what is merged at each x_m, a `Contribution`; inactive where nothing is."""
+    """Keep in ``world.merged`` the `Contribution` merged at each x_m."""
     from mitsuba_bdpt.merging import merging
 
     kind, draw, loop, mask = merging.Merging, merging._draw, dr.while_loop, {}
@@ -770,10 +731,9 @@ def record_merges(world: World, monkeypatch):
 )
 @pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
 def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch):
-    """200 random paths each of k = 1, 2, 3, 4 and 6 edges, a fifth of the vertices delta, half of these with
-    a BSDF that has other lobes too, shading frames unrelated to geometric normals. Tolerance: cosines of at
-    least 0.1, computed in float32 through a change of frame, carry 1e-5 each; up to 20 enter a weight.
-    """
+    """200 random paths each, a fifth of the vertices delta, half of these with a BSDF that has other lobes
+    too, shading frames unrelated to geometric normals. Tolerance: cosines of at least 0.1, computed in
+    float32 through a change of frame, carry 1e-5 each; up to 20 enter a weight."""
     kappa = COEFFICIENTS[classes]
     rng = np.random.default_rng(3)
     for k in (1, 2, 3, 4, 6):
@@ -785,12 +745,9 @@ def test_kernel_agrees_with_explicit_densities(name, classes, lens, monkeypatch)
 
 @pytest.mark.parametrize("lens", [False, True], ids=["pinhole", "lens"])
 def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
-    """Rationale: in polarized variants throughputs are products of matrices, which each strategy makes of two
-    halves of a path in its own order, and of a surface it may ask for light the wrong way. 200 random paths
-    as above whose surfaces have one random matrix for light towards the camera and another for light the
-    other way. Expected: the Stokes vector of every strategy is that of the product of the former from the
-    camera to the lamp, to 1e-3 of its intensity (changes of frames in single precision).
-    """
+    """Throughputs of polarized variants are products of matrices. Surfaces have one random matrix for light
+    towards the camera and another for light the other way. Expected: every strategy's Stokes vector is that
+    of the product of the former, to 2e-3 of its intensity (changes of frames in single precision)."""
     mi.set_variant(variants.of("mono_polarized"))
     rng = np.random.default_rng(3)
     for k in (1, 2, 3, 4, 6):
@@ -823,16 +780,10 @@ def test_kernel_multiplies_matrices_in_their_order(lens, monkeypatch):
     ],
 )
 def test_kernel_with_merges(name, classes, lens, least, monkeypatch):
-    """Rationale: as above, with merges on paths that connections sample too. Every strategy has to
-    pass V the vertex, densities and coefficients of its own, and stored vertices carry it. Bounds from one
-    side that are not exact are off (`merging.SLACK`), eta is spread over three orders of magnitude, and a
-    fifth of the vertices are delta.
-
-    Expected: the weights of all strategies and merges are the oracle's, to 1e-3, and their sums 1 within
-    1e-4, but on the paths where rounding decides a comparison (closer than 0.1 %; a few per mille). A
-    merge's estimate is the photon's flux over eta and the cosine towards the light's side, to 1e-3; the flux
-    is 1 / density of the events before it, times their adjoint factors.
-    """
+    """As above, with merges on paths that connections sample too. Bounds from one side that are not exact are
+    off (`merging.SLACK`), eta is spread over three orders of magnitude. Left out: paths on which rounding
+    decides a comparison (closer than 0.1 %). A merge's estimate is the photon's flux over eta and the cosine
+    towards the light's side; the flux is 1 / density of the events before it, times their adjoint factors."""
     from mitsuba_bdpt.merging import merging
     from mitsuba_bdpt.merging.radius import Radius
 
@@ -873,7 +824,7 @@ def test_kernel_with_merges(name, classes, lens, least, monkeypatch):
 
 
 def layers_of(paths) -> np.ndarray:
-    """Path layers by definition, of each path: by its rough events, and those beyond the first one."""
+    """Path layers by definition: by rough events, and those beyond the first one."""
     densities = np.minimum(paths.to_camera, paths.to_light)[:, 1 : paths.k]
     specular = paths.delta[:, 1 : paths.k] | (densities >= near_specular.NARROW)
     found = []
@@ -887,10 +838,8 @@ def layers_of(paths) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", ["alone", "merging"])
 def test_strategies_agree_on_path_layers(kind, monkeypatch):
-    """Rationale: each strategy knows the events of two halves of a path, and makes one or two by connecting
-    them. Paths and photons as above, half of the vertices delta, the others near-specular at half of the
-    densities. Expected: every strategy that samples a path, merges too, states the layer that
-    follows from its definition."""
+    """Each strategy knows the events of two halves of a path. Half of the vertices are delta, the others
+    near-specular at half of the densities."""
     from mitsuba_bdpt.merging.merging import Merging
     from mitsuba_bdpt.merging.radius import Radius
 
@@ -921,7 +870,7 @@ def test_strategies_agree_on_path_layers(kind, monkeypatch):
 
 
 def guided_estimates(world: World, weights) -> np.ndarray:
-    """Estimates times ``weights`` of guided s = 0 and s = 1, over the estimates without the guide."""
+    """Weighted estimates of guided s = 0 and s = 1, over those without the guide."""
     first, found = world.k + 2, []
     for s in range(first, weights.shape[1]):
         value, plain = (np.array(world.values.get(i, [0])[0]) for i in (s, (s - first) % 2))
@@ -943,17 +892,13 @@ def guided_estimates(world: World, weights) -> np.ndarray:
     ],
 )
 def test_kernel_guides_through_specular_events(name, classes, lens, least, monkeypatch):
-    """Rationale: which paths are SDS paths, and so what is left out and what knows the guide, is decided by
-    every strategy from its own subpaths. Guided subpaths are traced by the unchanged code along the paths, as
-    if from a guide of densities over four orders of magnitude. 1,000 random paths each of k = 3, 4 and 5
-    edges, a tenth of the vertices delta, half of the others specular by their densities; of 300 more than
+    """Which paths are SDS paths is decided by every strategy from its own subpaths. Guided subpaths are
+    traced by the unchanged code, as if from a guide of densities over four orders of magnitude. Of 1,000
+    paths a tenth of the vertices are delta, half of the others specular by their densities; of 300 more than
     half are delta, and all others specular. With ``least`` infinite half are delta, none of the others is
-    specular, and a tenth of the lamps can only be hit.
-
-    Expected: every weight is the oracle's to 1e-3 of its own size and 0 where the oracle has none. Guided
-    estimates times weights are the oracle's weights over the guide's density (stand-ins of BSDFs have value
-    1, and weight 1 where they are sampled), to 1e-3, and 0 on other paths.
-    """
+    specular, and a tenth of the lamps can only be hit. Expected: weights to 1e-3, 0 where the oracle has
+    none; guided estimates times weights are the oracle's weights over the guide's density (stand-ins of BSDFs
+    have value 1)."""
     kappa, rng, total, pure = COEFFICIENTS[classes], np.random.default_rng(12), 0, 0
     for k in (3, 4, 5):
         near = least < np.inf

@@ -11,7 +11,7 @@ PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RU
 
 
 def slots_of(pixels, samples, camera_paths, seed) -> tuple[Sharing, np.ndarray]:
-    """The map and the slots of all parts (part, lane); -1 where a lane has none."""
+    """The slots of all parts (part, lane); -1 where a lane has none."""
     sharing = Sharing(pixels, samples, camera_paths, mi.UInt32(seed))
     lane, part = dr.meshgrid(dr.arange(mi.UInt32, sharing.lanes), dr.arange(mi.UInt32, camera_paths))
     slots = sharing.slots(lane)(part).numpy().astype(int).reshape(camera_paths, sharing.lanes)
@@ -20,13 +20,11 @@ def slots_of(pixels, samples, camera_paths, seed) -> tuple[Sharing, np.ndarray]:
 
 @pytest.mark.parametrize("camera_paths", [1, 2, 3, 4, 8, 16])
 def test_every_sample_has_one_lane(camera_paths):
-    """Rationale: a sample that is traced twice, or not at all, biases the image of films whose size S does
-    not divide; samples of a pixel that share a light subpath depend on each other; those that share with
-    several pixels, or with others in every pass, have no net of light subpaths (8 % more error, see
-    `batch`). Expected, for films of any number of pixels (fewer than S, primes, whole runs and a rest) and
-    samples: each slot has one lane, which `lane` finds; a lane's slots are of different pixels; a pixel's
-    samples share in order with those of the same pixels, whatever their number; there are no more lanes than
-    the next whole number of pixels takes; the first part, thus all if S = 1, is as it was."""
+    """Rationale: samples of a pixel that share a light subpath depend on each other; those that share with
+    others in every pass have no net of light subpaths (8 % more error). Expected: each slot has one lane,
+    which `lane` finds; a lane's slots are of different pixels; a pixel's samples share in order with those of
+    the same pixels; there are no more lanes than the next whole number of pixels takes; the first part is in
+    order."""
     for number, pixels in enumerate(PIXELS):
         for samples in (1, 2, 3, 16) if pixels < 5000 else (1, 3):
             sharing, slots = slots_of(pixels, samples, camera_paths, number)
@@ -46,7 +44,7 @@ def test_every_sample_has_one_lane(camera_paths):
 
 
 def lags(width, height):
-    """Number of pairs of pixels at each lag (2 height, 2 width), negative lags behind the positive ones."""
+    """Pairs of pixels at each lag (2 height, 2 width), negative lags behind the positive ones."""
     down, across = (np.minimum(np.arange(2 * n), 2 * n - np.arange(2 * n)) for n in (height, width))
     return (height - down)[:, None] * (width - across)
 
@@ -57,13 +55,10 @@ def lags(width, height):
 )
 @pytest.mark.parametrize("camera_paths", [2, 3, 4, 8, 16])
 def test_sharers_lie_at_no_distance_in_particular(width, height, camera_paths):
-    """Rationale: pixels that share light subpaths have noise in common, half of it at most in our scenes; at
-    one distance from each other they make stripes. Expected, as far as at least a quarter of all pixels have
-    a neighbour at a lag, and in each of several maps: of the pairs of pixels there fewer than 0.05 share,
-    hence a correlation below 0.03 (found: 0.026 at most; all did at height / S rows), and a pixel shares with
-    hardly more of its own column than of others: 0.05 above chance (0.35 on 640 x 360 if pixels keep their
-    places in runs). Chance alone makes (S - 1) / pixels at each lag, 0.005 here: films of less than some 500
-    pixels are too small for S = 16."""
+    """Rationale: common noise at one distance makes stripes. Expected, as far as a quarter of all pixels have
+    a neighbour at a lag: of the pairs there fewer than 0.05 share, hence a correlation below 0.03, and a
+    pixel shares with its own column 0.05 above chance at most (0.35 if pixels keep their places in runs).
+    Chance alone makes (S - 1) / pixels at each lag, 0.005."""
     pairs = lags(width, height)
     for seed in (0, 1):
         _, slots = slots_of(width * height, 1, camera_paths, seed)
@@ -83,9 +78,8 @@ def test_sharers_lie_at_no_distance_in_particular(width, height, camera_paths):
 
 
 def correlations(renders) -> np.ndarray:
-    """The correlation of the noise of two pixels at each lag, averaged over all pairs of pixels at the lag:
-    where at least a quarter of all pixels have a neighbour there, and 0 elsewhere and at lag 0. ``renders``
-    (seeds, height, width) of the same scene. Every pixel counts alike, whatever its noise."""
+    """Of the noise of two pixels at each lag, averaged over all pairs, where at least a quarter of all pixels
+    have a neighbour there. ``renders`` (seeds, height, width). Every pixel counts alike."""
     count, height, width = renders.shape
     noise = renders - renders.mean(axis=0)
     deviation = noise.std(axis=0, ddof=1)
@@ -99,35 +93,14 @@ def correlations(renders) -> np.ndarray:
     return found
 
 
-def noise_of(scene, camera_paths, spp, renders) -> np.ndarray:
-    """Renders (seeds, height, width) of a scene, brightness."""
-    parameters = {"light_paths": 1 / camera_paths, "connections": "one", "max_depth": 6}
-    integrator = mi.load_dict({"type": "bdpt"} | parameters)
-    images = [np.array(integrator.render(scene, seed=seed, spp=spp)) for seed in range(renders)]
-    return np.array(images, dtype=float)[..., :3].mean(axis=-1)
-
-
 def test_noise_has_no_stripes():
-    """Rationale: relMSE does not see stripes, people do. Expected: of a room lit by its ceiling the noise of
-    two pixels is correlated by less than 0.03 at every lag, with S = 16, and means of columns vary no more
-    than 1.5 times as much as of independent pixels. Found: 0.015 and 1.04; when sharers lay in one column
-    0.59, at multiples of 4 rows, and 8.1. With 48 renders of 64 x 64 pixels a correlation of 0 is found with
-    a standard error of 0.0023 to 0.0045, the largest of all lags as 0.017."""
-    renders = noise_of(load_scene("uplight_room", resolution=64), 16, 4, 48)
+    """Expected, with S = 16: correlations below 0.03 (0.015; 0.59 when sharers lay in one column), and means
+    of columns vary at most 1.5 times as much as of independent pixels (1.04; 8.1). With 48 renders a
+    correlation of 0 has a standard error of 0.0045 at most, the largest of all lags is 0.017."""
+    parameters = {"light_paths": 1 / 16, "connections": "one", "max_depth": 6}
+    scene, method = load_scene("uplight_room", resolution=64), mi.load_dict({"type": "bdpt"} | parameters)
+    images = [np.array(method.render(scene, seed=seed, spp=4), dtype=float) for seed in range(48)]
+    renders = np.array(images)[..., :3].mean(axis=-1)
     assert correlations(renders).max() < 0.03
     noise = (renders - renders.mean(axis=0)) / renders.std(axis=0, ddof=1)
     assert noise.mean(axis=1).var() * 64 < 1.5
-
-
-SCENES = ("uplight_room", "ajar_door", "cornell_box", "many_lights", "smallvcm_cornell_lamp", "veach_bidir")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("camera_paths", [2, 4, 16])
-@pytest.mark.parametrize("name", SCENES)
-def test_noise_of_scenes_has_no_stripes(name, camera_paths):
-    """Expected: as above, in six scenes, by the positive correlations: neighbours in a row are opposite, by
-    up to 0.1 also with path tracing alone, since their samples are neighbours in the sequence. Tolerance:
-    with 128 renders the largest of all lags is found as 0.012 where all are 0."""
-    renders = noise_of(load_scene(name, resolution=64), camera_paths, 16, 128)
-    assert correlations(renders).max() < 0.03

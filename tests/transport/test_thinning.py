@@ -10,7 +10,7 @@ COUNT = 400
 
 
 def places(offsets):
-    """Place, whether kept and probability of the first `COUNT` vertices, one row for each offset."""
+    """Place, whether kept and probability of the first `COUNT` vertices, a row for each offset."""
     thinning = Thinning.begin(mi.Float(offsets))
     rows = [thinning.place(mi.UInt32(i)) for i in range(COUNT)]
     dr.eval(rows)
@@ -22,10 +22,8 @@ def places(offsets):
 
 
 def test_probabilities_are_those_stated():
-    """Rationale: what is kept stands for the others, so that its stated probability has to be the true one.
-    Expected: over 2^14 offsets spread evenly the share of subpaths that keep a vertex is its probability, to
-    the 2^-14 that one offset counts; the first half all are kept, of later ones the i-th with
-    (KEPT / 2)^2 / (i (i - 1)), to 1e-4 of it."""
+    """Expected: over 2^14 even offsets the share that keeps a vertex is its probability, to the 2^-14 of one
+    offset; the first half all are kept, the i-th later one with (KEPT / 2)^2 / (i (i - 1)), to 1e-4."""
     n = 2**14
     _, kept, probability = places((np.arange(n) + 0.5) / n)
     assert (probability == probability[:1]).all()
@@ -38,10 +36,7 @@ def test_probabilities_are_those_stated():
 
 
 def test_places_fill_memory_without_holes():
-    """Rationale: places in memory are read from 0 to the number kept; a hole would be read as a vertex.
-    Expected: for any offset the places of the vertices that are kept are 0, 1, 2, ... and below KEPT, also
-    for 0 and the largest offset below 1.
-    """
+    """A hole would be read as a vertex."""
     offsets = np.concatenate([[0, 1 - 2**-24], np.random.default_rng(0).random(200)])
     place, kept, _ = places(offsets)
     for of_path, keeps in zip(place, kept, strict=True):
