@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 from types import SimpleNamespace
 
 import drjit as dr
@@ -69,7 +69,7 @@ def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndar
     # Values that kernels look up, so that they are compiled once for all; 0 is a class not in use.
     kappa = Coefficients(*(dr.opaque(mi.Float, x) if x else 0 for x in astuple(kappa)))
     discs = None if eta is None else [mi.Float(x) for x in eta.astype(np.float32).T]
-    chain = Recursion(Columns.of(paths), kappa, mis.Heuristic(name), discs)
+    chain = Recursion(arrays(paths), kappa, mis.Heuristic(name), discs)
     weights = {0: chain.hit(), 1: chain.endpoints() if paths.k == 1 else chain.next_event()}
     if paths.k > 1:
         weights |= {s: chain.inner(s) for s in range(2, paths.k)} | {paths.k: chain.splat()}
@@ -79,67 +79,37 @@ def recursion(paths: Paths, kappa: Coefficients, name: str, eta=None) -> np.ndar
     return columns([weights[s] for s in range(len(weights))], len(paths.kind))
 
 
-@dataclass
-class Columns:
+def arrays(paths: Paths) -> SimpleNamespace:
     """`Paths` as Dr.Jit arrays: a list of one for each edge or vertex; masks of the kinds of emitters in
     place of ``kind``, and ``ratio``, see `emitters.Direct.emission_ratio`."""
 
-    k: int
-    dist2: list
-    cos_light: list
-    cos_camera: list
-    to_camera: list
-    to_light: list
-    delta: list
-    first: object
-    second: object
-    direct: object
-    lens: object
-    lens_pdf: object
-    sensor_pdf: object
-    area: object
-    position: object
-    infinite: object
-    unhittable: object
-    ratio: object
-    transmittance: list
+    def number(x):
+        with np.errstate(over="ignore"):
+            return mi.Float(x.astype(np.float32))
 
-    @staticmethod
-    def of(paths: Paths) -> Columns:
-        def number(x):
-            with np.errstate(over="ignore"):
-                return mi.Float(x.astype(np.float32))
-
-        ratio = paths.first.astype(np.float64) * paths.second / paths.direct
-        ratio /= np.where(
-            paths.kind == AREA,
-            paths.cos_light[:, 0],
-            np.where(paths.kind == POSITION, paths.dist2[:, 0], 1),
-        )
-        edges = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
-        single = ("first", "second", "direct", "lens_pdf", "sensor_pdf")
-        return Columns(
-            k=paths.k,
-            **{name: [number(x) for x in getattr(paths, name).T] for name in edges},
-            **{name: number(getattr(paths, name)) for name in single},
-            delta=[mi.Bool(x) for x in paths.delta.T],
-            lens=mi.Bool(paths.lens),
-            area=mi.Bool(paths.kind == AREA),
-            position=mi.Bool(paths.kind == POSITION),
-            infinite=mi.Bool(paths.infinite),
-            unhittable=mi.Bool(paths.delta_emitter),
-            ratio=number(ratio),
-            transmittance=[None] * paths.k
-            if paths.transmittance is None
-            else [number(x) for x in paths.transmittance.T],
-        )
+    area, position, transmittance = paths.kind == AREA, paths.kind == POSITION, paths.transmittance
+    ratio = paths.first.astype(np.float64) * paths.second / paths.direct
+    ratio /= np.where(area, paths.cos_light[:, 0], np.where(position, paths.dist2[:, 0], 1))
+    edges = ("dist2", "cos_light", "cos_camera", "to_camera", "to_light")
+    single = ("first", "second", "direct", "lens_pdf", "sensor_pdf")
+    masks = {"lens": paths.lens, "area": area, "position": position}
+    masks |= {"infinite": paths.infinite, "unhittable": paths.delta_emitter}
+    return SimpleNamespace(
+        k=paths.k,
+        **{name: [number(x) for x in getattr(paths, name).T] for name in edges},
+        **{name: number(getattr(paths, name)) for name in single},
+        **{name: mi.Bool(mask) for name, mask in masks.items()},
+        delta=[mi.Bool(x) for x in paths.delta.T],
+        ratio=number(ratio),
+        transmittance=[None] * paths.k if transmittance is None else [number(x) for x in transmittance.T],
+    )
 
 
 class Recursion:
     """Partial sums along both subpaths of each path, and the weight of each strategy from them, in the order
     of calls of ``walk.py`` and ``techniques.py``."""
 
-    def __init__(self, path: Columns, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
+    def __init__(self, path: SimpleNamespace, kappa: Coefficients, heuristic: mis.Heuristic, eta=None):
         self.path, self.kappa, self.h, self.eta = path, kappa, heuristic, eta
         self._no_merges = 0 if eta is None else heuristic.zero()
         self.arrival = dr.select(path.lens, kappa.arrival, mi.Float(0))

@@ -1,21 +1,17 @@
-"""Name the paths behind the worst values of a scene's renders.
+"""The paths behind the worst values of a scene's renders.
 
-Renders each scene with default parameters and takes the samples that are worst against the reference:
-those that by themselves are off by more than ``level`` times the value of their pixel. It traces them again
-(`recording`), finds each path anew with Mitsuba's own calls (`reconstruct`), and prints one line for each
-kind of path:
+Takes the samples of renders with default parameters that are off by more than ``level`` times the value of
+their pixel, traces them again (`recording`), finds each path anew (`reconstruct`), and prints one line for
+each kind of path:
 
-* error: the share of the squared error of all renders that these samples have; largest: how far one is off,
-  in values of its pixel; samples: how many of the samples examined (``top`` of each render).
-* path: from the lamp L to the eye E in P. Heckbert's letters, S for delta events, G for rough ones, D for
-  diffuse ones, V for those in a medium, and the materials on the way; `¦` is where the strategy joins light
-  and camera vertices.
-* other strategies: the densest other one, with its density over that of the strategy that made the path, by
-  one sample of each; "none" if no other can make it.
+* error: their share of the squared error of all renders; largest: in values of the pixel; samples: of those
+  examined (``top`` of each render).
+* path: P. Heckbert's letters, S for delta events, G for rough ones, D for diffuse ones, V in a medium; `¦` is
+  where the strategy connects.
+* other strategies: the densest one, with its density over that of the strategy that made the path.
 * `path`: what Mitsuba's `path` adds with the same path (s = 0 and s = 1, balance heuristic) over what was
-  added. Its roulette is counted where s = 0 or 1 made the path; it is the same there.
-* found anew: how many of these paths were found again from their vertices with the same estimate and weight;
-  in scenes with media none is.
+  added. Roulette is counted where s = 0 or 1 made the path.
+* found anew: with the same estimate and weight; in scenes with media none is.
 """
 
 from __future__ import annotations
@@ -44,12 +40,9 @@ AGREE = 1e-2
 
 @dataclass(frozen=True)
 class Firefly:
-    """A sample that stands out, with the path that adds most to it.
-
-    ``off`` by so many values of its pixel, ``error`` its sum of squared relative errors; ``kappa`` of the k +
-    2 strategies; ``rebuilt`` None if the path could not be found anew, ``doubt`` why, or in what it then
-    differed from what the render says, empty if in nothing.
-    """
+    """A sample that stands out, with the path that adds most to it. ``off`` by so many values of its pixel,
+    ``error`` its sum of squared relative errors; ``kappa`` of the k + 2 strategies; ``rebuilt`` None if the
+    path could not be found anew, ``doubt`` why, or in what it then differed from what the render says."""
 
     path: recording.Path
     letters: str
@@ -67,15 +60,13 @@ class Firefly:
 
 
 class Names:
-    """Letters and names of the vertices of a scene's paths."""
-
     def __init__(self, scene):
         self._shapes = {
             int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]): shape for shape in scene.shapes()
         }
 
     def letters(self, path) -> str:
-        """Heckbert's letters from the lamp to the eye, `¦` where the strategy joins."""
+        """Heckbert's letters from the lamp to the eye, `¦` where the strategy connects."""
         found = ["E"] + ["S" if d else "?" for d in path.delta[1:-1]] + ["L"]
         for i, letter in enumerate(found):
             if letter == "?" and not path.shapes[i]:
@@ -88,13 +79,12 @@ class Names:
         return " ".join(found[::-1])
 
     def vertices(self, path) -> str:
-        """The materials between lamp and eye, by class where they have no name; "medium" in one."""
+        """The materials between lamp and eye, by class where they have no name."""
         bsdfs = (self._shapes[number].bsdf() if number else None for number in path.shapes[-2:0:-1])
         return ", ".join("medium" if b is None else b.id() or b.class_name() for b in bsdfs)
 
 
 def fireflies(scene, integrator, target, spp: int, seed: int, level: float, top: int):
-    """The image of a render and its worst `Firefly` objects, at most ``top``."""
     scale = np.sqrt(target**2 + rel_mse_epsilon(target))
     image, outliers = recording.render(scene, integrator, level * spp * scale, spp, seed)
     names, found = Names(scene), []
@@ -139,10 +129,8 @@ def coefficients(plan, k: int) -> np.ndarray:
 
 
 def in_use(firefly: Firefly) -> np.ndarray:
-    """Densities of the strategies in use, each with its coefficient, over that of the one that made the path.
-
-    Raises ``ValueError`` for a path that was not found anew.
-    """
+    """Densities times coefficients of the strategies in use, over that of the one that made the path. Raises
+    ``ValueError`` for a path that was not found anew."""
     if firefly.rebuilt is None:
         raise ValueError(f"a path that was not found anew: {firefly.doubt}")
     return firefly.kappa * firefly.rebuilt.relative(firefly.path.s)
@@ -166,7 +154,6 @@ def line(name: str, found: list[Firefly], total: float, examined: int) -> list[s
 
 
 def _doubts(found: list[Firefly]) -> str:
-    """How many paths were found anew, and what speaks against the others."""
     doubts = {f.doubt for f in found} - {""}
     text = f"{sum(not f.doubt for f in found)} of {len(found)}"
     return text + (f" ({'; '.join(sorted(doubts))})" if doubts else "")
@@ -193,21 +180,10 @@ def _elsewhere(firefly: Firefly) -> tuple[str, str]:
     return text, f"{estimate / (by_path * survival * path.value.max()):.3g}x"
 
 
-HEAD = [
-    "scene",
-    "error",
-    "largest",
-    "samples",
-    "strategy",
-    "path",
-    "other strategies",
-    "`path`",
-    "found anew",
-]
+HEAD = "scene,error,largest,samples,strategy,path,other strategies,`path`,found anew".split(",")
 
 
 def lines(project: Project, file: MeasuredScene, options: Namespace) -> tuple[list, str]:
-    """The rows of a scene, those with most error first, and what its renders were like."""
     name, seconds = file.name, options.reference_seconds
     job = Job(project, file, options.resolution, options.max_depth, options.spp, seconds)
     target, scene = obtained(job).image, file.load(options.resolution)
@@ -231,7 +207,6 @@ def lines(project: Project, file: MeasuredScene, options: Namespace) -> tuple[li
 
 
 def text(project: Project, names: Sequence[str], options: Namespace) -> str:
-    """The table of the scenes with these ``names``, and the renders' errors, raw and trimmed."""
     rows, said = [], []
     for scene in [project.scene(name) for name in names]:
         more, errors = lines(project, scene, options)

@@ -54,12 +54,6 @@ class Paths:
         columns = (getattr(self, f.name) for f in fields(self))
         return Paths(*(None if x is None else x[chosen] for x in columns))
 
-    @staticmethod
-    def joined(several) -> Paths:
-        """All of ``several``, of the same number of edges."""
-        columns = ([getattr(p, f.name) for p in several] for f in fields(Paths))
-        return Paths(*(None if x[0] is None else np.concatenate(x) for x in columns))
-
     @property
     def infinite(self):
         return (self.kind == ENVIRONMENT) | (self.kind == DIRECTIONAL)

@@ -1,9 +1,6 @@
-"""Samples of a render that stand out, and the paths that made them.
-
-`render` renders as always, and keeps which camera samples and splats are large. `replay` traces these again,
-loop by loop, with the code and the random numbers of the render, and writes down every vertex and every
-contribution on the way.
-"""
+"""Samples of a render that stand out, and the paths that made them. `render` keeps which camera samples and
+splats are large; `replay` traces these again, loop by loop, with the code and the random numbers of the
+render, and records every vertex and contribution."""
 
 from __future__ import annotations
 
@@ -30,13 +27,11 @@ from mitsuba_bdpt.transport.inputs import Observer, TraceContext
 
 # Outliers kept of one launch, and what is kept of each: lane, pixel, colours, strategy of a splat.
 CAPACITY, COLUMNS = 1 << 16, 8
-
-# All of it is kept in single precision, in which whole numbers are exact up to here.
-MOST_LANES = 1 << 24
+MOST_LANES = 1 << 24  # exact in single precision
 
 
 def float64(x) -> np.ndarray:
-    """Convert to double precision, without NumPy warnings for NaN in masked lanes."""
+    """Without NumPy warnings for NaN in masked lanes."""
     with np.errstate(invalid="ignore"):
         return np.array(x, dtype=np.float64)
 
@@ -54,11 +49,9 @@ class Launch:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A sample that adds ``value`` (three colours) over the pixel's samples to the pixel (``x``, ``y``).
-
-    The camera sample ``slot`` of a ``launch``, or a splat of its light subpath; ``s`` and ``t`` of a splat, 0
-    for camera samples, in which several strategies are summed.
-    """
+    """A sample that adds ``value`` (three colours) over the pixel's samples to the pixel (``x``, ``y``): the
+    camera sample ``slot`` of a ``launch``, or a splat of its light subpath; ``s`` and ``t`` of a splat, 0 for
+    camera samples."""
 
     launch: Launch
     slot: int
@@ -70,10 +63,8 @@ class Outlier:
 
 
 class Collector(sink.Image):
-    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel).
-
-    Raises ``CommandError`` for a launch of too many ``lanes``.
-    """
+    """The sink of a render; keeps what is larger than ``least`` (three numbers for each pixel). Raises
+    ``CommandError`` for a launch of too many ``lanes``."""
 
     def __init__(self, film, least, lanes: int):
         super().__init__(film)
@@ -87,12 +78,10 @@ class Collector(sink.Image):
         self.kept = []
 
     def splat(self, kernel, c, shared, stream):
-        """Add a contribution with t <= 1."""
         self._keep(c.position, polarization.scaled(c.weighted(), shared.weight), shared, (c.s, c.t), c.active)
         return super().splat(kernel, c, shared, stream)
 
     def end(self, kernel, lane, sample, total, seen):
-        """Add a camera sample."""
         self._keep(
             sample.start.counted,
             polarization.scaled(total, lane.shared.weight),
@@ -117,7 +106,7 @@ class Collector(sink.Image):
         dr.scatter_reduce(dr.ReduceOp.Add, rows, packet, row, active & (row < CAPACITY))
 
     def found(self, launch: Launch) -> list[Outlier]:
-        """What was kept, the launch being over; raises ``CommandError`` if that was too much."""
+        """What was kept; raises ``CommandError`` if that was too much."""
         found = []
         for number, rows in self.kept:
             count = int(number[0])
@@ -130,11 +119,8 @@ class Collector(sink.Image):
 
 
 def _slots(launch: Launch, rows) -> list[int]:
-    """The camera samples that outliers are of.
-
-    Of those that share a lane, which lie in different pixels, that in the outlier's; for splats that of the
-    first part, whose slot is the lane.
-    """
+    """The camera samples that outliers are of: of those that share a lane that in the outlier's pixel, for
+    splats that of the first part, whose slot is the lane."""
     if not len(rows):
         return []
     batch = launch.batch
@@ -150,19 +136,15 @@ def _slots(launch: Launch, rows) -> list[int]:
 
 
 def _outlier(launch: Launch, row, slot: int) -> Outlier:
-    """An outlier from what was kept of it."""
     x, y, s, t = (int(row[i]) for i in (1, 2, 6, 7))
     return Outlier(launch, slot, x, y, row[3:6], s, t)
 
 
 def render(scene, integrator, least, spp: int, seed: int):
-    """The image of a render, and the `Outlier` objects in it, largest first.
-
-    They are all samples larger than ``least`` (of the image's shape) in one of the colours. Lanes keep one
-    light subpath each (`Plan.joined`), and ``merging=auto`` does not merge. Raises ``CommandError`` for a
-    film of other colours, for ``merging=true``, where s = 0 or emission is guided, and for decisions that
-    join more.
-    """
+    """The image of a render, and the `Outlier` objects larger than ``least`` (of the image's shape) in one of
+    the colours, largest first. Lanes keep one light subpath each (`Plan.joined`), and ``merging=auto`` does
+    not merge. Raises ``CommandError`` for a film of other colours, for ``merging=true``, where s = 0 or
+    emission is guided, and for decisions that join more."""
     film = scene.sensors()[0].film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise CommandError(f"film '{film.id()}' of class {film.class_name()} is not RGB; use hdrfilm")
@@ -200,14 +182,12 @@ def render(scene, integrator, least, spp: int, seed: int):
 
 @dataclass
 class Path:
-    """A path by its vertices, z_0 first and y_0 last, and what it adds.
-
-    Positions ``p`` (k + 1, 3), of an emitter at infinity the direction to it (``infinite``); ``shapes``
-    numbers of Dr.Jit, 0 for none; ``delta``: the event was a delta event. ``value`` (three colours) what the
-    strategy (``s``, ``t``) adds with the ``weight``, roulette and the draw of a connection included;
-    ``estimate`` without these two, unweighted. ``pdf_w`` of the sensor's direction. ``survival``: the
-    probability with which roulette let both subpaths live.
-    """
+    """A path by its vertices, z_0 first and y_0 last, and what it adds. Positions ``p`` (k + 1, 3), of an
+    emitter at infinity the direction to it (``infinite``); ``shapes`` numbers of Dr.Jit, 0 for none;
+    ``delta``: the event was a delta event. ``value`` (three colours) what the strategy adds with the
+    ``weight``, roulette and the draw of a connection included; ``estimate`` without these, unweighted.
+    ``pdf_w`` of the sensor's direction. ``survival``: probability with which roulette let both subpaths
+    live."""
 
     s: int
     t: int
@@ -224,13 +204,10 @@ class Path:
 
 @dataclass
 class _Visit:
-    """What a walk left at a vertex, arrays of the lanes.
-
-    ``number`` of the vertex in its subpath, 1 after the endpoint: in scenes with media what passes a surface
-    keeps it. ``departed``: the throughput with which the edge to it began, which media change on the way.
-    ``joined``: position (or direction, where ``infinite``) of the endpoint with which the vertex was joined;
-    ``pdf_w`` of the sensor's direction there.
-    """
+    """What a walk left at a vertex, arrays of the lanes. ``number`` of the vertex in its subpath, 1 after the
+    endpoint (kept where a surface is passed); ``departed``: throughput with which the edge to it began;
+    ``joined``: position (or direction, where ``infinite``) of the endpoint connected to; ``pdf_w`` of the
+    sensor's direction there."""
 
     p: np.ndarray
     shape: np.ndarray
@@ -247,21 +224,17 @@ class _Visit:
 
 @dataclass
 class _Subpath:
-    """A subpath: the position of its endpoint (``start``), and the further vertices (``visits``).
-
-    Of an endpoint at infinity, where ``infinite``, the direction to it.
-    """
+    """Position of its endpoint (``start``, where ``infinite`` the direction to it), and the further
+    vertices."""
 
     start: np.ndarray
     infinite: np.ndarray
     visits: list = field(default_factory=list)
 
     def chain(self, count: int, i: int, before: int | None = None) -> list[int]:
-        """Places in ``visits`` of the ``count`` - 1 vertices after the endpoint in lane ``i``, in order.
-
-        The last vertex is the latest of its number ``before`` a place, each other one before the next. Fewer
-        if there are not so many.
-        """
+        """Places in ``visits`` of the ``count`` - 1 vertices after the endpoint in lane ``i``, in order: the
+        last vertex is the latest of its number ``before`` a place, each other one before the next. Fewer if
+        there are not so many."""
         found, before = [], len(self.visits) if before is None else before
         for number in range(count - 1, 0, -1):
             places = [k for k in range(before) if self.visits[k].number[i] == number]
@@ -277,11 +250,8 @@ class _Subpath:
 
 @contextlib.contextmanager
 def stepwise(traced: TraceContext):
-    """Dr.Jit runs loops and branches of a kernel step by step, so that their state can be read.
-
-    As for a render the cycle collector is paused, and calls too go step by step where an emitter, of this
-    scene or another, needs it.
-    """
+    """Dr.Jit runs loops and branches of a kernel step by step, so that their state can be read. As for a
+    render the cycle collector is paused, and calls go step by step where an emitter needs it."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(gc_paused())
         stack.enter_context(evaluated_mode(traced.emitters.evaluated))
@@ -291,10 +261,7 @@ def stepwise(traced: TraceContext):
 
 
 class Recorder(Observer):
-    """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`.
-
-    Writes down contributions, and the vertices of the walks.
-    """
+    """Sink (see `sink`) of a replay of ``count`` samples, and its `Observer`."""
 
     alpha = False
 
@@ -305,34 +272,28 @@ class Recorder(Observer):
         self.contributions = []
 
     def emitted(self, emission):
-        """The light subpath begins."""
         start = dr.select(emission.infinite, mi.Point3f(-emission.d), mi.Point3f(emission.si.p))
         self.light = _Subpath(self._numbers(start, 3), self._numbers(emission.infinite).astype(bool))
 
     def started(self, traced, side, walk):
-        """The camera subpath begins; of the light subpath `emitted` knows more."""
+        """Of the light subpath `emitted` knows more."""
         if not side.adjoint:
             self.camera = self._begun(self._numbers(walk.previous, 3))
 
     def _begun(self, start) -> _Subpath:
-        """A subpath from finite points ``start``, without further vertices."""
         return _Subpath(start, np.zeros(self._count, dtype=bool))
 
     def vertex(self, side, walk, vertex, step):
-        """A subpath has reached a vertex."""
         subpath = self.light if side.adjoint else self.camera
         subpath.visits.append(self._visit(side, walk, vertex, step))
 
     def drawn(self, end):
-        """A connection was drawn."""
         self._drawn = self._numbers(end, 3)
 
     @staticmethod
     def _survival(subpath, places: list[int], i: int) -> float:
-        """The probability with which roulette let a subpath come to the last of these ``places``.
-
-        Also where it only passed a surface, roulette is played. What media take on the way is none of it.
-        """
+        """Probability with which roulette let a subpath come to the last of these ``places``: it is played
+        where a subpath only passes a surface too; what media take on the way is none of it."""
         found = 1.0
         for a, b in pairwise(subpath.visits[: places[-1] + 1] if places else []):
             found *= (a.throughput[:, i] * a.weight[:, i]).max() / b.departed[:, i].max()
@@ -362,26 +323,21 @@ class Recorder(Observer):
         return found
 
     def _numbers(self, x, rows: int = 0):
-        """An array of Dr.Jit as one of NumPy, with an entry for each lane."""
         shape = (rows, self._count) if rows else (self._count,)
         return np.broadcast_to(float64(x).reshape(*shape[:-1], -1), shape).copy()
 
     def begin(self):
-        """Nothing found yet."""
         return dr.zeros(mi.Spectrum)
 
     def add(self, traced, c, total, start, shared):
-        """Add a contribution with t >= 2."""
         self._note(c, c.weighted())
         return total + c.weighted()
 
     def splat(self, traced, c, shared, stream):
-        """Add a contribution with t <= 1."""
         self._note(c, c.weighted())
         return Counters()
 
     def connect(self, traced, z, lane, stream, total, start):
-        """Join the camera vertex ``z`` with the light vertices of its lane."""
         found = []
 
         def add(_, seen, total):
@@ -401,15 +357,12 @@ class Recorder(Observer):
 
     def _distances(self, c, end):
         """How far the light vertex of a connection is from the ``end`` of a visibility ray, in each lane.
-
-        Rays end short of the vertex drawn, by an offset that depends on the scene: it is the nearest one, not
-        one within a bound in units of the scene. One that is not seen adds nothing, drawn or not.
-        """
+        Rays end short of the vertex drawn, by an offset that depends on the scene: it is the nearest one. One
+        that is not seen adds nothing, drawn or not."""
         y = np.array([self.light.ends_at(int(s), i) for i, s in enumerate(self._numbers(c.s))])
         return np.where(self._numbers(c.active) > 0, np.linalg.norm(end.T - y, axis=1), np.inf)
 
     def end(self, traced, lane, sample, total, seen):
-        """The camera sample is complete."""
         self.pdf_w = self._numbers(sample.start.pdf_w)
         return Counters()
 
@@ -421,7 +374,7 @@ class Recorder(Observer):
         self.contributions.append(numbers)
 
     def paths(self, i: int) -> list[Path]:
-        """The paths of sample ``i``, those that add most first."""
+        """Of sample ``i``, those that add most first."""
         found = [
             self._path(i, {name: x[..., i] for name, x in c.items()})
             for c in self.contributions
@@ -451,10 +404,8 @@ class Recorder(Observer):
 
     @staticmethod
     def _vertices(subpath, count: int, i: int, places: list[int], joined: bool) -> list:
-        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath.
-
-        These are in ``places``. No event at the endpoint, and none of delta where it is ``joined``.
-        """
+        """Position, shape, and whether the event was a delta event, of ``count`` vertices of a subpath, in
+        ``places``: none at the endpoint, and none of delta where it is ``joined``."""
         if not count:
             return []
         found = [(subpath.start[:, i], 0, False)]
@@ -466,10 +417,8 @@ class Recorder(Observer):
 
 
 def replay(outliers: list[Outlier]) -> list[list[Path]]:
-    """The paths in each outlier, those that add most first.
-
-    Of camera samples all that have t >= 2, of splats those of the same strategy.
-    """
+    """The paths in each outlier, those that add most first: of camera samples all with t >= 2, of splats
+    those of the same strategy."""
     found: list[list[Path]] = [[] for _ in outliers]
     for launch in {id(o.launch): o.launch for o in outliers}.values():
         numbers = [i for i, o in enumerate(outliers) if o.launch is launch]

@@ -17,16 +17,13 @@ import scenes
 T = mi.ScalarTransform4f
 
 
-def film(width=32):
-    return {"type": "hdrfilm", "width": width, "height": width, "rfilter": {"type": "box"}}
+FROM_ABOVE = T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0])
 
 
-def camera(kind="perspective", **keys):
-    if kind == "orthographic":
-        keys["to_world"] = T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0]).scale(1.5)
-    else:
-        keys |= {"fov": 40, "to_world": T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0])}
-    return {"type": kind, "film": film(), **keys}
+def camera(kind="perspective"):
+    if kind == "perspective":
+        return scenes.camera(origin=(0, 4, 3), target=(0, 0, 0), fov=40, size=32)
+    return {"type": kind, "film": scenes.camera(size=32)["film"], "to_world": FROM_ABOVE.scale(1.5)}
 
 
 def floor(red=0.6):
@@ -40,9 +37,8 @@ def sheet(bsdf, height=1.0):
 
 def lamp_with_area(position, radius):
     """As bright as the point light, from afar."""
-    return {"type": "sphere", "center": position, "radius": radius} | {
-        "emitter": scenes.area(10 / (np.pi * radius**2))
-    }
+    emitter = scenes.area(10 / (np.pi * radius**2))
+    return {"type": "sphere", "center": position, "radius": radius, "emitter": emitter}
 
 
 DOWN = T().look_at([0.5, 3, 0], [0, 0, 0.3], [0, 0, 1])
@@ -50,12 +46,7 @@ LAMPS = {
     "point": {"type": "point", "position": [0.5, 3, 0], "intensity": 10.0},
     "spot": {"type": "spot", "cutoff_angle": 30, "intensity": 10.0, "to_world": DOWN},
     "directional": {"type": "directional", "direction": [0.2, -1, 0.1], "irradiance": 3.0},
-    "projector": {
-        "type": "projector",
-        "fov": 40,
-        "irradiance": {"type": "rgb", "value": 2.0},
-        "to_world": DOWN,
-    },
+    "projector": {"type": "projector", "fov": 40, "irradiance": scenes.rgb(2.0), "to_world": DOWN},
 }
 
 GLASS = {"type": "dielectric"}
@@ -116,7 +107,7 @@ def test_behind_a_sheet_of_nothing_the_direct_light_is_lost(lamp, eye, bsdf, pas
 
 def test_a_sensor_of_one_ray_finds_photons():
     """Its pixel has no size. Expected: the direct light at that point, within half (about twenty photons)."""
-    eye = {"type": "radiancemeter", "film": film(1), "to_world": T().look_at([0, 4, 3], [0, 0, 0], [0, 1, 0])}
+    eye = {"type": "radiancemeter", "film": scenes.camera(size=1)["film"], "to_world": FROM_ABOVE}
     scene = scene_of(LAMPS["spot"], eye, sheet=sheet({"type": "null"}))
     expected = mean(scene_of(LAMPS["spot"], eye), mi.load_dict({"type": "path", "max_depth": 2}), 64)
     assert sum(lost_in(scene).values()) == pytest.approx(expected, rel=0.5)
