@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
@@ -40,11 +41,9 @@ def recorded(calls: list):
         note(ray, active, None)
         return shadow(scene, ray, active=active)
 
-    mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test = ray_intersect_preliminary, ray_test
-    try:
+    preliminary = mock.patch.object(mi.Scene, "ray_intersect_preliminary", ray_intersect_preliminary)
+    with preliminary, mock.patch.object(mi.Scene, "ray_test", ray_test):
         yield
-    finally:
-        mi.Scene.ray_intersect_preliminary, mi.Scene.ray_test = closest, shadow
 
 
 def kernel_seconds(work) -> float:

@@ -46,7 +46,7 @@ LAMPS = {
     "point": {"type": "point", "position": [0.5, 3, 0], "intensity": 10.0},
     "spot": {"type": "spot", "cutoff_angle": 30, "intensity": 10.0, "to_world": DOWN},
     "directional": {"type": "directional", "direction": [0.2, -1, 0.1], "irradiance": 3.0},
-    "projector": {"type": "projector", "fov": 40, "irradiance": scenes.rgb(2.0), "to_world": DOWN},
+    "projector": {"type": "projector", "fov": 40, "irradiance": scenes.rgb(2.0, 2.0, 2.0), "to_world": DOWN},
 }
 
 GLASS = {"type": "dielectric"}

@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_parts import blend, bumps, picture, tilted
 from light_side import evaluate_adjoint, sample_adjoint
 from mitsuba_bdpt.transport import bsdf, draws, spectra
 from scipy import stats
@@ -26,34 +27,6 @@ PLASTIC = {"type": "plastic", "diffuse_reflectance": {"type": "rgb", "value": [0
 CLEAR = {"type": "principled", "roughness": 0.5, "spec_trans": 0.8}
 GLOSSY = {"type": "principled", "roughness": 0.6, "metallic": 0.3}
 NO_COLOUR = {"base_color": {"type": "rgb", "value": 0.0}}
-
-
-def bumps(nested):
-    """Smooth waves (a checkerboard has no gradient)."""
-    x = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-    waves = 0.5 + 0.5 * np.sin(x)[:, None] * np.cos(x)[None, :]
-    texture = {
-        "type": "bitmap",
-        "raw": True,
-        "wrap_mode": "repeat",
-        "bitmap": mi.Bitmap(waves.astype(np.float32)[..., None]),
-    }
-    return {"type": "bumpmap", "scale": 0.1, "texture": texture, "nested": nested}
-
-
-def tilted(nested):
-    """A frame tilted by 20 degrees everywhere."""
-    normal = np.array([np.sin(0.35) * 0.8, np.sin(0.35) * 0.6, np.cos(0.35)])
-    pixels = np.broadcast_to(0.5 + 0.5 * normal, (2, 2, 3)).astype(np.float32)
-    return {
-        "type": "normalmap",
-        "normalmap": {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ascontiguousarray(pixels))},
-        "nested": nested,
-    }
-
-
-def blend(weight, a, b):
-    return {"type": "blendbsdf", "weight": weight, "a": a, "b": b}
 
 
 # By name, a function that makes the plugin's dictionary: bitmaps need the variant.
@@ -238,8 +211,7 @@ def test_evaluation_beside_a_step(name):
 def test_directions_within_the_surface():
     """Two points of a floor see each other under a cosine of 1e-20, whose square leaves single precision:
     Mitsuba's shadowing of bumps is NaN there. Expected: 0."""
-    even = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((4, 4, 1), 0.5, dtype=np.float32))}
-    plugin = mi.load_dict({"type": "bumpmap", "map": even, "nested": GREY})
+    plugin = mi.load_dict({"type": "bumpmap", "map": picture(np.full((4, 4, 1), 0.5)), "nested": GREY})
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.n, si.dp_du, si.dp_dv = mi.Normal3f(0, 0, 1), mi.Vector3f(1, 0, 0), mi.Vector3f(0, 1, 0)
     si.sh_frame, si.wi = mi.Frame3f(si.n), mi.Vector3f(0.6, 0, 0.8)

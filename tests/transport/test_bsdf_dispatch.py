@@ -23,7 +23,7 @@ DIFFUSE, CONDUCTOR, GLASS, TWOSIDED, BLEND = range(len(KINDS))
 def beads(kinds, copies=0):
     """Balls with these BSDFs; ``copies`` (instances) of a ball far away."""
     at = mi.ScalarTransform4f()
-    view = scenes.camera(origin=(0, -3, 2), target=(0, 0, 0.2), up=(0, 0, 1), fov=39)
+    view = scenes.camera(origin=(0, -3, 2), target=(0, 0, 0.2), up=(0, 0, 1), fov=35)
     lamp = {"type": "sphere", "center": [0, 0, 2], "radius": 0.3, "emitter": scenes.area(9.0)}
     scene = {"type": "scene", "sensor": view, "floor": scenes.square(size=2), "lamp": lamp}
     for number, kind in enumerate(kinds):

@@ -1,6 +1,5 @@
 """Mueller matrices of Mitsuba's BSDFs from either side, in polarized variants."""
 
-import struct
 import tempfile
 from functools import cache
 from pathlib import Path
@@ -9,7 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
+from bsdf_parts import bumps, tilted
 from light_side import evaluate_adjoint, sample_adjoint
+from mitsuba.python import tensor_io
 from mitsuba_bdpt.transport import bsdf
 
 COUNT = 4096
@@ -19,16 +20,6 @@ GLASS = {"type": "dielectric", "int_ior": 1.5}
 MIRROR = {"type": "conductor", **METAL}
 ROUGH = {"type": "roughconductor", "alpha": 0.3, **METAL}
 PLASTIC = {"type": "pplastic", "alpha": 0.3, "diffuse_reflectance": 0.5}
-
-
-def bumps():
-    heights = 0.3 * np.random.default_rng(0).random((8, 8, 1))
-    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(heights.astype(np.float32))}
-
-
-def normals():
-    tilted = np.array([0.5, 0.5, 1]) + 0.1 * np.random.default_rng(1).standard_normal((8, 8, 3))
-    return {"type": "bitmap", "raw": True, "data": mi.TensorXf(tilted.astype(np.float32))}
 
 
 @cache
@@ -45,18 +36,8 @@ def measured():
     matrices += 0.1 * rng.random((1, 5, 6, 1, 4, 4)) * matrices[..., :1, :1]
     fields = {name: values[None].astype(np.float32) for name, values in angles.items()}
     fields |= {"wvls": np.arange(450, 700, 50, dtype=np.uint16), "M": matrices.astype(np.float32)}
-    header = sum(2 + len(name) + 2 + 1 + 8 + 8 * data.ndim for name, data in fields.items())
-    head, body = b"tensor_file\0" + bytes([1, 0]) + struct.pack("<I", len(fields)), b""
-    start = len(head) + header
-    for name, data in fields.items():
-        kind = 3 if data.dtype == np.uint16 else 10
-        head += struct.pack(
-            f"<H{len(name)}sHBQ", len(name), name.encode(), data.ndim, kind, start + len(body)
-        )
-        head += struct.pack(f"<{data.ndim}Q", *data.shape)
-        body += data.tobytes()
     file = Path(tempfile.mkdtemp()) / "made_up.pbsdf"
-    file.write_bytes(head + body)
+    tensor_io.write(file, **fields)
     return str(file)
 
 
@@ -67,7 +48,7 @@ SMOOTH = {
     "mask": lambda: {"type": "mask", "opacity": 0.4, "nested": PLASTIC},
     "twosided": lambda: {"type": "twosided", "nested": ROUGH},
     "blend": lambda: {"type": "blendbsdf", "weight": 0.3, "a": ROUGH, "b": PLASTIC},
-    "bumpmap": lambda: {"type": "bumpmap", "bumps": bumps(), "nested": ROUGH},
+    "bumpmap": lambda: bumps(ROUGH),
     "measured_polarized": lambda: {
         "type": "measured_polarized",
         "filename": measured(),
@@ -84,8 +65,8 @@ DELTA = {
     "circular": lambda: {"type": "circular"},
     "mask": SMOOTH["mask"],
     "twosided mirror": lambda: {"type": "twosided", "nested": MIRROR},
-    "bumpy mirror": lambda: {"type": "bumpmap", "bumps": bumps(), "nested": MIRROR},
-    "bumpy glass": lambda: {"type": "normalmap", "normalmap": normals(), "nested": GLASS},
+    "bumpy mirror": lambda: bumps(MIRROR),
+    "bumpy glass": lambda: tilted(GLASS),
 }
 
 

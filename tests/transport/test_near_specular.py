@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_parts import blend, bumps, picture, tilted
 from mitsuba_bdpt.host.introspection import all_shapes
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import draws, near_specular
@@ -21,16 +22,11 @@ def found_in(bsdf):
     return any(b is bsdf for b, _ in near_specular.near_specular(family, uncached))
 
 
-def picture(values):
-    values = np.asarray(values, np.float32)
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(values[..., None]), "filter_type": "nearest"}
-
-
 def speck(value):
     """A texture of 0.6 with one texel of another ``value``."""
     values = np.full((64, 64), 0.6)
     values[17, 5] = value
-    return picture(values)
+    return picture(values[..., None], filter_type="nearest")
 
 
 def metal(alpha, **keys):
@@ -47,20 +43,6 @@ def principled(roughness, **keys):
 
 def thin(roughness, **keys):
     return {"type": "principledthin", "roughness": roughness, **keys}
-
-
-def bumps(nested):
-    return {"type": "bumpmap", "texture": picture(np.random.default_rng(1).random((8, 8))), "nested": nested}
-
-
-def normals(nested):
-    pixels = np.broadcast_to(np.float32([0.5, 0.5, 1]), (2, 2, 3))
-    texture = {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ascontiguousarray(pixels))}
-    return {"type": "normalmap", "normalmap": texture, "nested": nested}
-
-
-def blend(weight, a, b):
-    return {"type": "blendbsdf", "weight": weight, "a": a, "b": b}
 
 
 # Functions: bitmaps need the variant.
@@ -103,7 +85,7 @@ SHARP = {
     "checkered principled": lambda: principled({"type": "checkerboard", "color0": 0.6, "color1": 0.1}),
     "twosided": lambda: {"type": "twosided", "of": metal(0.01)},
     "bumps": lambda: bumps(metal(0.01)),
-    "normals": lambda: normals(principled(0.1)),
+    "normals": lambda: tilted(principled(0.1)),
     "blend": lambda: blend(0.5, {"type": "diffuse"}, metal(0.01)),
     "mask": lambda: {"type": "mask", "opacity": 0.5, "of": metal(0.01)},
     "mask in a blend": lambda: blend(0.5, {"type": "mask", "opacity": 0.5, "of": glass(0.01)}, metal(0.3)),
