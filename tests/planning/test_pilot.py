@@ -529,27 +529,21 @@ def test_replay():
     assert second.statistics["seconds"]["pilot"] == 0
 
 
-def dark():
-    box = mi.cornell_box()
-    box["light"]["emitter"]["radiance"] = {"type": "rgb", "value": 0.0}
-    return mi.load_dict(box | {"sensor": camera(24)})
-
-
-def blinding():
-    lamp = {"type": "point", "position": [0, 3, 0], "intensity": np.inf}
-    return scene_of(24, lamp=lamp, floor=ground(5))
-
-
+BLINDING = {"type": "point", "position": [0, 3, 0], "intensity": np.inf}
 SEEN = "the pilot found no light but that of emitters which the sensor sees directly"
 
 
 @pytest.mark.parametrize(
     "make, depth, why",
     [
-        (dark, 5, "no light subpaths are possible"),
+        (lambda: scene_of(24, floor=ground(2)), 5, "no light subpaths are possible"),
         (lambda: cornell(24), 1, SEEN),
         (lambda: scene_of(24, sky={"type": "constant"}), 5, SEEN),
-        (blinding, 5, "the pilot found only invalid samples (NaN or infinite)"),
+        (
+            lambda: scene_of(24, lamp=BLINDING, floor=ground(5)),
+            5,
+            "the pilot found only invalid samples (NaN or infinite)",
+        ),
     ],
     ids=["dark", "direct light", "sky", "infinite"],
 )
@@ -590,8 +584,7 @@ def furnace():
     """A sphere lit from its centre: the same radiance everywhere, without noise but for the directions of
     many bounces."""
     view = camera(32, to_world=T().look_at([0, 0, 0.5], [0, 0, -1], [0, 1, 0]))
-    grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
-    wall = {"type": "sphere", "flip_normals": True, "bsdf": grey}
+    wall = {"type": "sphere", "flip_normals": True}
     return scene_of(sensor=view, wall=wall, lamp={"type": "point", "position": [0, 0, 0]})
 
 

@@ -5,7 +5,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.transport.batch import LEAST_RUNS, LONGEST_RUN, Sharing
-from repository import load_scene
 
 PIXELS = (*range(1, 40), 97, 256, 257, 31 * 17, 997, 64 * 64, 4097, 4 * LEAST_RUNS * LONGEST_RUN + 13)
 
@@ -75,32 +74,3 @@ def test_sharers_lie_at_no_distance_in_particular(width, height, camera_paths):
         assert column < (camera_paths - 1) * (height - 1) / (width * height - 1) + 0.05
         enough = pairs >= width * height / 4
         assert (shared[enough] / pairs[enough]).max() < 0.05
-
-
-def correlations(renders) -> np.ndarray:
-    """Of the noise of two pixels at each lag, averaged over all pairs, where at least a quarter of all pixels
-    have a neighbour there. ``renders`` (seeds, height, width). Every pixel counts alike."""
-    count, height, width = renders.shape
-    noise = renders - renders.mean(axis=0)
-    deviation = noise.std(axis=0, ddof=1)
-    noisy = deviation > 0
-    noise = np.where(noisy, noise / np.where(noisy, deviation, 1), 0)
-    size = (2 * height, 2 * width)
-    sums = np.fft.irfft2((np.abs(np.fft.rfft2(noise, size)) ** 2).sum(axis=0), size) / (count - 1)
-    pairs = np.fft.irfft2(np.abs(np.fft.rfft2(noisy.astype(float), size)) ** 2, size).round()
-    found = np.where(pairs >= noisy.sum() / 4, sums / np.maximum(pairs, 1), 0)
-    found[0, 0] = 0
-    return found
-
-
-def test_noise_has_no_stripes():
-    """Expected, with S = 16: correlations below 0.03 (0.015; 0.59 when sharers lay in one column), and means
-    of columns vary at most 1.5 times as much as of independent pixels (1.04; 8.1). With 48 renders a
-    correlation of 0 has a standard error of 0.0045 at most, the largest of all lags is 0.017."""
-    parameters = {"light_paths": 1 / 16, "connections": "one", "max_depth": 6}
-    scene, method = load_scene("uplight_room", resolution=64), mi.load_dict({"type": "bdpt"} | parameters)
-    images = [np.array(method.render(scene, seed=seed, spp=4), dtype=float) for seed in range(48)]
-    renders = np.array(images)[..., :3].mean(axis=-1)
-    assert correlations(renders).max() < 0.03
-    noise = (renders - renders.mean(axis=0)) / renders.std(axis=0, ddof=1)
-    assert noise.mean(axis=1).var() * 64 < 1.5
