@@ -529,21 +529,19 @@ def test_replay():
     assert second.statistics["seconds"]["pilot"] == 0
 
 
+BLACK = scenes.square(emitter=scenes.area(0.0))
 BLINDING = {"type": "point", "position": [0, 3, 0], "intensity": np.inf}
+INVALID = "the pilot found only invalid samples (NaN or infinite)"
 SEEN = "the pilot found no light but that of emitters which the sensor sees directly"
 
 
 @pytest.mark.parametrize(
     "make, depth, why",
     [
-        (lambda: scene_of(24, floor=ground(2)), 5, "no light subpaths are possible"),
+        (lambda: scene_of(24, lamp=BLACK), 5, "no light subpaths are possible"),
         (lambda: cornell(24), 1, SEEN),
         (lambda: scene_of(24, sky={"type": "constant"}), 5, SEEN),
-        (
-            lambda: scene_of(24, lamp=BLINDING, floor=ground(5)),
-            5,
-            "the pilot found only invalid samples (NaN or infinite)",
-        ),
+        (lambda: scene_of(24, lamp=BLINDING, floor=ground(5)), 5, INVALID),
     ],
     ids=["dark", "direct light", "sky", "infinite"],
 )
