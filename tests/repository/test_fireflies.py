@@ -8,48 +8,25 @@ import media_parts
 import mitsuba as mi
 import numpy as np
 import pytest
-from scene_parts import T, grey
+
+import scenes
 
 from instruments import fireflies, reconstruct, recording
+
+T = scenes.transform
 
 
 def between_mirrors(bsdf="conductor"):
     """A small lamp that lights the floor only by a mirror, and a camera that sees it only in another one."""
-    mirror = {"type": "twosided", "bsdf": {"type": bsdf}}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "fov": 30,
-                "to_world": T().look_at([2, 1, 0], [2, 2, -0.8], [0, 1, 0]),
-                "film": {
-                    "type": "hdrfilm",
-                    "width": 12,
-                    "height": 12,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-            },
-            # Facing up, away from the floor.
-            "lamp": {
-                "type": "disk",
-                "to_world": T().translate([-0.5, 1, -1]).rotate([1, 0, 0], -90).scale(0.35),
-                "bsdf": {"type": "diffuse", "reflectance": 0.0},
-                "emitter": {"type": "area", "radiance": 100.0},
-            },
-            "upper": {
-                "type": "rectangle",
-                "to_world": T().translate([0, 2.5, 0]).rotate([1, 0, 0], 90).scale(4),
-                "bsdf": mirror | {"id": "ceiling"},
-            },
-            "lower": {
-                "type": "rectangle",
-                "to_world": T().rotate([1, 0, 0], -90).scale(4),
-                "bsdf": grey(0.5) | {"id": "floor"},
-            },
-        }
+    mirror = {"type": "twosided", "bsdf": {"type": bsdf}, "id": "ceiling"}
+    # Facing up, away from the floor.
+    to_world = T().translate([-0.5, 1, -1]).rotate([1, 0, 0], -90).scale(0.35)
+    lamp = {"type": "disk", "to_world": to_world, "bsdf": scenes.matte(0), "emitter": scenes.area(100.0)}
+    return scenes.load(
+        sensor=scenes.camera(origin=(2, 1, 0), target=(2, 2, -0.8), fov=30, size=12),
+        lamp=lamp,
+        upper=scenes.square((0, 2.5, 0), scenes.DOWNWARDS, 4, mirror),
+        lower=scenes.floor(size=4, bsdf=scenes.both_sides(0.5) | {"id": "floor"}),
     )
 
 
@@ -65,12 +42,8 @@ def worst(scene, depth, count, level, **parameters):
 
 
 def test_a_path_that_one_strategy_alone_makes_is_named():
-    """A lamp that faces a mirror, a floor that is seen in that mirror: of paths of up to 4 edges only lamp,
-    mirror, floor, mirror, eye brings light, by s = 0 alone.
-
-    Expected: every sample that stands out is that path, found anew from its vertices, with its estimate
-    (radiance times reflectance: 50), weight 1, no other strategy, and `path` has the same firefly.
-    """
+    """Of paths of up to 4 edges only lamp, mirror, floor, mirror, eye brings light, by s = 0 alone. Expected:
+    its estimate is radiance times reflectance, 50, its weight 1, and `path` has the same firefly."""
     found = worst(between_mirrors(), 4, 8, 0.3)
     assert len(found) == 8
     for firefly in found:
@@ -84,13 +57,8 @@ def test_a_path_that_one_strategy_alone_makes_is_named():
 
 
 def test_the_worst_samples_of_all_strategies_are_found_anew():
-    """Rationale: what is named has to be what happened, whichever strategy it was, drawn connections and
-    light subpaths that several camera subpaths share included. A glossy ceiling takes all strategies.
-
-    Expected: each of the 40 worst samples has the estimate and the weight that follow from its vertices by
-    Mitsuba's own calls and the densities of all strategies (1 %: directions between float32 vertices at a
-    rough surface); several strategies are among them.
-    """
+    """A glossy ceiling takes all strategies. Expected: estimates and weights follow from the vertices by
+    Mitsuba's own calls and the densities of all strategies (1 %: directions between float32 vertices)."""
     scene = between_mirrors("roughconductor")
     found = worst(scene, 5, 40, 0.02, light_paths=0.25, connections="one", skip="impossible")
     assert len(found) == 40 and [f.doubt for f in found if f.doubt] == []
@@ -120,11 +88,8 @@ def fill_memory():
 
 @pytest.mark.parametrize("scale", [1, 1e-4])
 def test_replays_add_up_to_what_was_rendered(scale):
-    """Rationale: which connection was drawn was told by a distance in units of the scene. Expected: the
-    strategies of a camera sample, traced again, add up to what the render put into the pixel, and each splat
-    is found again (the same arithmetic: float32), in a box of two units and in one of a five thousandth. What
-    lies in memory does not matter: steps of lanes that are masked out hold it, and NumPy took a signalling
-    NaN there for an invalid cast, once in four runs of all tests."""
+    """Rationale: which connection was drawn followed from a distance in units of the scene; NumPy took a
+    signalling NaN in masked lanes for an invalid cast. Tolerance: the same arithmetic in float32."""
     fill_memory()
     room = box(scale)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 5, "light_paths": 0.25})
@@ -137,8 +102,6 @@ def test_replays_add_up_to_what_was_rendered(scale):
 
 
 def test_what_cannot_be_recorded_is_refused():
-    """Expected: a film whose bands are not three colours, and a launch whose lanes single precision cannot
-    number, are refused in words."""
     film = SimpleNamespace(alpha=False, size=(1, 1))
     with pytest.raises(ValueError, match="lanes in a launch, more than 16777216: set a smaller spp_per_pass"):
         recording.Collector(film, np.ones((1, 1, 3)), (1 << 24) + 1)
@@ -152,8 +115,6 @@ def test_what_cannot_be_recorded_is_refused():
 
 
 def test_wrong_paths_are_not_found():
-    """Expected: a vertex that is moved, an event that is called delta, a weight that is another: each is
-    noticed."""
     scene = between_mirrors()
     target = np.full((12, 12, 3), 0.1)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 4})
@@ -181,42 +142,20 @@ def test_wrong_paths_are_not_found():
 def under_water():
     """A small lamp above tilted water, a camera that looks at the floor below it: t = 1 brings nearly all,
     over one refraction (L S D E) and, by reflections in the water from below, over more."""
-    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    lamp = T().translate([-0.7, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.05)
     water = T().translate([0, 1, 0]).rotate([0, 0, 1], 15).rotate([1, 0, 0], -90).scale(4)
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": {
-                "type": "perspective",
-                "fov": 60,
-                "to_world": T().look_at([0, 0.5, 1.5], [0, 0, 0], [0, 1, 0]),
-                "film": film | {"component_format": "float32"},
-            },
-            "lamp": {
-                "type": "disk",
-                "to_world": T().translate([-0.7, 2.5, 0]).rotate([1, 0, 0], 90).scale(0.05),
-                "bsdf": grey(0.0),
-                "emitter": {"type": "area", "radiance": 1000.0},
-            },
-            "water": {
-                "type": "rectangle",
-                "to_world": water,
-                "bsdf": {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0},
-            },
-            "floor": {
-                "type": "rectangle",
-                "to_world": T().rotate([1, 0, 0], -90).scale(4),
-                "bsdf": grey(0.8),
-            },
-        }
+    glass = {"type": "dielectric", "int_ior": 1.33, "ext_ior": 1.0}
+    return scenes.load(
+        sensor=scenes.camera(origin=(0, 0.5, 1.5), target=(0, 0, 0), size=12),
+        lamp={"type": "disk", "to_world": lamp, "bsdf": scenes.both_sides(0), "emitter": scenes.area(1000.0)},
+        water={"type": "rectangle", "to_world": water, "bsdf": glass},
+        floor=scenes.floor(size=4, bsdf=scenes.both_sides(0.8)),
     )
 
 
 @pytest.mark.parametrize("rr_depth", [1, 100])
 def test_refractions_on_the_light_side(rr_depth):
-    """Rationale: a light subpath counts a refraction in solid angle on the other side than a camera subpath,
-    and roulette hid that the rebuilt paths did not (0.46 to 0.63 times what they should be). Expected: the 40
-    worst samples agree with their paths, with roulette from the start and without."""
+    """A light subpath counts a refraction in solid angle on the other side than a camera subpath."""
     scene = under_water()
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 6, "rr_depth": rr_depth})
     plain = np.array(integrator.render(scene, spp=64, seed=1))
@@ -231,10 +170,7 @@ def test_refractions_on_the_light_side(rr_depth):
 
 
 def test_paths_in_media_are_named():
-    """Rationale: `fireflies` ended in a traceback at the first vertex in a medium. Expected: such a vertex
-    has the letter V and the name "medium"; paths with one are not followed and the row says so. Nor are
-    others in such a scene, here those that come straight from a lamp.
-    """
+    """Expected: a vertex in a medium is V; no path of a scene with media is rebuilt, and the row says so."""
     ball = media_parts.ball(interior=media_parts.fog(4, 0.9))
     for light, expected in ((media_parts.point(), "lies in a medium, where"), (None, "has media, through")):
         room = media_parts.room(light=light, ball=ball)
@@ -253,10 +189,8 @@ def test_paths_in_media_are_named():
 
 @pytest.mark.parametrize("boundary", ["null", "mask"])
 def test_replays_in_media(boundary):
-    """Rationale: what passes a surface is no vertex in scenes with media, and albedos change the throughput
-    along edges, which is not roulette. Expected: replays add up to what was rendered, as above; without
-    roulette subpaths live with probability 1, with it some with less and none with more (rounding: 1e-4).
-    """
+    """Expected: without roulette subpaths live with probability 1, with it some with less and none with more.
+    Tolerance: rounding."""
     bsdf = {"type": "mask", "opacity": 0.4, "bsdf": media_parts.matte(0.35, 0.35, 0.35)}
     ball = media_parts.ball("null" if boundary == "null" else bsdf, interior=media_parts.coloured(6.0))
     scene = mi.load_dict(media_parts.room(light=media_parts.point(), ball=ball))
@@ -274,13 +208,10 @@ def test_replays_in_media(boundary):
 
 
 def test_what_is_passed_is_no_vertex():
-    """Expected: of visits with the numbers 1, 1, 2, 2, 3 (two surfaces were passed) the last of each is the
-    vertex; what was joined where the first surface was passed has that one.
-    """
+    """Of visits with one number the last is the vertex."""
     numbers = [1, 1, 2, 2, 3]
-    visits = [
-        SimpleNamespace(number=np.array([number]), p=np.full((3, 1), i)) for i, number in enumerate(numbers)
-    ]
+    places = [np.full((3, 1), i) for i in range(5)]
+    visits = [SimpleNamespace(number=np.array([n]), p=p) for n, p in zip(numbers, places, strict=True)]
     subpath = recording._Subpath(np.zeros((3, 1)), np.zeros(1, dtype=bool), visits)
     assert subpath.chain(4, 0) == [1, 3, 4] and subpath.chain(3, 0) == [1, 3]
     assert subpath.chain(2, 0, before=1) == [0] and subpath.chain(1, 0) == subpath.chain(0, 0) == []

@@ -26,12 +26,10 @@ def name(nodeid):
 
 
 def needed():
-    """Return the names of the tests that see planted bugs."""
     return {name(test) for mutant in mutants.MUTANTS for test in mutant.tests}
 
 
 def pytest_addoption(parser):
-    """Add the option that records what tests cost."""
     parser.addoption("--costs", action="store_true", help=f"write the processor time of tests to {COSTS}")
 
 
@@ -45,7 +43,6 @@ def marker(test, costs, planted):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark tests by their cost, before pytest deselects by markers."""
     costs, planted = json.loads(COSTS.read_text()), needed()
     for item in items:
         if found := marker(name(item.nodeid), costs, planted):
@@ -60,7 +57,6 @@ def _seconds():
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Note when a test begins."""
     item.began = _seconds()
 
 
@@ -76,11 +72,10 @@ _measured = {}
 
 
 def pytest_runtest_logreport(report):
-    """Collect what tests took, in the main process."""
     if report.when == "teardown":
-        _measured.update(
-            {name(report.nodeid): value for key, value in report.user_properties if key == "seconds"}
-        )
+        found = dict(report.user_properties)
+        if "seconds" in found:
+            _measured[name(report.nodeid)] = found["seconds"]
 
 
 def pytest_sessionfinish(session):

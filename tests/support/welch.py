@@ -36,16 +36,15 @@ class Comparisons:
     """
 
     p: np.ndarray
-    labels: list
     continuous: np.ndarray
+    labels: list
 
     @staticmethod
     def join(parts):
         """One family out of several."""
+        labels = [label for x in parts for label in x.labels]
         return Comparisons(
-            np.concatenate([x.p for x in parts]),
-            [label for x in parts for label in x.labels],
-            np.concatenate([x.continuous for x in parts]),
+            *(np.concatenate([getattr(x, k) for x in parts]) for k in ("p", "continuous")), labels
         )
 
 
@@ -68,27 +67,27 @@ def _comparisons(a: Sample, b: Sample, label, labels):
         f"{label} {name}: {x:.6g} vs {y:.6g} +- {e:.2g}"
         for name, x, y, e in zip(names, a.mean, b.mean, found.error, strict=True)
     ]
-    return Comparisons(found.p, text, found.continuous)
+    return Comparisons(found.p, found.continuous, text)
 
 
 def compare_images(a, b, label="") -> Comparisons:
     """`welch` for each tile of ``a`` and ``b`` (renders, tiles) and for the mean of all tiles.
 
-    The mean is a comparison of its own: it finds an error common to all tiles at a quarter of the
-    size for 16 of them. It stays out of the test of uniformity, for it is no new sample.
+    The mean finds an error common to all tiles at a quarter of the size for 16 of them. It stays out of the
+    test of uniformity, for it is no new sample.
     """
-    tiles = welch(a, b, label)
-    whole = welch(np.mean(a, 1, keepdims=True), np.mean(b, 1, keepdims=True), label, ["image"])
-    whole.continuous[:] = False
-    return Comparisons.join([tiles, whole])
+    return _with_mean(welch, a, b, np.mean(b, 1, keepdims=True), label)
 
 
 def compare_known(a, expected, label="") -> Comparisons:
     """As `compare_images`, against a value that is known for every tile."""
-    tiles = one_sample(a, expected, label)
-    whole = one_sample(np.mean(a, 1, keepdims=True), np.mean(expected), label, ["image"])
+    return _with_mean(one_sample, a, expected, np.mean(expected), label)
+
+
+def _with_mean(compared, a, b, mean, label):
+    whole = compared(np.mean(a, 1, keepdims=True), mean, label, ["image"])
     whole.continuous[:] = False
-    return Comparisons.join([tiles, whole])
+    return Comparisons.join([compared(a, b, label), whole])
 
 
 def uniformity(p) -> float:
@@ -125,6 +124,19 @@ def assert_same_tiles(a, b, at_least=10):
     assert_agree(compare_images(tiles(a), tiles(b)), at_least=at_least)
 
 
+def _reach(error, freedom):
+    """Half-widths of the intervals of a family of means."""
+    return stats.t.isf((1 - (1 - OF_AGREE) ** (1 / len(error))) / 2, freedom) * error
+
+
+def _check(mean, expected, reach, used=True):
+    bad = (np.abs(mean - expected) > reach) & used
+    assert not bad.any(), "\n".join(
+        f"value {i}: {mean[i]:.6f} against {expected[i]:.6f}, allowed {reach[i]:.6f}"
+        for i in np.flatnonzero(bad)[-20:]
+    )
+
+
 def agree(a, b, relative, rounding):
     """Welch's t-test of the columns of ``a`` and ``b`` (seeds first) with Sidak's correction, and of
     their means. Faint columns that are zero in a tenth of the renders are left to the mean: a few
@@ -132,26 +144,13 @@ def agree(a, b, relative, rounding):
     ``rounding``: what single precision makes of the two sides, relative."""
     share = np.minimum((a != 0).mean(0), (b != 0).mean(0))
     lumpy = np.append((share < 0.9) & (b.mean(0) < 0.05 * b.mean(0).max()), False)
-    a, b = (np.concatenate([x, x.mean(1, keepdims=True)], axis=1) for x in (a, b))
-    variance = [x.var(0, ddof=1) / len(x) for x in (a, b)]
-    error = np.sqrt(sum(variance))
-    freedom = np.maximum(error, 1e-30) ** 4 / np.maximum(
-        sum(v**2 / (len(x) - 1) for v, x in zip(variance, (a, b), strict=True)), 1e-120
-    )
-    level = 1 - (1 - OF_AGREE) ** (1 / a.shape[1])
-    scale = np.maximum(np.abs(a.mean(0)), np.abs(b.mean(0)))
-    reach = stats.t.isf(level / 2, np.maximum(freedom, 1)) * error + rounding * scale
-    difference = a.mean(0) - b.mean(0)
-    bad = (np.abs(difference) > reach) & ~lumpy
-    assert not bad.any(), "\n".join(
-        f"{'all' if i == len(scale) - 1 else i}: {a[:, i].mean():.6f} against "
-        f"{b[:, i].mean():.6f}, off by {difference[i]:.6f}, allowed {reach[i]:.6f}"
-        for i in np.flatnonzero(bad)[-20:]
-    )
+    a, b = (Sample.of(np.concatenate([x, x.mean(1, keepdims=True)], axis=1)) for x in (a, b))
+    found = difference(a, b)
+    scale = np.maximum(np.abs(a.mean), np.abs(b.mean))
+    reach = _reach(found.error, found.freedom) + rounding * scale
+    _check(a.mean, b.mean, reach, ~lumpy)
     assert scale[-1] > 0
-    assert reach[-1] < relative * scale[-1], (
-        f"too noisy to see an error of {relative}: {reach[-1] / scale[-1]:.2e}"
-    )
+    assert reach[-1] < relative * scale[-1], f"{relative} is not seen: {reach[-1] / scale[-1]:.2e}"
 
 
 def check_known(samples, expected, relative, rounding):
@@ -161,20 +160,9 @@ def check_known(samples, expected, relative, rounding):
     added, holds the expected value. It must reach no further than ``relative``: else the test could not see
     an error of that size.
     """
-    samples = np.asarray(samples, dtype=np.float64)
-    samples = samples.reshape(len(samples), -1)
-    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64).ravel(), samples.shape[1:])
-    mean = samples.mean(0)
-    error = samples.std(0, ddof=1) / np.sqrt(len(samples))
-    level = 1 - (1 - OF_AGREE) ** (1 / expected.size)
-    reach = stats.t.isf(level / 2, len(samples) - 1) * error + rounding * np.abs(expected)
-    bad = np.abs(mean - expected) > reach
-    assert not bad.any(), "\n".join(
-        f"value {i}: {mean[i]:.6f} +- {error[i]:.6f}, expected {expected[i]:.6f}"
-        for i in np.flatnonzero(bad)[:20]
-    )
+    found = Sample.of(np.reshape(samples, (len(samples), -1)))
+    expected = np.broadcast_to(np.asarray(expected, dtype=np.float64).ravel(), found.mean.shape)
+    reach = _reach(found.error, found.freedom) + rounding * np.abs(expected)
+    _check(found.mean, expected, reach)
     blind = reach > relative * np.abs(expected)
-    assert not blind.any(), (
-        f"too noisy to see an error of {relative}: "
-        f"{np.max(reach[blind] / np.maximum(np.abs(expected[blind]), 1e-12)):.2e}"
-    )
+    assert not blind.any(), f"{relative} is not seen: {reach[blind]} of {expected[blind]}"
