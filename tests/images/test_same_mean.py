@@ -490,7 +490,7 @@ CONTRADICTORY = {"declares no medium": inside_without_saying, "that it is in no 
 @same("all", of=CONTRADICTORY)
 def contradictory_media(why):
     """LuxCoreRender #485: light and camera subpaths would see two scenes."""
-    return Row(CONTRADICTORY[why](), VOLPATH, spp=128, judge_spp=128, seeds=16)
+    return Row(CONTRADICTORY[why](), VOLPATH, spp=128, judge_spp=128, seeds=16, error=0.05)
 
 
 def lens_before_a_far_plane(**more):
