@@ -75,7 +75,7 @@ class Row(NamedTuple):
     ours: dict = {}
     other: object = None
     tile: int = 4
-    error: float = 0.02
+    error: float = 0.05
     patched: tuple = ()
     judge_seed: int = 5000
 
@@ -133,7 +133,7 @@ CONVERGING = {"cornell_box": 6, "uplight_room": 4, "veach_mis": 3, "open_sky": 5
 
 @same("all", "default", of=CONVERGING)
 def scene_file(name):
-    return Row(file(name), PATH, CONVERGING[name], 32, 128, 24, error=0.05)
+    return Row(file(name), PATH, CONVERGING[name], 32, 128, 24)
 
 
 @same("all, one connection", "all, quarter", "default", of=("glass_caustics", "lamp_behind_glass"))
@@ -141,7 +141,7 @@ def scene_file(name):
 def without_path(name):
     """`path` misses most of the light: caustics of small and of delta lamps, a spot that shines through an
     egg."""
-    return Row(file(name), EVERYTHING, 5 if name == "veach_bidir" else 6, 32, 32, 24, error=0.05)
+    return Row(file(name), EVERYTHING, 5 if name == "veach_bidir" else 6, 32, 32, 24)
 
 
 @same("all, no connections", of=("glass_caustics", "veach_bidir"))
@@ -375,7 +375,7 @@ def phase_function(name):
     ``wi`` points, normalisation, frames) each could take otherwise. Much of the image is light scattered
     once."""
     fogs.register_plugins()
-    return Row(fogs.foggy(fogs.fog(1.5, 0.9) | {"phase": PHASES[name]}), VOLPATH)
+    return Row(fogs.foggy(fogs.fog(1.5, 0.9) | {"phase": PHASES[name]}), VOLPATH, error=0.01)
 
 
 @same("all", "default", of=("thindielectric", "blendbsdf"))
@@ -385,14 +385,14 @@ def boundary(name):
     thindielectric reflects.)"""
     medium = fogs.fog(3, 0.7)
     if name == "thindielectric":
-        return Row(fogs.room(ball=fogs.ball(name, interior=medium)), VOLPATH)
+        return Row(fogs.room(ball=fogs.ball(name, interior=medium)), VOLPATH, error=0.01)
     blend = {"type": name, "weight": 0.4, "a": {"type": "null"}, "b": matte(0.7, 0.5, 0.3)}
-    return Row(lit(ball=fogs.ball(blend, interior=medium)), VOLPATH)
+    return Row(lit(ball=fogs.ball(blend, interior=medium)), VOLPATH, error=0.01)
 
 
 @same("all", "default")
 def fog_without_next_event_estimation():
-    return Row(fogs.foggy(fogs.fog(1.5, 0.9, sample_emitters=False)), VOLPATH)
+    return Row(fogs.foggy(fogs.fog(1.5, 0.9, sample_emitters=False)), VOLPATH, error=0.01)
 
 
 FOG = {"type": "ref", "id": "fog"}
@@ -422,7 +422,7 @@ def sensor_in_fog(name):
     del scene["sensor"]
     scene = {"fog": scene.pop("fog"), **scene, **globals()[name]()}
     times = 128 if name == "irradiancemeter" else 1  # of the one pixel
-    return Row(scene, VOLPATH, spp=64 * times, judge_spp=256 * times)
+    return Row(scene, VOLPATH, spp=64 * times, judge_spp=256 * times, error=0.01)
 
 
 @same("all", "default")
@@ -431,7 +431,7 @@ def medium_in_python():
     fogs.register_plugins()
     own = {"type": "own_fog", "extinction": 4.0, "albedo": 0.9, "phase": hg(0.3)}
     uniform = lit(ball=fogs.ball(interior=fogs.fog(4, 0.9)))
-    return Row(lit(ball=fogs.ball(interior=own)), VOLPATH, other=uniform)
+    return Row(lit(ball=fogs.ball(interior=own)), VOLPATH, other=uniform, error=0.01)
 
 
 @same("all", "default")
@@ -456,7 +456,7 @@ def spot_in_fog(cutoff):
     # Beside a narrow beam light is rare: tiles of few pixels are not normal.
     spp, tile = (512, 4) if cutoff > 5 else (1024, 8)
     scene = fogs.foggy(fogs.fog(0.8, 0.8), light=spot)
-    return Row(scene, VOLPATH, spp=256, judge_spp=spp, seeds=16, tile=tile, error=0.05)
+    return Row(scene, VOLPATH, spp=256, judge_spp=spp, seeds=16, tile=tile)
 
 
 def coloured_grid(values, low=fogs.LOW, edge=fogs.EDGE, **more):
@@ -490,7 +490,7 @@ CONTRADICTORY = {"declares no medium": inside_without_saying, "that it is in no 
 @same("all", of=CONTRADICTORY)
 def contradictory_media(why):
     """LuxCoreRender #485: light and camera subpaths would see two scenes."""
-    return Row(CONTRADICTORY[why](), VOLPATH, spp=128, judge_spp=128, seeds=16, error=0.05)
+    return Row(CONTRADICTORY[why](), VOLPATH, spp=128, judge_spp=128, seeds=16)
 
 
 def lens_before_a_far_plane(**more):
@@ -633,7 +633,7 @@ def wide_lamp_over_glass_balls():
 
 @same("merged")
 def glass_balls():
-    return Row(caustics(1), WAYS["always"] | {"merging": False}, 8, 64, 64, 8, error=0.05)
+    return Row(caustics(1), WAYS["always"] | {"merging": False}, 8, 64, 64, 8)
 
 
 GUIDED = {"merging": False, "guiding": "always"}
@@ -655,7 +655,7 @@ def small_lamp_by_power():
 def small_lamp_and_sky():
     """s = 0 finds the light of an even sky, which is not merged."""
     sky = {"type": "constant", "radiance": 0.2}
-    return Row(under_glass(sds.spark(), sky=sky), GUIDED, 6, 256, 256, 8, error=0.05)
+    return Row(under_glass(sds.spark(), sky=sky), GUIDED, 6, 256, 256, 8)
 
 
 @same("merged", of=(None, 4))
