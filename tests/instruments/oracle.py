@@ -1,12 +1,19 @@
-"""A slow oracle for the weights: every density of every strategy, written out. E. Veach, "Robust Monte Carlo
-Methods for Light Transport Simulation" (1997), section 10.2: a path x_0 ... x_k of k edges, x_0 on an emitter
-and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s, of density p_s = light[0] ...
-light[s-1] * camera[s] ... camera[k], products of densities of each vertex from either side. Nothing is
-recursive and nothing is shared with the code under test. Logarithms: products of twenty densities over 60
-orders of magnitude leave the range of float64. In media every sampled vertex has the density T c besides: T
-the transmittance of the edge that it is sampled along, c the extinction (1 on surfaces, at emitters and
-sensors); a connecting edge is not sampled; cosines are 1 (M. Raab, D. Seibert, A. Keller 2008). Edge i joins
-x_i and x_{i+1}. Arrays have one row per path."""
+"""A slow oracle for the weights: every density of every strategy, written out.
+
+E. Veach, "Robust Monte Carlo Methods for Light Transport Simulation" (1997), section 10.2: a path x_0 ... x_k
+of k edges, x_0 on an emitter and x_k on the sensor, can be made by the strategies (s, t) with t = k + 1 - s:
+
+    p_s = light[0] ... light[s-1] * camera[s] ... camera[k],
+
+densities of each vertex from either side. Nothing is recursive and nothing is shared with the code under
+test. Logarithms: products of twenty densities over 60 orders of magnitude leave the range of float64.
+
+In media every sampled vertex has the density T c besides: T the transmittance of the edge that it is sampled
+along, c the extinction (1 on surfaces, at emitters and sensors). A connecting edge is not sampled. Cosines
+are 1 (M. Raab, D. Seibert, A. Keller 2008).
+
+Edge i joins x_i and x_{i+1}. Arrays have one row per path.
+"""
 
 from __future__ import annotations
 
