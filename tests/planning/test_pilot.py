@@ -310,8 +310,7 @@ def test_pixels_of_a_pilot(chosen):
 
 def test_splats_in_shadows_count_by_what_is_there():
     """A picture of radiance 1 with a black block of 3 x 3 fine tiles. Expected: the norm there is that of
-    black (a hundredth of the mean's square, and what the larger tile stands in for), that of the rest is
-    1."""
+    black (a hundredth of the mean's square, and what the larger tile stands in for), of the rest 1."""
     fine = moments.FINE
     tile = np.repeat(np.arange(fine**2), 8)
     dark = np.zeros((fine, fine), dtype=bool)

@@ -49,7 +49,7 @@ def principled(roughness, **keys):
 
 def sphere(radius):
     """As bright as the point light, from afar."""
-    emitter = {"type": "area", "radiance": 10 / (np.pi * radius**2)}
+    emitter = scenes.area(10 / (np.pi * radius**2))
     return {"type": "sphere", "center": POINT["position"], "radius": radius, "emitter": emitter}
 
 
@@ -240,11 +240,12 @@ def test_light_off_a_metal_ceiling(metal, warned):
 @pytest.mark.parametrize(
     "bsdf, lamp",
     [
-        *(
-            (bsdf, POINT)
-            for bsdf in ({"type": "null"}, frosted(0.4), principled(0.7), {"type": "thindielectric"})
-        ),
-        *((frosted(0.01), lamp) for lamp in (sphere(0.5), {"type": "constant"})),
+        ({"type": "null"}, POINT),
+        (frosted(0.4), POINT),
+        (principled(0.7), POINT),
+        ({"type": "thindielectric"}, POINT),
+        (frosted(0.01), sphere(0.5)),
+        (frosted(0.01), {"type": "constant"}),
     ],
     ids=["null", "rough", "principled", "thin", "large lamp", "sky"],
 )
