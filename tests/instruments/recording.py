@@ -82,13 +82,8 @@ class Collector(sink.Image):
         return super().splat(kernel, c, shared, stream)
 
     def end(self, kernel, lane, sample, total, seen):
-        self._keep(
-            sample.start.counted,
-            polarization.scaled(total, lane.shared.weight),
-            lane.shared,
-            (0, 0),
-            sample.covered,
-        )
+        value = polarization.scaled(total, lane.shared.weight)
+        self._keep(sample.start.counted, value, lane.shared, (0, 0), sample.covered)
         return super().end(kernel, lane, sample, total, seen)
 
     def _keep(self, position, value, shared, strategy, active):
@@ -113,8 +108,9 @@ class Collector(sink.Image):
             if count > CAPACITY:
                 raise CommandError(f"{count} samples stand out, more than {CAPACITY}: raise the level")
             numbers = np.array(rows, dtype=float).reshape(-1, COLUMNS)[:count]
-            slots = _slots(launch, numbers)
-            found += [_outlier(launch, row, slot) for row, slot in zip(numbers, slots, strict=True)]
+            for row, slot in zip(numbers, _slots(launch, numbers), strict=True):
+                x, y, s, t = (int(row[i]) for i in (1, 2, 6, 7))
+                found.append(Outlier(launch, slot, x, y, row[3:6], s, t))
         return found
 
 
@@ -133,11 +129,6 @@ def _slots(launch: Launch, rows) -> list[int]:
         here = (taken // batch.samples == mi.UInt32(pixel)) & mi.Mask(splat == 0)
         slot = dr.select(here, taken, slot)
     return np.broadcast_to(np.array(slot), len(rows)).tolist()
-
-
-def _outlier(launch: Launch, row, slot: int) -> Outlier:
-    x, y, s, t = (int(row[i]) for i in (1, 2, 6, 7))
-    return Outlier(launch, slot, x, y, row[3:6], s, t)
 
 
 def render(scene, integrator, least, spp: int, seed: int):
