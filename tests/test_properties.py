@@ -435,14 +435,14 @@ class Poison(mi.BSDF):
         bs.pdf = dr.select(u1 < 0.25, dr.nan, bs.pdf)
         return bs, dr.select(u1 < 0.25, dr.nan, weight)
 
-    def eval(self, ctx, si, wo, active=True):
-        return self.inner.eval(ctx, si, wo, active)
+    def eval(self, *arguments):
+        return self.inner.eval(*arguments)
 
-    def pdf(self, ctx, si, wo, active=True):
-        return self.inner.pdf(ctx, si, wo, active)
+    def pdf(self, *arguments):
+        return self.inner.pdf(*arguments)
 
-    def eval_pdf(self, ctx, si, wo, active=True):
-        return self.inner.eval_pdf(ctx, si, wo, active)
+    def eval_pdf(self, *arguments):
+        return self.inner.eval_pdf(*arguments)
 
     def to_string(self):
         return "Poison[]"
@@ -461,27 +461,29 @@ def test_walks_without_a_finite_throughput_are_counted(light_paths):
     assert abs(bdpt.statistics["non_finite"] - expected) < 0.05 * expected
 
 
-def compiled_for(tmp_path, change, skip="impossible", size=16, spp=4):
-    """How many kernels a second render compiles after ``change`` (Python code) with an empty cache."""
-    script = f"""
-import mitsuba_bdpt, mitsuba as mi
+RECOMPILED = """
+import sys, mitsuba_bdpt, mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-scene = mi.load_dict({{
-    "type": "scene", "wall": {{"type": "sphere", "bsdf": {{"type": "twosided", "b": {{"type": "diffuse"}}}}}},
-    "lamp": {{"type": "point"}},
-    "sensor": {{"type": "perspective", "film": {{
-        "type": "hdrfilm", "width": {size}, "height": {size}, "rfilter": {{"type": "gaussian"}}}}}}}})
-bdpt = mi.load_dict({{"type": "bdpt", "max_depth": 4, "skip": "{skip}"}})
-params = mi.traverse(scene)
-spp, seed = {spp}, 1
+change, skip, size, spp = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
+film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}}
+wall = {"type": "sphere", "bsdf": {"type": "twosided", "b": {"type": "diffuse"}}}
+sensor = {"type": "perspective", "film": film}
+scene = mi.load_dict({"type": "scene", "wall": wall, "lamp": {"type": "point"}, "sensor": sensor})
+bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4, "skip": skip})
+params, seed = mi.traverse(scene), 1
 bdpt.render(scene, spp=spp, seed=seed)
 first = bdpt.statistics["kernels"]["compiled"]
-{change}
+exec(change)
 params.update()
 bdpt.render(scene, spp=spp, seed=seed)
 print(first, bdpt.statistics["kernels"]["compiled"])
 """
-    first, second = (int(x) for x in run(script, DRJIT_CACHE_DIR=str(tmp_path)).split())
+
+
+def compiled_for(folder, change, skip="impossible", size=16, spp=4):
+    """How many kernels a second render compiles after ``change`` (Python code) with an empty cache."""
+    found = run(RECOMPILED, change, skip, str(size), str(spp), DRJIT_CACHE_DIR=str(folder))
+    first, second = (int(x) for x in found.split())
     assert first > 0
     return second
 
@@ -566,7 +568,7 @@ METER = {"type": "rectangle"}
             GLASS_LAMP,
             True,
             {"light_paths": 0},
-            ["needs t=1", "needs inner", "SDS", "needs t=0", r"delta emitter - sensor .needs \(1,1\)"],
+            ["t=1", "inner", "SDS", "t=0", r"emitter - sensor .needs \(1,1\)"],
         ),
         (BEAM, False, {}, []),
         (BEAM, False, {"light_paths": 0}, ["directionalarea.*needs t=1", "directionalarea.*needs inner"]),
@@ -830,12 +832,9 @@ REFUSED_PARTS = {
     ),
     "mesh of ellipsoids": (
         lamp_on("ellipsoidsmesh", **ELLIPSOID),
-        "emitter '.*' is on a shape that Mitsuba does not name .*use shape type ellipsoids, or a mesh",
+        "a shape that Mitsuba does not name .*use shape type ellipsoids",
     ),
-    "mirrored cylinder": (
-        lamp_on("cylinder", to_world=MIRRORED),
-        "emitter '.*' is on a cylinder .*'lamp'.* mirrors it.*leave out the negative scale",
-    ),
+    "mirrored cylinder": (lamp_on("cylinder", to_world=MIRRORED), "'lamp'.* mirrors it.*the negative scale"),
     "mirrored cylinder of beams": (
         placed("cylinder", MIRRORED, emitter={"type": "directionalarea"}),
         "emitter '.*' is on a cylinder .*'lamp'.* mirrors it",
@@ -855,60 +854,24 @@ REFUSED_PARTS = {
         {"group": GROUP, "boxes": BOXES},
         "to_world of instance 'boxes' has another inverse .* different surfaces.* axis of length 1",
     ),
-    "cylinder turned about a long axis": (
-        placed("cylinder", LONG_AXIS),
-        f"to_world of cylinder 'lamp' has another inverse {AXIS}",
-    ),
-    "grid turned about a long axis": (
-        {"ball": GRID | {"to_world": LONG_AXIS}},
-        f"to_world of sdfgrid 'ball' has another inverse {AXIS}",
-    ),
-    "squashed cylinder": (
-        lamp_on("cylinder", to_world=STRETCHED),
-        "is on a cylinder .*'lamp'.* squashes or shears it .*1, 2, 1.* or use a mesh",
-    ),
-    "ellipsoid": (
-        lamp_on("sphere", to_world=STRETCHED),
-        "is on a sphere .*'lamp'.* stretches or shears it .*1, 2, 1.* or use a mesh",
-    ),
-    "meter on a sheared disk": (
-        meter_on({"type": "disk", "to_world": LONG_AXIS}),
-        "irradiance meter '.*' is on a disk .*'meter'.* give rotate an axis of length 1",
-    ),
-    "projector": (
-        placed("projector", STRETCHED),
-        "to_world of projector 'lamp' distorts angles .*1, 2, 1.*set fov instead",
-    ),
-    "long spot": (
-        placed("spot", T().scale([1, 1, 2])),
-        "to_world of spot 'lamp' distorts angles .*1, 1, 2.*set cutoff_angle instead",
-    ),
-    "sheared spot": (
-        placed("spot", SHEARED),
-        "to_world of spot 'lamp' distorts angles .*leave out scaling and shear",
-    ),
+    "cylinder turned about a long axis": (placed("cylinder", LONG_AXIS), f"cylinder 'lamp' .*{AXIS}"),
+    "grid turned about a long axis": ({"ball": GRID | {"to_world": LONG_AXIS}}, f"sdfgrid 'ball' .*{AXIS}"),
+    "squashed cylinder": (lamp_on("cylinder", to_world=STRETCHED), "squashes or shears it .*1, 2, 1.*mesh"),
+    "ellipsoid": (lamp_on("sphere", to_world=STRETCHED), "'lamp'.* stretches or shears .*1, 2, 1.*mesh"),
+    "meter on a sheared disk": (meter_on({"type": "disk", "to_world": LONG_AXIS}), f"'meter'.*{AXIS}"),
+    "projector": (placed("projector", STRETCHED), "projector 'lamp' distorts angles .*1, 2, 1.*set fov"),
+    "long spot": (placed("spot", T().scale([1, 1, 2])), "'lamp' distorts angles .*1, 1, 2.*set cutoff_angle"),
+    "sheared spot": (placed("spot", SHEARED), "spot 'lamp' distorts angles .*leave out scaling and shear"),
     "narrow spot": (
         {"lamp": {"type": "spot", "cutoff_angle": 0.013}},
         "spot 'lamp' has cutoff_angle=0.013, a cone without width .*make it 0.02 degrees or more",
     ),
-    "sunsky": (
-        placed("sunsky", STRETCHED),
-        "to_world of sunsky 'lamp' is not a rotation .*leave out scaling",
-    ),
+    "sunsky": (placed("sunsky", STRETCHED), "sunsky 'lamp' is not a rotation .*leave out scaling"),
     "scaled envmap": (placed("envmap", T().scale(2), **SKY), "envmap 'lamp' is not a rotation"),
-    "sheared envmap": (
-        placed("envmap", T().rotate([1, 2, 3], 77), **SKY),
-        "to_world of envmap 'lamp' is not a rotation",
-    ),
+    "sheared envmap": (placed("envmap", T().rotate([1, 2, 3], 77), **SKY), "'lamp' is not a rotation"),
     "batch border": ({"eye": BATCH}, "film of batch sensor 'eye' has sample_border.*set it to false"),
-    "meter border": (
-        meter_on({"type": "disk"}, **GAUSSIAN),
-        "irradiance meter '.*' has sample_border.*set it to false",
-    ),
-    "meter on a grid": (
-        meter_on(GRID),
-        "irradiance meter '.*' is on a SDFGrid.*put it on another shape",
-    ),
+    "meter border": (meter_on({"type": "disk"}, **GAUSSIAN), "meter '.*' has sample_border.*set it to false"),
+    "meter on a grid": (meter_on(GRID), "irradiance meter '.*' is on a SDFGrid.*put it on another shape"),
 }
 
 
@@ -1062,26 +1025,21 @@ def test_registration(code):
     assert found.strip() == "BDPTIntegrator"
 
 
+SCENE = """<scene version="3.0.0">
+    <default name="depth" value="2"/>
+    <integrator type="bdpt">
+        <integer name="max_depth" value="$depth"/><string name="skip" value="none"/>
+        <string name="light_paths" value="1/2"/><boolean name="hide_emitters" value="true"/>
+    </integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm"><integer name="width" value="4"/><integer name="height" value="4"/></film>
+    </sensor>
+    <shape type="sphere"><emitter type="area"/></shape>
+</scene>"""
+
+
 def test_xml():
-    scene = mi.load_string(
-        """
-        <scene version="3.0.0">
-            <default name="depth" value="2"/>
-            <integrator type="bdpt">
-                <integer name="max_depth" value="$depth"/>
-                <string name="skip" value="none"/>
-                <string name="light_paths" value="1/2"/>
-                <boolean name="hide_emitters" value="true"/>
-            </integrator>
-            <sensor type="perspective">
-                <film type="hdrfilm">
-                    <integer name="width" value="4"/><integer name="height" value="4"/>
-                </film>
-            </sensor>
-            <shape type="sphere"><emitter type="area"/></shape>
-        </scene>""",
-        depth=3,
-    )
+    scene = mi.load_string(SCENE, depth=3)
     bdpt = scene.integrator()
     assert bdpt.max_depth == 3 and bdpt.settings.light_paths == 0.5
     assert bdpt.settings.hide_emitters
