@@ -547,16 +547,13 @@ def kernel_weights(
     k, scene = world.k, world.scene
     u32, f = mi.UInt32, mi.Float
     plan = SimpleNamespace(
-        hit=True,
-        direct=True,
+        **dict.fromkeys(("hit", "direct", "light"), True),
+        **dict.fromkeys(("roulette", "hide_emitters"), False),
         splat=kappa.splat > 0,
         endpoints=kappa.endpoints > 0,
         arrival=kappa.arrival > 0 and world.lens,
-        light=True,
         connections="all" if kappa.inner > 0 else "none",
         camera_paths_per_light_path=1,
-        roulette=False,
-        hide_emitters=False,
     )
     k_ = Inputs(
         scene=scene,
@@ -591,13 +588,10 @@ def kernel_weights(
         hits=Hits(scene, None),
         has_media=False,
         space=Vacuum(scene, Flat()),
-        light_media=None,
         sds=sds.PhotonStrategy(),
-        cells=None,
-        light_groups=None,
         light_group=lambda index, active: None,
         path_layers=world.path_layers,
-        sensor_medium=None,
+        **dict.fromkeys(("light_media", "cells", "light_groups", "sensor_medium")),
     )
     shared = Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
     if merges is not None:
