@@ -877,5 +877,5 @@ def test_seeds_are_evaluated():
     check(values, 1, 3e-3)
     with pytest.raises(AssertionError, match="allowed"):
         check(values, 1.01, 3e-3)
-    with pytest.raises(AssertionError, match="noisy"):
+    with pytest.raises(AssertionError, match="is not seen"):
         check(1 + rng.standard_normal((24, 5)), 1, 3e-3)
