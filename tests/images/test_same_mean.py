@@ -20,8 +20,6 @@ import variants
 import welch as st
 from meshes import ball_mesh, folder
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.guided_emission import EmissionTables, side_of
-from mitsuba_bdpt.merging import passes
 from mitsuba_bdpt.transport import mis
 from sds_scenes import guided, under_glass
 from tables import Table
@@ -686,7 +684,7 @@ def point_lamp_seen_from_below_the_plate():
 
 
 # One photon subpath for each sample: else merges have little of the weight beside a large lamp.
-MANY_PHOTONS = (passes, "SAMPLES_PER_PHOTON", 1)
+MANY_PHOTONS = ("mitsuba_bdpt.merging.passes.SAMPLES_PER_PHOTON", 1)
 NEVER = {"guiding": "never"}
 
 
@@ -776,6 +774,8 @@ def all_vertices_merged(light, kind):
 
 def random_tables(scene):
     """Tables of a scene's emitters, of neighbours that differ by up to 50."""
+    from mitsuba_bdpt.guided_emission import EmissionTables, side_of  # other rows do without
+
     emitters = Emitters(scene)
     side = side_of(sum(emitters.tables))
     densities = np.random.default_rng(1).random((sum(emitters.tables), side, side)) ** 4 + 0.02

@@ -143,6 +143,15 @@ def test_the_rest_renders_as_before(name, tmp_path):
         np.testing.assert_allclose(found[skip], expected, rtol=2e-4, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", KNOWN)
+def test_tests_that_import_a_component_are_known_here(name):
+    """Without the component they cannot be collected, which else only the slow test sees."""
+    imports = re.compile(rf"^(from|import) mitsuba_bdpt(\.| import ){name}\b", re.MULTILINE)
+    known = [TESTS / path for path in KNOWN[name].tests]
+    for file in TESTS.rglob("test_*.py"):
+        assert any(map(file.is_relative_to, known)) or not imports.search(file.read_text()), file
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KNOWN)
 def test_the_rest_passes_its_tests(name, tmp_path):
