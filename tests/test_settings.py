@@ -1,7 +1,5 @@
 """The parameters are one record: reader, manual and documents are made from it."""
 
-import re
-
 import mitsuba as mi
 import pytest
 from mitsuba_bdpt import settings
@@ -80,11 +78,3 @@ def test_what_was_removed_is_an_error_with_the_remedy(entry, capsys):
         said = capsys.readouterr().err
         assert ended.value.code == 2 and all(word in said for word in entry.split())
     assert f"was removed; {REMOVED[entry]}" in said
-
-
-def test_what_was_removed_is_gone():
-    for entry, remedy in REMOVED.items():
-        name, _, value = entry.partition("=")
-        assert value not in PARAMETERS[name].choices if value else name not in PARAMETERS
-        if (word := re.match(r"use (\w+)$", remedy)) is not None:
-            assert word[1] in PARAMETERS

@@ -8,7 +8,6 @@ import sys
 from functools import partial
 from pathlib import Path
 
-import floor
 import matplotlib.image
 import mitsuba as mi
 import mutants
@@ -177,14 +176,6 @@ def test_a_comparison_is_of_the_errors_of_reports(second, ratio, bounds):
         *mark, value, _ = cells[f"{kind} efficiency (quartiles)"].split()
         assert "".join(mark) == bounds[1]
         assert ratio is None or float(value) == pytest.approx(1 / ratio, rel=0.1)
-
-
-def test_the_floor_is_recorded_in_a_variant(monkeypatch):
-    """The record names the LLVM of the variant."""
-    steps = []
-    monkeypatch.setattr(mi, "set_variant", lambda name: steps.append("variant"))
-    monkeypatch.setattr(floor, "record", lambda file, rounds: steps.append("record"))
-    assert floor.main(["--record", "probes.json"]) == 0 and steps == ["variant", "record"]
 
 
 COMMANDS = sorted(path.name for path in SCRIPTS.glob("*.py") if "__main__" in path.read_text())

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 34231}
+OUTSIDE = {"scripts": 2929, "tests": 34221}
 MOST_WORDS = 29023
 
 
