@@ -13,7 +13,7 @@ from ..transport.plan import Plan
 # from `LEAST_SAMPLES` on the pilot's gain pays for it in the first render of a scene, from `FOCUSED_SAMPLES`
 # on where light is focused (`focuses`); from `CHEAP_SAMPLES` on recording the pilot takes about 2 % of the
 # render. See experiments, "Short renders".
-PILOT_SHARE = 1 / 1024
+PILOT_SHARE = 1 / 128
 LEAST_LANES, MOST_LANES = 1 << 12, 1 << 15
 FOCUSED_SAMPLES, LEAST_SAMPLES, CHEAP_SAMPLES = 1 << 16, 1 << 18, 1 << 24
 
