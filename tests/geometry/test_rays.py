@@ -219,7 +219,7 @@ def test_what_was_found_from_near_by_is_seen_from_afar(kind, small, tmp_path):
     from_afar = rays.free_anchor(anchor.p + 300 * d)
     number = rounding.met(si.shape, si.instance)
     shadow_ray, own = rays.shadow_ray(errors, from_afar, anchor, number, dr.zeros(mi.SurfaceInteraction3f, n))
-    blocked = counts & rays.occluded(scene, shadow_ray, counts, own)
+    blocked = counts & rays.occluded(scene, errors, shadow_ray, counts, own)
     assert int(dr.count(counts)[0]) > 0.01 * n
     assert int(dr.count(blocked)[0]) <= (0 if kind in FLAT else 1e-4 * n)
 
@@ -500,7 +500,7 @@ def is_seen(scene, errors, origin, end, number, active=True):
     """Mask: the anchor ``end`` on the shape of this ``number`` is seen from ``origin``."""
     like = dr.zeros(mi.SurfaceInteraction3f)
     ray, own = rays.shadow_ray(errors, rays.free_anchor(origin), end, number, like)
-    return ~rays.occluded(scene, ray, mi.Bool(active), own)
+    return ~rays.occluded(scene, errors, ray, mi.Bool(active), own)
 
 
 def grouped(shape, to_world):
@@ -583,6 +583,28 @@ def test_a_shell_about_a_small_sphere_hides_it(radius):
     end = rays.sampled_anchor(mi.Point3f(outwards * radius), mi.Normal3f(outwards), errors.at(shape))
     seen = is_seen(scene, errors, origin, end, rounding.met(shape), facing)
     assert errors.small and int(dr.count(facing & seen)[0]) == 0
+
+
+@pytest.mark.parametrize("radius", [0.01, 1e-3])
+def test_small_spheres_hide_flat_shapes(radius):
+    """Mitsuba's `ray_test` misses a sphere of radius 1e-3 from 8 away. Expected: hidden where the line passes
+    within 0.999 radii, seen beyond 1.001 (single precision errs by 1e-6 / radius)."""
+    turned = T().translate([-1.5 * radius, 0, 0]).rotate([0, 1, 0], 90).scale(2 * radius)
+    ball, disk = {"type": "sphere", "radius": radius}, {"type": "disk", "to_world": turned}
+    scene = mi.load_dict({"type": "scene", "ball": ball, "far": far_away(16), "disk": disk})
+    rng, errors = mi.PCG32(1 << 14, 13), rounding.ShapeErrors(scene)
+    shape = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "disk"))
+    y, z = 1.4 * radius * (2 * rng.next_float32() - 1), 1.4 * radius * (2 * rng.next_float32() - 1)
+    p, origin = mi.Point3f(-1.5 * radius, y, z), mi.Point3f(8, 0, 0)
+    end = rays.sampled_anchor(p, mi.Normal3f(1, 0, 0), errors.at(shape))
+    number, like = rounding.met(shape), dr.zeros(mi.SurfaceInteraction3f)
+    alone = rays.segment(rays.free_anchor(origin), rays.free_anchor(p), like)
+    rows = (is_seen(scene, errors, origin, end, number), ~rays.occluded(scene, errors, alone, mi.Bool(True)))
+    to, o = p.numpy().T.astype(float), np.array([8.0, 0, 0])
+    d = (to - o) / np.linalg.norm(to - o, axis=1)[:, None]
+    miss = np.linalg.norm(np.cross(d, -o), axis=1) / radius
+    for seen in map(np.array, rows):
+        assert errors.small and not seen[miss < 0.999].any() and seen[miss > 1.001].all()
 
 
 @pytest.mark.parametrize("flipped", [False, True])

@@ -256,7 +256,7 @@ class Capture(Observer):
         c = connections.inner(self.kernel, z, y)
         c.active &= y.hit & bsdf.connectible(y.bsdf) & bsdf.connectible(z.bsdf)
         ray = rays.segment(z.anchor, y.anchor, z.si)
-        c.active &= ~rays.occluded(self.scene, ray, c.active)
+        c.active &= ~self.scene.ray_test(ray, active=c.active)
         return self._made(s, t, c)
 
     def _made(self, s, t, c) -> Made:

@@ -21,7 +21,6 @@ from .rounding import (
     FAR,
     LEAST_COSINE,
     QUADRIC_ULPS,
-    SHELL,
     Errors,
     ShapeErrors,
     met,
@@ -130,11 +129,10 @@ def segment(a: Anchor, b: Anchor, shared) -> mi.Ray3f:
 
 @dataclass
 class Own:
-    """Surface ``number`` (`met`) at a shadow ray's end, hit from ``t``; ``first_hit``: that decides alone."""
+    """Surface ``number`` (`met`) at a shadow ray's end, hit from ``t`` on."""
 
     number: mi.UInt32
     t: mi.Float
-    first_hit: mi.Bool
 
 
 def shadow_ray(
@@ -145,22 +143,20 @@ def shadow_ray(
         return segment(a, b, shared), None
     end = _before(a, b)
     ray = segment_to(a, end, shared)
-    early = ray.maxt * _early(a.p - end, b)
-    behind = dr.dot(b.n, a.p - end) * b.curvature < 0
-    first_hit = behind | (early * dr.abs(b.curvature) > SHELL) | shape_errors.crowded(number)
-    return ray, Own(number, ray.maxt - early, first_hit)
+    return ray, Own(number, ray.maxt * (1 - _early(a.p - end, b)))
 
 
-def occluded(scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None):
+def occluded(
+    scene: mi.Scene, shape_errors: ShapeErrors, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None
+) -> mi.Bool:
     """Whether any surface (also null, as in ``path``) but ``own`` blocks ``ray``."""
-    if own is None:
+    if not shape_errors.small:
         return scene.ray_test(ray, active=active)
-    before = mi.Ray3f(ray)
-    before.maxt = own.t
-    # Mitsuba finds rays of negative length blocked, also where not active.
-    blocked = scene.ray_test(before, active=active & ~own.first_hit) & ~own.first_hit
-    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active & own.first_hit)
-    return blocked | (pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t)))
+    # `ray_test` errs by t^2 2^-23 in the squared radius of a sphere, which the first hit does not.
+    pi = scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+    if own is None:
+        return pi.is_valid()
+    return pi.is_valid() & ~((met(pi.shape, pi.instance) == own.number) & (pi.t >= own.t))
 
 
 def intersect_past_emitters(

@@ -13,8 +13,7 @@ import numpy as np
 from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
 from .boxes import asked_anew, scene_box
-from .directions import random_directions
-from .quadrics import ROUND, is_sphere, outward_sign
+from .quadrics import ROUND, outward_sign
 
 # Ray offset in ulps, so that no hit finds its own start (this and the next: experiments, section Rounding).
 OFFSET_ULPS = 32
@@ -28,10 +27,6 @@ LEAST_COSINE = 0.1
 # Diameter of a scene in radii of its smallest sphere or cylinder, above which shadow rays test what they hit:
 # they would end more than two radii early (2 LEAST_COSINE / (QUADRIC_ULPS 2^-24) = 650^2).
 SMALL = 650
-
-# Shadow rays to a small sphere end up to this distance before it, in radii, if no other shape is nearer to
-# it; and the number of rays from the sphere that look for one.
-SHELL, _AROUND = 0.1, 256
 
 # Distance in radii of a sphere or cylinder above which rays to its back would end before its front: the chord
 # is 2 LEAST_COSINE radii (2 LEAST_COSINE^2 / (QUADRIC_ULPS 2^-24) = 205^2).
@@ -96,15 +91,7 @@ class ShapeErrors:
         self._triangles = None
         if len(triangles) > 1:
             self._triangles = mi.UInt32(first), mi.Float(np.concatenate(triangles).astype(np.float32))
-        crowded = np.zeros(self._size, dtype=bool)
-        if self.small:
-            crowded[ids] = _crowded(scene, shapes, [abs(row.ends) for row in rows])
-        self._crowded = mi.Bool(crowded)
-        dr.make_opaque(self._table, self._triangles, self._crowded)
-
-    def crowded(self, number: mi.UInt32) -> mi.Bool:
-        """Mask: another shape may be nearer than `SHELL` radii to the one of index ``number``."""
-        return dr.gather(mi.Bool, self._crowded, dr.minimum(number, self._size - 1))
+        dr.make_opaque(self._table, self._triangles)
 
     def at(self, shape, active=True, instance=None, triangle=None) -> Errors:
         """`Errors` of hits on ``shape`` or ``instance``; on one ``triangle`` if given."""
@@ -120,20 +107,6 @@ class ShapeErrors:
             found.ends = dr.gather(mi.Float, self._table.ends, index, known)
             found.starts = dr.gather(mi.Float, self._table.starts, index, known)
         return found
-
-
-def _crowded(scene: mi.Scene, shapes, curvatures: list[float]) -> np.ndarray:
-    """Whether rays from a round shape meet another within `SHELL` radii; true for all but spheres."""
-    near = np.array(curvatures) != 0
-    spheres = [i for i, shape in enumerate(shapes) if near[i] and is_sphere(shape)]
-    if spheres:
-        d = random_directions(np.random.default_rng(0), _AROUND * len(spheres))
-        radius = mi.Float(np.repeat([1 / curvatures[i] for i in spheres], _AROUND).astype(np.float32))
-        centre = mi.Point3f(np.repeat([matrix_of(shapes[i])[:3, 3] for i in spheres], _AROUND, axis=0).T)
-        ray = mi.Ray3f(centre + d * (radius * (1 + 0.01 * SHELL)), d)
-        ray.maxt = SHELL * radius
-        near[spheres] = scene.ray_test(ray).numpy().reshape(-1, _AROUND).any(axis=1)
-    return near
 
 
 def met(shape, instance=None):

@@ -46,7 +46,7 @@ def between(space: Space, ray, medium, active, own=None, word: mi.UInt32 | int =
     """
     media = space.media
     if not media.null_lobes and not hidden:
-        visible = active & ~rays.occluded(space.scene, ray, active, own)
+        visible = active & ~rays.occluded(space.scene, space.shape_errors, ray, active, own)
         transmittance, depth, _, collisions = _along(media, medium, ray, ray.maxt, word, visible)
         counted = Counters(segments=one(active), collisions=collisions)
         return Crossing(dr.select(visible, transmittance, 0), depth, visible, counted)

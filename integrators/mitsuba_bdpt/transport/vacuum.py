@@ -72,7 +72,8 @@ class Vacuum:
         """The `Contribution` ``c`` after its shadow ray, with T in the value and T~ in the weight."""
         ray, active = c.shadow_ray.ray, c.active
         if not c.shadow_ray.hidden:
-            return replace(c, active=active & ~rays.occluded(self.scene, ray, active, c.shadow_ray.own))
+            blocked = rays.occluded(self.scene, self.shape_errors, ray, active, c.shadow_ray.own)
+            return replace(c, active=active & ~blocked)
         pi, _ = rays.intersect_past_emitters(self.scene, self.shape_errors, ray, active, coherent=False)
         return replace(c, active=active & ~pi.is_valid())
 
@@ -85,4 +86,4 @@ class Vacuum:
 
     def clear(self, ray: mi.Ray3f, medium: mi.UInt32 | None, active: mi.Bool) -> Any:
         """Mask: no surface blocks ``ray``, which starts in ``medium``."""
-        return ~rays.occluded(self.scene, ray, active)
+        return ~rays.occluded(self.scene, self.shape_errors, ray, active)
