@@ -10,12 +10,12 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 6283,
-    "transport merging guided_emission": 5729,
+    "transport merging guided_emission": 5730,
     "planning": 1731,
     "emitters": 2231,
     "cli": 1695,
     "media": 1349,
-    "geometry": 1475,
+    "geometry": 1444,
     "image": 1426,
     "files": 890,
     "run": 1134,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 34221}
-MOST_WORDS = 29023
+OUTSIDE = {"scripts": 2929, "tests": 34243}
+MOST_WORDS = 29022
 
 
 def _lines(files):

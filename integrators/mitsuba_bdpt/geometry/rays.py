@@ -148,7 +148,7 @@ def shadow_ray(
 
 def occluded(
     scene: mi.Scene, shape_errors: ShapeErrors, ray: mi.Ray3f, active: mi.Bool, own: Own | None = None
-) -> mi.Bool:
+):
     """Whether any surface (also null, as in ``path``) but ``own`` blocks ``ray``."""
     if not shape_errors.small:
         return scene.ray_test(ray, active=active)
