@@ -25,7 +25,7 @@ MOST = {
     "": 1413,  # top files
 }
 OUTSIDE = {"scripts": 2929, "tests": 34243}
-MOST_WORDS = 29022
+MOST_WORDS = 29019
 
 
 def _lines(files):
