@@ -26,7 +26,6 @@ from mitsuba_bdpt.measure.analysis import (
     summary,
 )
 from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL, KINDS, Error
-from mitsuba_bdpt.measure.report import pilot_percent
 from mitsuba_bdpt.measure.tables import met_text, ratio, table
 from scipy import stats
 
@@ -147,7 +146,8 @@ def pilot(results: Results, scene: str) -> Measured:
     shares: dict[int, float] = {}
     for budget in (results.deciding, 4 * results.deciding):
         if len(rows := results.of(scene, results.methods[0], budget)):
-            shares[budget] = pilot_percent(rows)
+            seconds = rows["seconds_pilot"]
+            shares[budget] = 100 * float((seconds / (seconds + rows["seconds"])).median())
     if not shares:
         raise Unavailable(f"no render of {scene}")
     text = ", ".join(f"{share:.1f} % at {budget} spp" for budget, share in shares.items())

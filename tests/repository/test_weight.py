@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6283,
+    "measure": 6220,
     "transport merging guided_emission": 5730,
     "planning": 1731,
     "emitters": 2231,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 34243}
+OUTSIDE = {"scripts": 2929, "tests": 34231}
 MOST_WORDS = 29019
 
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 import json
 import re
 from argparse import Namespace
-from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -241,59 +241,10 @@ def _verdict(results: Results, scene: str, merged: bool) -> str:
     return f"{verdict}, p = {check.family_p:.2g}, energy {-100 * check.missing.value:+.2g} % ± {half:.2g}"
 
 
-def choices_table(results: Results) -> str:
-    """Table of the pilots' choices and costs, skipped strategies, and rays per sample."""
-
-    def rows(scene: str, method: str = results.methods[0]) -> pd.DataFrame:
-        return results.of(scene, method, results.deciding)
-
-    def chosen(scene: str) -> str:
-        counts = Counter(rows(scene)["decisions"].map(_chosen)).most_common()
-        return "; ".join(f"{text or 'no pilot'} ({n})" for text, n in counts) or "not rendered"
-
-    def left_out(scene: str) -> str:
-        first = rows(scene)["statistics"].iloc[:1]
-        skipped = [s for text in first for s in json.loads(text).get("skipped", [])]
-        return ", ".join(s["class"] for s in skipped if s["level"] == "not worth its cost here") or "nothing"
-
-    columns: dict[str, Figure] = {
-        "chosen (number of renders)": chosen,
-        "left out in the first render": left_out,
-        "share of the pilot in the first render": lambda scene: f"{pilot_percent(rows(scene)):.1f} %",
-        "closest hits and shadow rays per sample": lambda scene: _rays_per_sample(rows(scene)),
-    }
-    if NONE in results.methods:
-        columns[f"the same, {NONE}"] = lambda scene: _rays_per_sample(rows(scene, NONE))
-    return by_scene(results.scenes, columns)
-
-
 def _chosen(decisions: str) -> str:
-    """Return the pilot's last choice as parameters; empty without a pilot."""
+    """Return what the pilot chose last; empty without a pilot."""
     found = json.loads(decisions or "null")
-    if not found:
-        return ""
-    share = found[-1]["light_paths"]
-    light_paths = f"1/{round(1 / share)}" if share else "0"
-    return f"light_paths={light_paths}, connections={found[-1]['connections']}"
-
-
-def pilot_percent(rows: pd.DataFrame) -> float:
-    """Return the pilots' share of a scene's first render in percent; later ones reuse them."""
-    if rows.empty:
-        raise Unavailable("not rendered")
-    if "seconds_pilot" not in rows or rows["seconds_pilot"].isna().any():
-        raise Unavailable("rows of a version that cached no pilots")
-    return 100 * float((rows["seconds_pilot"] / (rows["seconds_pilot"] + rows["seconds"])).median())
-
-
-def _rays_per_sample(rows: pd.DataFrame) -> str:
-    """Rays per sample: camera, light; shadow rays of s = 1, t = 1, inner."""
-    if "rays_camera" not in rows or rows["rays_camera"].iloc[:1].dropna().empty:
-        return "–"
-    first = rows.iloc[0]
-    kinds = ("camera", "light"), ("shadow_s1", "shadow_t1", "shadow_inner")
-    samples = first["spp"] * first["width"] * first["height"]
-    return "; ".join(" + ".join(f"{first[f'rays_{kind}'] / samples:.2f}" for kind in of) for of in kinds)
+    return f"{found[-1]['light_paths']}, {found[-1]['connections']}" if found else ""
 
 
 def references_table(made: dict[str, Reference]) -> str:
@@ -366,62 +317,51 @@ def machine(rows: pd.DataFrame) -> str:
     return f"{wheres[0]}, source {main}" + "".join(f", {one} for `{scenes[one]}`" for one in others)
 
 
-def matched(results: Results) -> dict[int, list[str]]:
-    """Return the scenes by the budget at which times are equal, where it is not the largest."""
-    found: dict[int, list[str]] = defaultdict(list)
-    for scene, rows in results.rows.groupby("scene", sort=False):
-        at = rows.get("equal_time_spp", pd.Series(dtype=float)).dropna().unique()
-        for spp in sorted({*at} - {rows["budget"].max()}):
-            found[int(spp)].append(f"`{scene}`")
-    return dict(sorted(found.items()))
-
-
 # Standard deviations of the logarithm of seconds over seeds. Other programs ran where that of wall seconds is
 # `DISTURBED`, a fifth of the seconds, and `BUSY` times that of processor seconds, which the work alone sets.
 DISTURBED = 0.2
 BUSY = 3.0
 FEWEST_TIMED = 3
 
-
-def _disturbance(rows: pd.DataFrame) -> str:
-    """Return the ranges of seconds where wall seconds differ more than processor seconds; else nothing."""
-    if len(rows) < FEWEST_TIMED or "cpu_seconds" not in rows or not (rows["cpu_seconds"] > 0).all():
-        return ""
-    seconds = rows[["seconds", "cpu_seconds"]]
-    wall, processor = np.log(seconds).std()
-    if wall <= max(DISTURBED, BUSY * processor):
-        return ""
-    ranges = [f"{low:.3g}–{high:.3g} s" for low, high in zip(seconds.min(), seconds.max(), strict=True)]
-    return f"{ranges[0]} (processor {ranges[1]})"
-
-
-def disturbed(results: Results) -> list[str]:
-    """Return the scenes whose wall seconds other programs disturbed, with the integrators."""
-    found: list[str] = []
-    for scene in results.scenes:
-        names = [results.methods[0], *results.rivals]
-        texts = {name: _disturbance(results.of(scene, name, results.deciding)) for name in names}
-        if any(texts.values()):
-            found.append(f"`{scene}`: {', '.join(f'{name} {text}' for name, text in texts.items() if text)}")
-    return found
-
-
 # Seconds, and multiples of those of both renders, within which the renders of one seed follow one another.
 APART, APART_TIMES = 60.0, 10.0
 
 
-def apart(results: Results) -> dict[str, list[str]]:
-    """Return the scenes, by integrator, in which its renders did not follow those of the first."""
+def conditions_table(results: Results) -> str:
+    """Table of unusual conditions of the times, with the scenes; empty if there are none."""
     found: dict[str, list[str]] = defaultdict(list)
     for scene in results.scenes:
-        ours = results.of(scene, results.methods[0], results.deciding)
-        for name in results.rivals:
-            pairs = ours.merge(results.of(scene, name, results.deciding), on="seed")
-            began, other = (pd.to_datetime(pairs[f"started_{side}"]) for side in "xy")
-            allowed = APART + APART_TIMES * (pairs["seconds_x"] + pairs["seconds_y"])
-            if ((began - other).abs().dt.total_seconds() > allowed).any():
-                found[name].append(f"`{scene}`")
-    return found
+        for condition in _conditions(results, scene):
+            found[condition].append(f"`{scene}`")
+    lines = [{"condition": text, "scenes": ", ".join(scenes)} for text, scenes in found.items()]
+    return markdown(pd.DataFrame(lines)) if lines else ""
+
+
+def _conditions(results: Results, scene: str) -> Iterator[str]:
+    """Yield what makes the times of a scene differ from those of a quiet sweep in one run."""
+    everything = results.rows[results.rows["scene"] == scene]
+    matched = everything.get("equal_time_spp", pd.Series(dtype=float)).dropna().unique()
+    for spp in sorted({*matched} - {everything["budget"].max()}):
+        yield f"for lack of time, samples are matched for equal time at {spp:.0f} spp"
+    ours = results.methods[0]
+    first = results.of(scene, ours, results.deciding)
+    for name in (ours, *results.rivals):
+        rows = results.of(scene, name, results.deciding)
+        if _is_disturbed(rows):
+            yield f"{name}: other programs ran meanwhile (wall seconds differ, processor seconds do not)"
+        pairs = first.merge(rows, on="seed")
+        began, other = (pd.to_datetime(pairs[f"started_{side}"]) for side in "xy")
+        allowed = APART + APART_TIMES * (pairs["seconds_x"] + pairs["seconds_y"])
+        if ((began - other).abs().dt.total_seconds() > allowed).any():
+            yield f"{name}: its renders did not follow those of {ours}"
+
+
+def _is_disturbed(rows: pd.DataFrame) -> bool:
+    """Return whether wall seconds differ over seeds where processor seconds do not."""
+    if len(rows) < FEWEST_TIMED or "cpu_seconds" not in rows or not (rows["cpu_seconds"] > 0).all():
+        return False
+    wall, processor = np.log(rows[["seconds", "cpu_seconds"]]).std()
+    return wall > max(DISTURBED, BUSY * processor)
 
 
 MARK = "Made by `mitsuba-bdpt report`"
@@ -465,13 +405,11 @@ class Report:
             mark=MARK,
             missing=self.missing,
             commands=list(dict.fromkeys(one["command"] for one in self.missing.values() if one["command"])),
-            disturbed=disturbed(results),
-            apart=apart(results),
+            conditions=conditions_table(results),
             machine=machine(rows),
             spp=results.deciding,
             ours=results.methods[0],
             has_equal_time=set(results.methods[1:]) != {*results.at_equal_samples},
-            matched=matched(results),
             at_equal_samples=results.at_equal_samples,
             is_of_processor="clock" in rows and (rows["clock"] == "processor").any(),
             efficiency=efficiency_table(results),
@@ -482,7 +420,6 @@ class Report:
             first_images=first_images_table(results),
             gaps=gaps_table(results),
             errors=errors_table(results),
-            choices=choices_table(results),
             checks=checks_table(results, self.made, self.notes),
             notes=notes,
             references=references_table(self.made),
