@@ -1,13 +1,15 @@
 """Kernel time over that of its rays alone, see `instruments.floor`.
 
 python scripts/floor.py cornell_box uplight_room veach_mis
-python scripts/floor.py --record results/benchmark/probes.json    # beside the probes of a sweep
+python scripts/floor.py --record results/benchmark/probes.json    # of some scenes, cold start and memory
 """
 
 from __future__ import annotations
 
+import json
 import statistics
 import sys
+import tempfile
 from pathlib import Path
 
 import command_line
@@ -36,18 +38,56 @@ print(*floor.measure(PROJECT.scene(sys.argv[2]), int(sys.argv[3])))
 """
 
 
-def record(file: Path, rounds: int) -> None:
-    """Add the floor to the probes of a sweep, unless the same software was measured before.
+BOX = """
+import json, sys, time, mitsuba_bdpt, mitsuba as mi, drjit as dr
+from mitsuba_bdpt.host import memory
+mi.set_variant("llvm_ad_rgb")
+film, parameters, spp = json.loads(sys.argv[1])
+box = mi.cornell_box()
+box["sensor"]["film"] |= film
+scene, integrator = mi.load_dict(box), mi.load_dict(parameters)
+dr.sync_thread()
+began = time.perf_counter()
+image = mi.render(scene, integrator=integrator, spp=spp); dr.eval(image); dr.sync_thread()
+print(time.perf_counter() - began, memory.peak() / 2**30)
+"""
 
-    A process for each scene.
+
+def of_kernels(rounds: int) -> dict[str, list[float]]:
+    """Return the ratios of `floor`, by scene."""
+    return {name: probes.numbers(CODE, str(ROOT / "scripts"), name, str(rounds)) for name in RECORDED}
+
+
+def coldstart(rounds: int) -> dict[str, list[float]]:
+    """Return seconds from an empty kernel cache to the first image, without loading, by integrator.
+
+    Cornell box, 256x256, depth 6, 16 spp.
     """
+    found: dict[str, list[float]] = {"path": [], "bdpt": []}
+    for _ in range(rounds):
+        for name, seconds in found.items():
+            wanted = json.dumps([{}, {"type": name, "max_depth": 6}, 16])
+            with tempfile.TemporaryDirectory() as cache:
+                seconds.append(probes.numbers(BOX, wanted, DRJIT_CACHE_DIR=cache, HOME=cache)[0])
+    return found
+
+
+def memory(rounds: int) -> dict[str, list[float]]:
+    """Return the peak resident GiB of a render, by samples per pixel: Cornell box, 1920x1080, depth 8."""
+    film, way = {"width": 1920, "height": 1080}, {"type": "bdpt", "max_depth": 8}
+    wanted = {f"{spp} spp": json.dumps([film, way, spp]) for spp in (2, 8)}
+    return {name: [probes.numbers(BOX, one)[1] for _ in range(rounds)] for name, one in wanted.items()}
+
+
+def record(file: Path, rounds: int) -> None:
+    """Add floor, cold start and memory, unless the same software was measured before."""
     kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
-    key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
-    if {name: kept.get("floor", {}).get(name) for name in key} == key:
-        return
-    scripts = str(ROOT / "scripts")
-    values = {name: probes.numbers(CODE, scripts, name, str(rounds)) for name in RECORDED}
-    write_json(file, kept | {"floor": key | {"values": values}})
+    measures = {"floor": (of_kernels, rounds), "coldstart": (coldstart, rounds), "memory": (memory, 1)}
+    for name, (measure, n) in measures.items():
+        key = {"rounds": n, "versions": software() | {"machine": machine()}}
+        if {k: kept.get(name, {}).get(k) for k in key} != key:
+            kept[name] = key | {"values": measure(n)}
+            write_json(file, kept)
 
 
 def main(arguments=None) -> int:

@@ -512,27 +512,6 @@ def test_a_full_disk_leaves_the_old_image(folder, pixels):
     assert file.read_bytes() == before and not list(folder.glob(".*"))
 
 
-def test_probes_are_kept_and_renewed(folder, monkeypatch, capsys, job, swept):
-    """Measured once, again when the number of rounds changes; a failure is reported with what the process
-    wrote, and the sweep goes on."""
-    making.make(job(3))
-    calls = []
-    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: calls.append(rounds) or {"2 spp": [1.0]})
-    output = folder / "out"
-    for rounds in (1, 1, 2):
-        path = preset_file(folder, f"{PRESET}[probes]\nmemory = {rounds}\n")
-        words = path, "-o", output
-        assert swept(*words) == 0
-    assert calls == [1, 2]
-    assert json.loads((output / "probes.json").read_text())["memory"]["values"] == {"2 spp": [1.0]}
-    monkeypatch.setitem(probes.PROBES, "memory", lambda rounds: {"2 spp": [probes.numbers("1 / 0")[-1]]})
-    preset_file(folder, f"{PRESET}[probes]\nmemory = 3\n")
-    assert swept(*words) == 1
-    assert "failed: memory: a probe ended with status 1" in capsys.readouterr().out
-    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
-        probes.numbers("1 / 0")
-
-
 def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
     """Status 1 if one is not good enough or fails, the others are made; bad numbers are refused."""
 
@@ -683,7 +662,6 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (('type = "path"', 'type = "path"\nmax_depth = 3'), "max_depth of one integrator would compare"),
         (('type = "path"', 'type = "path"\nname = "ours"'), "two integrators have the same name"),
         (('match = "seconds"', "x = [1]"), r"integrator.1.x=\[1\]: must be a number, a text"),
-        (('match = "seconds"', "[probes]\nspeed = 1"), "speed.*'coldstart' or 'memory'"),
         (('match = "seconds"', "[scene.pool]\nspp = [1]\nseeds = 1"), r"\[scene.pool\]: 'pool' is not among"),
         (('match = "seconds"', "[scene.cornell_box]\ndepth = 1"), "cornell_box.depth=1: .*max_depth"),
         (("seeds = 2", "scene.cornell_box = 3\nseeds = 2"), r"scene.cornell_box=3"),

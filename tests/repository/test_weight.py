@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6220,
+    "measure": 6163,
     "transport merging guided_emission": 5730,
     "planning": 1731,
     "emitters": 2231,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2929, "tests": 34231}
-MOST_WORDS = 29019
+OUTSIDE = {"scripts": 2969, "tests": 34209}
+MOST_WORDS = 29014
 
 
 def _lines(files):

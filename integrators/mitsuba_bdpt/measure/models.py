@@ -135,8 +135,7 @@ class PresetFile(Model):
     """A preset; by default the package's integrator and Mitsuba's path tracer in equal time.
 
     ``clock``: whose seconds decide. ``first_image``: processes that render the first image of each scene and
-    integrator. ``scenes``: files, names or patterns; None where the command names them. ``probes``:
-    repetitions of each.
+    integrator. ``scenes``: files, names or patterns; None where the command names them.
     """
 
     scenes: Names | None = None
@@ -153,7 +152,6 @@ class PresetFile(Model):
         Method(type="volpath", media=True),
     )
     more: More | None = None
-    probes: dict[Literal["coldstart", "memory"], Whole] = {}
 
     def depth(self, scene: str, own: int) -> int:
         """Return the ``max_depth`` of a scene: its table's, else the preset's, else the file's ``own``."""

@@ -74,8 +74,8 @@ def preset_of(
 ) -> Preset:
     """Return the preset of a dictionary; ``path`` names it in errors.
 
-    By default all scenes that the ``project`` has as dictionaries. ``only``: of the preset's scenes these,
-    without probes; or the scenes of a preset that names none. Loads these scenes.
+    By default all scenes that the ``project`` has as dictionaries. ``only``: of the preset's scenes these;
+    or the scenes of a preset that names none. Loads these scenes.
     """
     file = checked(PresetFile, ({"scenes": list(project.given)} if project.given else {}) | dict(given), path)
     if file.first_image and project.given:
@@ -94,7 +94,6 @@ def preset_of(
         if unknown := [name for name in only if name not in names]:
             raise CommandError(f"--scenes {unknown[0]}: not in the preset, which has {', '.join(names)}")
         scenes = [scene for scene in scenes if scene.name in only]
-        file = file.model_copy(update={"probes": {}})
     subjects, left_out = _subjects(path, file, scenes)
     return Preset(file, subjects, tuple(names) if file.scenes else None, left_out)
 

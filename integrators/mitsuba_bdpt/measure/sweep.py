@@ -5,8 +5,8 @@ affects all. Each render is a file in OUTPUT/cells, named by a hash of all that 
 scene, versions, the plugin's source), and is not repeated; its image is in OUTPUT/images. Failed cells, and
 scenes without reference, are reported and tried again by the next run. Errors are against the references of
 `making`, made first if missing, and computed again when a reference changes. On a cluster, consecutive
-renders go to one worker; workers need the project under the same path and the same software. Probes are left
-out there. `results` describes the files.
+renders go to one worker; workers need the project under the same path and the same software. `results`
+describes the files.
 """
 
 from __future__ import annotations
@@ -300,7 +300,6 @@ class Sweep:
         if client is not None:
             self._remote(client)
             return
-        self._probes()
         if seconds is not None:
             self._limited(seconds)
             return
@@ -367,19 +366,6 @@ class Sweep:
                 write_json(file, [decided(one | {"clock": cell.clock}) for one in taken])
             except Exception as error:  # one render must not end the others
                 self._note(f"{cell.scene}, first image, {cell.method}", error)
-
-    def _probes(self):
-        file = self.output / "probes.json"
-        kept = read_json(file, "delete it, to measure it anew") if file.exists() else {}
-        for name, rounds in self.preset.file.probes.items():
-            self._progress.begin(name)
-            key = {"rounds": rounds, "versions": software() | {"machine": machine()}}
-            try:
-                if {k: kept.get(name, {}).get(k) for k in key} != key:
-                    kept[name] = key | {"values": probes.PROBES[name](rounds)}
-                    write_json(file, kept)
-            except Exception as error:  # a probe must not end the sweep
-                self.failed.append(f"{name}: {error}")
 
     def _cell(self, bench: Bench, cell: Cell) -> float | None:
         """Render a cell in this process; returns its wall seconds, None if it failed."""
