@@ -840,7 +840,7 @@ def test_time_left_follows_from_work(monkeypatch, capsys):
     """After a render of a quarter of the work in 10 s, 30 s are left, less where a limit is nearer; lines at
     most each half a minute where there is no terminal, with the number of renders."""
     clock = [0.0]
-    monkeypatch.setattr(showing.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr("rich.console.monotonic", lambda: clock[0])
     with showing.Renders() as made, showing.Renders(limit=25) as limited:
         assert made.seconds_left() is None and limited.seconds_left() == 25
         for shown in (made, limited):

@@ -6,10 +6,10 @@ Elsewhere than on a terminal only long `Renders` are shown, by lines. Print befo
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from datetime import timedelta
+from functools import partial
 from itertools import count
 from typing import Self
 
@@ -52,10 +52,10 @@ class Renders:
     """
 
     def __init__(self, limit: float | None = None):
-        self._bar, self._limit = bar(), limit
-        self._task = self._bar.add_task("", total=0.0)
-        self._done, self._total, self._work, self._whole, self._spent = 0, 0, 0.0, 0.0, 0.0
-        self._began = self._since = self._printed = time.monotonic()
+        self._bar = bar()
+        task = self._bar.add_task("", total=0.0)
+        self._task, self._update = self._bar.tasks[0], partial(self._bar.update, task)
+        self._done, self._total, self._limit, self._printed = 0, 0, limit, 0.0
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -67,33 +67,30 @@ class Renders:
     def plan(self, works: Iterable[float]) -> None:
         """Add renders of so much work each."""
         found = list(works)
-        self._total, self._whole = self._total + len(found), self._whole + sum(found)
+        self._total += len(found)
+        self._update(total=(self._task.total or 0.0) + sum(found))
 
     def begin(self, text: str) -> None:
         """Show what is rendered next."""
-        self._since = time.monotonic()
-        self._bar.update(self._task, description=self.words(text), completed=self._work, total=self._whole)
+        self._update(description=self.words(text))
 
     def end(self, text: str, work: float) -> None:
-        """Count a render, whose seconds are those since the last `begin` or `end`."""
-        now = time.monotonic()
-        self._spent, self._done, self._work = (
-            self._spent + now - self._since,
-            self._done + 1,
-            self._work + work,
-        )
+        """Count a render."""
+        self._done += 1
+        self._update(advance=work)
         self.begin(text)
-        if self._bar.disable and now - self._printed >= max(EVERY, SHARE * (now - self._began)):
-            self._printed = now
+        elapsed = self._task.elapsed or 0.0
+        if self._bar.disable and elapsed - self._printed >= max(EVERY, SHARE * elapsed):
+            self._printed = elapsed
             print(self.words(text), file=sys.stderr, flush=True)
 
     def seconds_left(self) -> float | None:
         """Return the estimated seconds until all is rendered or the limit is over; None before the first."""
-        rest = self._limit - (time.monotonic() - self._began) if self._limit is not None else None
-        if not self._work:
-            return rest
-        left = self._spent * (self._whole - self._work) / self._work
-        return max(left if rest is None else min(left, rest), 0.0)
+        task, elapsed = self._task, self._task.elapsed or 0.0
+        left = [] if self._limit is None else [self._limit - elapsed]
+        if task.completed:
+            left.append(elapsed * (task.remaining or 0.0) / task.completed)
+        return max(min(left), 0.0) if left else None
 
     def words(self, text: str) -> str:
         """Return how many renders are done, and the time left."""
