@@ -295,6 +295,21 @@ def lens_beside_the_scene(far_clip):
     return Row(scene, 1, 3e-3, 512, {"rr_depth": 5}, ((partial(blocks, 4), 1e-2),))
 
 
+@known("all", of=(0, 130))
+def meter_of_a_turned_sphere(angle):
+    """With the wrong normals it was 59 % too dark."""
+    turned = transform().rotate([0.26726124, 0.53452248, 0.80178373], angle).scale(0.5)
+    scene = {"meter": {"type": "sphere", "to_world": turned, "sensor": meter()}, "sky": sky(0.7)}
+    return Row(scene, 0.7 * np.pi, 0.01, 1 << 12, {"max_depth": 1})
+
+
+@known("all", "default")
+def distant_sensor_in_an_empty_scene():
+    """Mitsuba's sensor starts its rays nowhere if there are no bounds."""
+    eye = {"type": "distant", "direction": [0.2, 0.3, -1], "film": camera(size=1)["film"]}
+    return Row({"sensor": eye, "sky": sky()}, 1, spp=16, more={"max_depth": 3})
+
+
 @known("all", of=[(kind, far) for kind in ("constant", "envmap") for far in (False, True)])
 def disk_under_a_sky(kind, far):
     """Mitsuba 0.6 #80: brightness depended on other objects. A small sphere far away makes the scene 30 times

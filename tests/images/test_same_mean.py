@@ -957,6 +957,77 @@ def joined_light_subpaths_on_a_film_of(width, height):
     return joined(of_material("diffuse", sensor=parts.perspective() | {"film": film}), error=0.002)
 
 
+# -- in the room of `scene_parts`, beside `path` --------------------------------------------------------
+
+
+IN_A_ROOM = {
+    name: MATERIALS[name] for name in ("roughdielectric", "principled", "mask", "blend", "one side")
+} | {
+    "bumpmap": lambda: MATERIALS["bumpmap"]() | {"bsdf": matte(0.6)},
+    "null": lambda: {"type": "null"},
+    "two sides": lambda: {"type": "twosided", "front": {"type": "diffuse"}, "back": METAL},
+    "dielectric": lambda: {"type": "dielectric"},
+    "thindielectric": lambda: {"type": "thindielectric"},
+    "conductor": lambda: {"type": "conductor"},
+    "plastic": lambda: {"type": "plastic", "diffuse_reflectance": 0.5},
+    "textured": lambda: {"type": "diffuse", "reflectance": parts.texture()},
+}
+
+
+@same("all", of=IN_A_ROOM)
+def surface_in_a_room(name):
+    """A ball and an upright card. `path` finds the lamp through delta lobes by chance only."""
+    scene = parts.room(lamp=parts.EMITTERS["rectangle"]())
+    scene["ball"]["bsdf"] = IN_A_ROOM[name]()
+    at = transform().translate([0.3, 0.7, 1]).rotate([0, 1, 0], 40).scale([0.5, 0.7, 1])
+    card = {"type": "rectangle", "bsdf": IN_A_ROOM[name](), "to_world": at}
+    return Row(scene | {"card": card}, PATH, 4, 128, 1024, error=0.01)
+
+
+@same("all")
+def unequal_lamps():
+    lamps = {}
+    for i, name in enumerate(("rectangle", "sphere", "point", "spot", "directional", "envmap")):
+        lamps[name] = lamp = parts.EMITTERS[name]()
+        lamp.get("emitter", lamp)["sampling_weight"] = 0.3 + i * i / 4
+    return Row(parts.room(**lamps), PATH, 3, 256, 512, error=0.015)
+
+
+@same("all")
+def instances():
+    """A group of a ball and a box, instanced twice with scale and rotation."""
+    box = {"type": "cube", "bsdf": matte(0.4), "to_world": transform().translate([0.5, 0, 0]).scale(0.2)}
+    ball = {"type": "sphere", "radius": 0.3, "bsdf": {"type": "roughplastic"}}
+    turned = transform().translate([-0.2, 1.3, 0.5]).rotate([0, 0.70710678, 0.70710678], 50)
+    stretched = transform().translate([0.4, 0.4, 1.2]).scale([1, 1.3, 0.8])
+    one, two = (
+        {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": at}
+        for at in (turned, stretched)
+    )
+    group = {"type": "shapegroup", "a": ball, "b": box}
+    return Row(
+        parts.room(lamp=parts.EMITTERS["rectangle"](), group=group, one=one, two=two), PATH, error=0.01
+    )
+
+
+@same("all", of=[(lamp, hide) for lamp in ("sphere", "constant") for hide in (False, True)])
+def lamp_before_the_sky(lamp, hide):
+    """One corner of the image sees past all."""
+    glass = {"type": "sphere", "center": [1, 1.5, 0.5], "radius": 0.4, "bsdf": {"type": "null"}}
+    scene = parts.room(parts.perspective(origin=(0, 2, 7), fov=50), lamp=parts.EMITTERS[lamp](), glass=glass)
+    return Row(scene, PATH, 3, 128, 1024, more={"hide_emitters": hide}, error=0.01)
+
+
+@same("default", of=("plastic", "dielectric", "conductor"))
+def timed_sky_over(name):
+    """Step by step, calls of functions written in Python fail for `plastic`."""
+    sky = {"type": "timed_sunsky", "to_world": transform().rotate([1, 0, 0], -90)}
+    scene = parts.room(sky=sky)
+    del scene["back"], scene["box"]
+    scene["ball"]["bsdf"] = IN_A_ROOM[name]()
+    return Row(scene, WAYS["camera"], 4, 64, 64, 5, error=0.02)
+
+
 @same.test
 def test_same_mean(make, way, monkeypatch):
     row = make()
