@@ -49,8 +49,6 @@ def sampled(emitters, time=0.0):
 
 
 def test_no_emitter_is_left_out():
-    """Rationale: a kind of emitter that is added later has to be looked at here. Expected: each one of
-    `scene_parts.EMITTERS` from which light subpaths start is in one of the lists above."""
     parts.register_plugins()
     ball = {"type": "sphere"}
     scenes = {name: {"type": "scene", "ball": ball, "lamp": make()} for name, make in parts.EMITTERS.items()}
@@ -104,8 +102,7 @@ def sphere_bins(d, axis, cos_least, rings=10, sectors=16):
 
 @pytest.mark.parametrize("name", AT_A_POINT)
 def test_directions_from_a_point(name):
-    """Mitsuba offers no density for what a spot or a projector sends out. Expected: the stated density of
-    directions is that of the sampled ones, and each emission states its own. Statistic: see the module."""
+    """Mitsuba offers no density of what a spot or a projector sends out."""
     _, emitters, e = emission(name)
     d = column(e.d)
     axis, cos_least = np.array([-1, -3, -1.5]) / np.sqrt(12.25), -1.0
@@ -128,9 +125,7 @@ def test_directions_from_a_point(name):
 
 @pytest.mark.parametrize("name", AT_INFINITY)
 def test_directions_from_infinity(name):
-    """Emission, next-event estimation and hits of an environment share one density of directions. Expected:
-    the density that a camera ray that leaves the scene states is that of the sampled emissions, which state
-    the same. Statistic: see the module."""
+    """The density that a camera ray that leaves the scene states is that of the sampled emissions."""
     scene, emitters, e = emission(name)
     d = column(e.d)
     u = numbers(2, 12)
@@ -152,10 +147,8 @@ def test_directions_from_infinity(name):
 
 @pytest.mark.parametrize("name", [*AT_INFINITY, "directional"])
 def test_light_from_infinity_covers_the_scene_evenly(name):
-    """Mitsuba's `envmap` starts from a wrong disk if it is rotated. Expected: seen along its direction, an
-    emission starts on the plane before the scene's bounding sphere and evenly on the disk that covers it: its
-    squared distance from the middle is uniform, and so is its angle. Statistic: Kolmogorov-Smirnov at 1e-4,
-    within 1e-4 of the radius for the plane."""
+    """Mitsuba's `envmap` starts from a wrong disk if it is rotated. Emissions start before the scene's
+    bounding sphere (1e-4 of the radius), evenly on the disk that covers it (Kolmogorov-Smirnov at 1e-4)."""
     _, emitters, e = emission(name)
     d, around = column(e.d), emitters.disks.scene
     radius = float(around.radius[0])
@@ -178,9 +171,8 @@ def place_bins(p, low, high, cells=6):
 
 @pytest.mark.parametrize("name", ON_SURFACES)
 def test_places_on_a_surface(name):
-    """Emission chooses places by area or by texture. Expected: the stated density of places is that of the
-    sampled ones, and directions have the density cos / pi about the normal (a directionalarea: only that
-    one). Statistic: see the module, for directions Kolmogorov-Smirnov at 1e-4."""
+    """Directions have the density cos / pi about the normal (a directionalarea: one), by
+    Kolmogorov-Smirnov."""
     scene, emitters, e = emission(name)
     shape = scene.emitters()[0].get_shape()
     u = numbers(2, 12)
@@ -206,9 +198,8 @@ def test_places_on_a_surface(name):
 
 @pytest.mark.parametrize("name", ["spot", "projector", "textured projector"])
 def test_power_of_cones(name):
-    """The weight is the intensity over the density of directions. Expected: the mean weight is the power, the
-    integral of Mitsuba's own intensity over directions (points at distance 1 and `sample_direction`).
-    Statistic: five standard errors of both sides."""
+    """The mean weight is the integral of Mitsuba's own intensity over directions. Tolerance: five standard
+    errors of both sides."""
     scene, _, e = emission(name)
     lamp = scene.emitters()[0]
     d = column(e.d)
@@ -228,8 +219,8 @@ def test_power_of_cones(name):
 
 
 def test_selection_beside_what_cannot_be_traced():
-    """Expected: of a point light and a plugin of unknown class only the emissions of the first carry light,
-    half of all, and their mean is the point light's power. Statistic: five standard errors."""
+    """Half of the emissions carry light, and their mean is the point light's power. Tolerance: five standard
+    errors."""
     parts.register_plugins()
     _, _, e = emission("point", other=parts.EMITTERS["own lamp"]())
     weight = column(e.weight)[0]
@@ -259,10 +250,9 @@ FROM_INFINITY = {
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_emission(name):
-    """Half of the light subpaths from infinity are aimed at the block on the ground. Expected: where they
-    pass, per area across their direction, is what `Emitters` states at any point of that line, and integrates
-    to the disk of the scene, and to that of the block; half and more pass the block's sphere. Statistic: five
-    standard errors."""
+    """Half of the light subpaths from infinity are aimed at the block on the ground. Where they pass, per
+    area across their direction, is what `Emitters` states at any point of that line, and integrates to the
+    disk of the scene, and to that of the block. Tolerance: five standard errors."""
     emitters = Emitters(meadow(FROM_INFINITY[name]))
     e = sampled(emitters)
     stated = column(e.pdf_second)
@@ -286,9 +276,8 @@ def test_aimed_emission(name):
 
 
 def test_details():
-    """Expected: small shapes that lie together are details; not those spread over the scene, nor a scene of
-    one shape, nor shapes without extent, nor, since rounding decides, those tiny beside the scene or far
-    from the origin."""
+    """Small shapes that lie together are details; not those spread over the scene, nor without extent, nor,
+    since rounding decides, those tiny beside the scene or far from the origin."""
     box = mi.ScalarBoundingBox3f
 
     def found(*small, at=0.0):
@@ -308,8 +297,7 @@ def test_details():
 
 @pytest.mark.parametrize("scale", [8, 1000])
 def test_aimed_points_know_that_they_are(scale):
-    """A point on the rim of the details' disk may be outside of it by rounding. Expected: no start that was
-    aimed has less than that part, and none has none."""
+    """A point on the rim of the details' disk may be outside of it by rounding."""
     ground = {"type": "rectangle", "to_world": parts.T().scale(scale)}
     ball = {"type": "sphere", "center": [0.3, 0.2, 1], "radius": 1.0}
     disks = emitter_disks.Disks(mi.load_dict({"type": "scene", "ground": ground, "ball": ball}))
@@ -322,8 +310,7 @@ def test_aimed_points_know_that_they_are(scale):
 
 
 def test_a_vertex_that_is_not_finite():
-    """The box of a mesh with such a vertex is not valid, yet rays meet its other triangles. Expected: the
-    scene's disk covers what is finite."""
+    """The box of a mesh with such a vertex is not valid, yet rays meet its other triangles."""
     mesh = mi.Mesh("broken", 4, 2)
     params = mi.traverse(mesh)
     params["vertex_positions"] = [0, 0, 0, 2, 0, 0, 0, 2, 0, np.nan, 0, 0]
@@ -368,9 +355,8 @@ def room_of_rectangles():
 
 @pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
 def test_a_room_of_merged_rectangles(parameters):
-    """Shadow rays of `path` towards the sky end at the box of the cube, and meet no wall. Expected: the image
-    is the same whether Mitsuba has merged the walls or not, to 1e-5 of the mean for sums in another order;
-    `path` differs."""
+    """Shadow rays of `path` towards the sky end at the box of the cube, and meet no wall: it differs.
+    Tolerance: 1e-5 of the mean for sums in another order."""
     merged, apart = (mi.load_dict(room_of_rectangles(), optimize=on) for on in (True, False))
     assert len(merged.shapes()) == 2 and len(apart.shapes()) == 6
     ours = mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters)
@@ -382,8 +368,8 @@ def test_a_room_of_merged_rectangles(parameters):
 
 
 def test_sizes_of_scenes_with_merged_rectangles():
-    """Expected: the scene's box is that of the rectangles, beside which a ball of radius .1, a thousandth of
-    them, is small; spheres around merged mirrors, at which photons are aimed, are finite."""
+    """A ball of radius .1, a thousandth of the rectangles, is small; spheres around merged mirrors are
+    finite."""
     text = CORNER.replace("diffuse", "conductor").replace(
         '<rotate x="1" angle="-90"/>', '<scale value="100"/>'
     )
@@ -396,8 +382,7 @@ def test_sizes_of_scenes_with_merged_rectangles():
 
 
 def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
-    """The box of such a mesh is that of the cube alone, and valid. Expected: the scene's box is that of
-    all."""
+    """The box of such a mesh is that of the cube alone, and valid."""
     scene = room_of_rectangles()
     scene["cube"]["bsdf"] = scene["floor"]["bsdf"]
     merged, apart = (mi.load_dict(scene, optimize=on) for on in (True, False))
@@ -407,9 +392,8 @@ def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
-    """Expected: next-event estimation (1, 2) and light tracing (2, 1) alone each give the image of light that
-    is reflected once, and so do all together. Statistic: t test (23 degrees of freedom, at least) of each
-    pixel and of the whole over 24 renders, Sidak, at 1e-4; the whole is known to 2 % or better."""
+    """Next-event estimation and light tracing alone each give the image of light that is reflected once, and
+    so do all together: t test of each pixel and of the whole over 24 renders, Sidak, at 1e-4."""
     scene, images = meadow(FROM_INFINITY[name]), {}
     integrator = mi.load_dict(
         {"type": "bdpt", "max_depth": 2, "light_paths": 1, "layers": "strategies", "hide_emitters": True}
@@ -431,9 +415,8 @@ def test_aimed_light_subpaths(name):
 
 
 def test_aimed_light_subpaths_that_reach_a_lens():
-    """For and t = 0 the density is asked for at the sensor, which may lie outside the scene. Expected: with
-    all strategies, the sky that a wide lens far outside sees directly past the scene, and beside it, is that
-    of `path`. Statistic: as above, against the mean of a long render (1e-3 for its error)."""
+    """For t = 0 the density is asked for at the sensor, which may lie outside the scene: the image is that of
+    a long render by `path` (1e-3 for its error), by a t test as above."""
     scene = meadow(FROM_INFINITY["sky"])
     lens = {"type": "thinlens", "aperture_radius": 3.0, "focus_distance": 20.0}
     sensor = mi.load_dict(parts.perspective((0, 5, 25), (0, 0, 0), 60, size=6) | lens)

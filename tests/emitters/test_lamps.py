@@ -42,10 +42,9 @@ def gap(**lamp):
 
 
 def check_sums(scene, depth=2, spp=512, width=0.03, seeds=SEEDS):
-    """For each path length the weighted strategies sum to s = 0 alone, of the same samples; the longest
-    carries light. Statistic: Student's t-test of the differences of the image's means over seeds, Sidak over
-    the path lengths, at 1e-4, and 1e-4 of the mean for rounding; their standard error is below ``width`` of
-    the mean."""
+    """For each path length the weighted strategies sum to s = 0 alone, of the same samples: Student's t-test
+    of the differences of the image's means over seeds, Sidak over the path lengths, and 1e-4 of the mean for
+    rounding; their standard error is below ``width`` of the mean."""
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": depth, "skip": "none", "layers": "strategies"})
     names = bdpt.aov_names()
     means = np.array([np.array(bdpt.render(scene, seed=s, spp=spp)).mean((0, 1)) for s in range(seeds)])
@@ -72,8 +71,7 @@ FLAT = ("rectangle", "disk")
 
 
 def textured_lamps():
-    """Parameters of `test_peaked_textures`. Mirrored cylinders are refused; where Mitsuba's calls have been
-    right all along, one case for each shape is in the quick tests."""
+    """Mirrored cylinders are refused; where Mitsuba's calls are right, one case for each shape is quick."""
     for shape, flipped, placed in itertools.product((*FLAT, *CLOSED), (False, True), PLACED):
         quick = shape in ("rectangle", "sphere") or (flipped and placed == "rotated")
         if (shape, placed) != ("cylinder", "mirrored"):
@@ -83,8 +81,8 @@ def textured_lamps():
 
 @pytest.mark.parametrize("shape, flipped, placed", list(textured_lamps()))
 def test_peaked_textures(shape, flipped, placed, tmp_path):
-    """Mitsuba samples the texture of some lamps, and the shape of others. See `check_sums`. A flipped closed
-    shape surrounds all."""
+    """Mitsuba samples the texture of some lamps, and the shape of others. Closed shapes surround all if
+    flipped."""
     # A sphere that is mirrored turns its normals as well.
     around = shape in CLOSED and flipped != (shape == "sphere" and placed == "mirrored")
     to_world = T().translate([0, 1.5, 0]).scale((16 if shape == "mesh" else 8) if around else 1)
@@ -130,7 +128,6 @@ REFLECTORS = {
 
 @pytest.mark.parametrize("name", SHEARED_LAMPS)
 def test_shapes_that_may_be_sheared(name):
-    """Lamps whose `to_world` shears where Mitsuba samples and finds the same points. See `check_sums`."""
     shape, matrix = SHEARED_LAMPS[name]
     to_world = T().translate([0, 1.5, 0]).rotate([1, 0, 0], 75) @ matrix
     check_sums(gap(lamp=LAMP | {"type": shape, "to_world": to_world}))
@@ -138,7 +135,7 @@ def test_shapes_that_may_be_sheared(name):
 
 @pytest.mark.parametrize("name", REFLECTORS)
 def test_what_reflects_may_be_sheared(name):
-    """Connections need the surface's area and normal. See `check_sums`."""
+    """Connections need the surface's area and normal."""
     shape, matrix = REFLECTORS[name]
     parts = {"lamp": {"type": "rectangle", "to_world": T().translate([0, 2.9, 0]).rotate([1, 0, 0], 90)}}
     parts["lamp"]["emitter"] = LAMP["emitter"]
@@ -150,7 +147,6 @@ def test_what_reflects_may_be_sheared(name):
 
 
 def test_flat_instances_are_not_refused():
-    """Expected: no complaint about axes."""
     flat = T().rotate([0.6, 0.8, 0], 30).scale([1, 1, 1e-7])
     group = {"type": "shapegroup", "plate": {"type": "rectangle"}}
     one = {"type": "instance", "to_world": flat, "group": {"type": "ref", "id": "group"}}
@@ -158,8 +154,7 @@ def test_flat_instances_are_not_refused():
 
 
 def test_a_sheared_disk_is_found_where_it_is_sampled():
-    """Of a disk turned by `rotate` about [1, 1, 0], 40 degrees, rays find 46 % of the sampled points.
-    Expected: rays find all points, with the density of places that is stated, one over the area."""
+    """Of a disk turned by `rotate` about [1, 1, 0], 40 degrees, rays find 46 % of the sampled points."""
     matrix = np.array(T().rotate([1, 1, 0], 40).matrix)
     lamp = {"type": "disk", "emitter": {"type": "area", "radiance": 5.0}}
     scene = gap(lamp=lamp | {"to_world": T().translate([0, 1.5, 0]) @ T(matrix)})
@@ -203,9 +198,8 @@ def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitt
 
 @pytest.mark.parametrize("rows", [3, 32, 128, 256])
 def test_normals_of_fine_meshes(rows):
-    """Expected: on a ball of triangles all normals of emitted points and of those sampled directly are within
-    the largest angle between a face and the points of the sphere above it: half a diagonal of a cell, and a
-    tenth more, and 1e-3 for rounding (2e-6 of the height of a face near a pole)."""
+    """Within the largest angle between a face and the sphere above it: half a diagonal of a cell, and a tenth
+    more, and 1e-3 for rounding (2e-6 of the height of a face near a pole)."""
     count = 20_000
     scene = gap(lamp=ball_of_triangles((0, 1.5, 0), 0.5, rows, rows))
     assert rows < 128 or scene.emitters()[0].get_shape().face_count() > 30_000
@@ -232,9 +226,8 @@ def placed_lamps():
 
 @pytest.mark.parametrize("shape, placed, flipped", list(placed_lamps()))
 def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
-    """The side of an emitting surface decides in which medium light starts. Expected: for emission and
-    next-event estimation the normal is that of a hit at the same point, to 0.03 (interpolated normals of a
-    coarse mesh are off by 0.1 and more); of at least 99 % of 2,000 points, others are on edges."""
+    """The side of an emitting surface decides in which medium light starts. Tolerance: 0.03 (interpolated
+    normals of a coarse mesh are off by 0.1 and more) for 99 % of the points, others are on edges."""
     count = 2000
     lamp = {"type": shape, "flip_normals": flipped}
     if shape == "mesh":
@@ -257,13 +250,12 @@ def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
 
 
 def test_a_fine_mesh_shines_like_any():
-    """See `check_sums`."""
     check_sums(gap(lamp=ball_of_triangles((0, 1.5, 0), 0.6)), width=0.01)
 
 
 def test_another_table_of_faces_is_noticed(monkeypatch):
-    """Rationale: the images were wrong without a word. Expected: an error with sums in double precision, and
-    after an edit of the faces alone, after which Mitsuba keeps its areas; none once it has made them anew."""
+    """By sums in double precision, and after an edit of the faces alone, after which Mitsuba keeps its
+    areas."""
     mesh = ball_of_triangles((0, 1.5, 0), 0.5)
     scene = gap(lamp=mesh)
     Emitters(scene)
@@ -295,9 +287,8 @@ def test_another_table_of_faces_is_noticed(monkeypatch):
 
 
 def test_faces_are_chosen_as_mitsuba_chooses():
-    """Rationale: a search within a part of [0, 1) may miss the face by one at the part's ends. Expected: the
-    face of `DiscreteDistribution.sample` for random numbers, the ends of all parts and their neighbours, with
-    areas over six decades and without area, in each of two meshes."""
+    """A search within a part of [0, 1) may miss the face by one at the part's ends; areas over six decades
+    and without area, in each of two meshes."""
     rng, meshes = np.random.default_rng(0), [None]
     for count in (1000, 3):
         areas = 10 ** rng.uniform(-6, 0, count) * (np.arange(count) % 5 > 0)
@@ -313,8 +304,8 @@ def test_faces_are_chosen_as_mitsuba_chooses():
 
 @pytest.mark.parametrize("u", [0.4, 0.9])
 def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
-    """Rationale: the normals of two points of a sphere may be opposite without being flipped. Expected: by
-    texture (relative variance of a floor at 64 spp 0.003; sampled by shape, with the sun at u = 0.9: 8.2)."""
+    """The normals of two points of a sphere may be opposite without being flipped. (Relative variance of a
+    floor by texture 0.003; by shape, with the sun at u = 0.9: 8.2.)"""
     image = np.full((64, 128, 3), 0.2, np.float32)
     image[26:28, int(u * 128) - 1 : int(u * 128) + 1] = 2000
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True, "filter_type": "nearest"}
@@ -327,7 +318,6 @@ def test_a_dome_is_sampled_by_its_texture_wherever_that_is_bright(u):
 
 @pytest.mark.parametrize("emitter", [None, "timed_sunsky", "own_area"])
 def test_textured_lamps_beside_shapes_without_points(emitter, tmp_path):
-    """See `check_sums`."""
     curve = tmp_path / "curve.txt"
     curve.write_text("\n".join(f"{x} 1 0 0.1" for x in (-1.5, -0.5, 0.5, 1.5)))
     area = {"type": "area", "radiance": peaked(20)}
@@ -360,7 +350,6 @@ def test_textured_lamps_beside_shapes_without_points(emitter, tmp_path):
 
 
 def test_a_textured_cube_that_was_met_as_an_emitters_shape():
-    """Expected: the image is made all the same."""
     lamp = {"type": "cube", "emitter": {"type": "area", "radiance": peaked(2)}}
     film = {"type": "hdrfilm", "width": 8, "height": 8}
     eye = T().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
@@ -371,9 +360,8 @@ def test_a_textured_cube_that_was_met_as_an_emitters_shape():
 
 
 def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
-    """Rationale: such a lamp is sampled by its area from within, and that must not be asked of other lamps: a
-    table has their centres at the origin. Expected: nothing counts as not finite, and the sky is seen with
-    its radiance of 1 (within 5 %, ten standard errors of (1,1) and s = 0 together); it was black."""
+    """Such a lamp is sampled by its area from within, which must not be asked of other lamps: the sky was
+    black. Tolerance: ten standard errors."""
     lamp = {"type": "sphere", "center": [0, 0, -5], "flip_normals": True}
     lamp["emitter"] = {"type": "area", "radiance": 1.0}
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
@@ -388,7 +376,7 @@ def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
 
 
 def test_a_textured_lamp_beside_a_group_of_two_kinds_of_shapes():
-    """``Shape.ray_intersect`` of Mitsuba reads out of bounds there. Expected: it is rendered."""
+    """``Shape.ray_intersect`` of Mitsuba reads out of bounds there."""
     group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.2}, "box": {"type": "cube"}}
     one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     scene = {

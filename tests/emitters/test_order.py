@@ -39,8 +39,8 @@ def places(scene):
 
 @pytest.mark.parametrize("ids", [["b", "c", "a", "d"], ["", "", "", ""], ["x", "", "e", ""]])
 def test_loads_of_a_file_have_one_order(ids):
-    """Rationale: Mitsuba puts meshes in the order of addresses, so that seeds gave other images. Expected:
-    one order of all that the lamps can have, by ids, then by places."""
+    """Mitsuba puts meshes in the order of addresses, so that seeds gave other images: by ids, then by
+    places."""
     loads = [room(ids, order) for order in itertools.permutations(range(4))]
     assert len({tuple(places(scene)) for scene in loads}) == 1
     found = [emitter.get_shape().id() for emitter in in_order(loads[0])]
@@ -48,7 +48,6 @@ def test_loads_of_a_file_have_one_order(ids):
 
 
 def test_a_seed_has_one_image_in_every_load():
-    """Expected: the images of three orders of the lamps with one seed are equal up to rounding."""
     bdpt = mi.load_dict({"type": "bdpt"})
     orders = [(0, 1, 2, 3), (3, 2, 1, 0), (1, 3, 0, 2)]
     images = [np.array(bdpt.render(room(["b", "c", "a", "d"], order), seed=3, spp=4)) for order in orders]
@@ -59,8 +58,6 @@ def test_a_seed_has_one_image_in_every_load():
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_photons_are_aimed_at_one_order_of_shapes(order):
-    """Rationale: the spheres were in the order of the load, so that a seed had other photons in each process.
-    Expected: they are in the order of their places."""
     glass = {
         f"glass{i}": {
             "type": "cube",
@@ -75,8 +72,7 @@ def test_photons_are_aimed_at_one_order_of_shapes(order):
 
 
 def test_light_groups_are_those_of_the_tables():
-    """Expected: the layer of each lamp has its colour, whose red over green is its number. Tolerance: sums of
-    some ten numbers in single precision."""
+    """Tolerance: sums of some ten numbers in single precision."""
     bdpt = mi.load_dict({"type": "bdpt", "light_groups": "auto", "max_depth": 2})
     image = np.array(bdpt.render(room(["b", "c", "a", "d"]), seed=3, spp=4))
     layers = dict(zip(bdpt.aov_names(), np.moveaxis(image[..., -12:], -1, 0), strict=True))
@@ -87,14 +83,12 @@ def test_light_groups_are_those_of_the_tables():
 
 
 def test_other_emitters_keep_their_places():
-    """Expected: emitters on no mesh stay where the scene has them."""
     lamps = {name: {"type": "point", "position": [i, 0, 0]} for i, name in enumerate("cab")}
     scene = mi.load_dict({"type": "scene"} | lamps)
     assert [emitter.id() for emitter in in_order(scene)] == [emitter.id() for emitter in scene.emitters()]
 
 
 def test_statistics_have_the_scenes_numbers(monkeypatch):
-    """Expected: the share of the lamp that is first in the tables is under its number in the scene."""
     unsampled = UnsampledLight({0: np.ones(3)})
     monkeypatch.setattr(Render, "_unsampled", lambda self: unsampled)
     scene, bdpt = room(["b", "a"]), mi.load_dict({"type": "bdpt"})

@@ -83,10 +83,8 @@ LAMPS = {
 
 @pytest.mark.parametrize("name", LAMPS)
 def test_lamps_of_any_size(name):
-    """Expected: pixel by pixel the image at scale 1, with the same random numbers: scales that are powers of
-    two change no rounding. Tolerance: 1e-6 of the mean for the order of sums, and for lamps at a point, which
-    are asked at a distance of 1 + |p|; losses of one lamp do not hide behind others. All scales are one
-    kernel."""
+    """Scales that are powers of two change no rounding. Tolerance: 1e-6 of the mean for the order of sums,
+    and for lamps at a point, which are asked at a distance of 1 + |p|."""
     lamps, images = LAMPS[name](), []
     for scale in (1.0, *SCALES):
         parts = {key: of_scale(part, scale) for key, part in (room() | lamps).items()}

@@ -114,11 +114,9 @@ def pairs(slow=lambda emitter, sensor: True):
     ("emitter", "sensor"), pairs(lambda e, s: not (s == "perspective" or (e, s) in QUICK))
 )
 def test_pair(emitter, sensor):
-    """Each pair has its own combination of strategies, measures and special cases. Expected: the image with
-    all strategies is `path`'s, known to 1 %; the weighted layers add up to it (1e-4 of its mean: other orders
-    of sums); for k = 1, 2, 3 every strategy that the table of `scene_parts` gives to the pair has the mean of
-    the first of them, all others are dark. Light that comes straight from a delta emitter is out of sight
-    (`path` misses it where the sensor has area)."""
+    """The image is `path`'s, known to 1 %; the weighted layers add up to it (1e-4 of its mean: other orders
+    of sums); for k = 1, 2, 3 every strategy that takes part by `scene_parts` has the mean of the first, all
+    others are dark."""
     scene = parts.pair(emitter, sensor)
     method = bdpt(layers="strategies")
     images = renders(scene, method, SAMPLES, 0)
@@ -163,7 +161,7 @@ def strategies(images, method, emitter, sensor):
 
 @pytest.mark.parametrize(("emitter", "sensor"), pairs())
 def test_pair_with_defaults(emitter, sensor):
-    """As `test_pair`, with the default choice of what to skip, one connection, roulette."""
+    """The default choice of what to skip, one connection, roulette."""
     ours = tiles(renders(parts.pair(emitter, sensor), bdpt(skip="auto"), 2 * SAMPLES, 0))
     other = parts.pair(emitter, sensor, reference=True)
     with evaluated_mode(emitter == "timed_sunsky"):
@@ -187,10 +185,8 @@ DISTINCT = {part: PLUGINS[plugin] for plugin, part in parts.EMITTER_PARTS.items(
     [pytest.param(e, marks=[pytest.mark.slow] * (e not in DISTINCT)) for e in PLUGINS.values()],
 )
 def test_explain_names_what_is_impossible(emitter, sensor):
-    """`explain` has a line `skipped (impossible): CLASS: why` for each class of strategies that the table of
-    `scene_parts` does not give to the pair, for emission that no table can guide, and for no other; and a
-    line that names the emitter if no light subpath starts from it, or next-event estimation cannot choose
-    it."""
+    """By the table of `scene_parts`, for emission that no table can guide, and for emitters without light
+    subpaths or next-event estimation; for no other."""
     text = bdpt().explain(parts.pair(emitter, sensor))
     skipped = dict(re.findall(r"skipped \(impossible\): ([^:]+): (.+)", text))
     expected = {c for c, (s, t) in CLASSES.items() if not parts.takes_part(emitter, sensor, s, t)}
@@ -204,10 +200,8 @@ def test_explain_names_what_is_impossible(emitter, sensor):
 
 
 def test_kinds_that_take_part_partly_beside_others():
-    """An emitter that starts no light subpaths, or none but these, must not keep others in the scene from
-    what they can do, nor be chosen where it cannot be used: a point light, a plugin of unknown class, a lamp
-    of the class `directionalarea` and an area light together make the sum of the images that each makes
-    alone."""
+    """A point light, a plugin of unknown class, a `directionalarea` and an area light together make the sum
+    of their images: none keeps others from what they can do, nor is chosen where it cannot be used."""
     parts.register_plugins()
     lamps = {
         "a": parts.EMITTERS["sphere"](),
@@ -278,8 +272,7 @@ def test_directionalarea_seen_from_afar():
 
 
 def test_directionalarea_by_inner_connections():
-    """(2,2) and (3,1) make the same paths; with a lamp that no camera path can find, nothing else checks
-    them."""
+    """(2,2) and (3,1) make the same paths, and nothing else checks them with such a lamp."""
     method = bdpt(layers="strategies")
     images = renders(parts.pair("directionalarea", "perspective"), method, 4 * SAMPLES, 0)
     inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
@@ -390,8 +383,8 @@ def test_strategies_of_a_batch_of_meters_agree():
 
 
 def test_meter_of_another_scene():
-    """The shape of a meter from elsewhere is not in the scene, so that no light subpath arrives at it;
-    weights that count with t = 0 lose its part."""
+    """No light subpath arrives at the shape of a meter from elsewhere; weights that count with t = 0 lose its
+    part."""
     scene = mi.load_dict({"type": "scene", "lamp": LAMPS_ABOVE["rectangle"]()})
     elsewhere = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS)})
     method, sensor = bdpt(max_depth=1), elsewhere.sensors()[0]
@@ -440,8 +433,7 @@ def test_the_page_names_tests_that_exist():
 
 
 def test_the_page_says_who_takes_part():
-    """A dash exactly where the table of `scene_parts`, which the tests above rely on, says that it has no
-    part."""
+    """A dash exactly where the table of `scene_parts` says that it has no part."""
     rows = re.findall(r"^\| `([\w ]+)` \| (.+) \|.*\|$", PAGE.read_text(), re.MULTILINE)
     found = {name: [cell.startswith("–") for cell in cells.split(" | ")] for name, cells in rows}
     kinds = {name: part for name, part in parts.EMITTER_PARTS.items() if not name.startswith("own")}

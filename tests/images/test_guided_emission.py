@@ -108,9 +108,8 @@ def test_the_best_table_of_unequal_shares():
 
 
 def test_what_a_pilot_accumulates():
-    """Of the second moments of light tracing and of camera subpaths each counts once per sample: for the
-    floor under a lamp, which s = 1 and t = 1 find, the sums are the same whatever the number of light
-    subpaths, within 15 % (noise; a factor of two and more if splats counted by themselves)."""
+    """Of the second moments of light tracing and of camera subpaths each counts once per sample, whatever the
+    number of light subpaths (noise of 15 %; a factor of two and more if splats counted by themselves)."""
     scene = load(
         sensor=camera(origin=(0, 2, 0.01), target=(0, 0, 0), fov=40, size=32),
         floor=floor(0, 1, parts.grey(0.6)),
@@ -129,8 +128,7 @@ def test_what_a_pilot_accumulates():
 
 @pytest.mark.parametrize("side", [24, 16])
 def test_noise_teaches_nothing(side):
-    """A table of noise destroys what points achieve: none of moments that differ by noise alone, in 20 of 20
-    pilots; one where the same noise lies over a real difference."""
+    """A table of noise destroys what points achieve; the same noise over a real difference has a table."""
     even, odd = np.ones((side, side)), np.ones((side, side))
     odd[side // 4 : side // 2, side // 4 : side // 2] = 400
     for seed in range(20):
@@ -145,8 +143,8 @@ def hill(side, height):
 
 
 def test_detail_is_kept_where_it_pays():
-    """Half of a pilot likes smoother tables than the whole teaches best. A table that is blurred little is
-    used where it pays, though one that is blurred more would leave less of the half that judges."""
+    """A table that is blurred little is used where it pays, though one that is blurred more would leave
+    less."""
     squares = hill(24, 50)
     statistics = statistics_of(squares, 16.0, seed=4, noise=1.2)
     narrow, wide = learning.BLURS[24]
@@ -156,8 +154,7 @@ def test_detail_is_kept_where_it_pays():
 
 
 def test_noise_is_blurred_where_it_would_not_pay():
-    """Of moments that are noise over a wide hill 20 pilots learn twice as often by the wide blur as by the
-    narrow one, which is used where both pay."""
+    """20 pilots learn twice as often by the wide blur as by the narrow one, which is used where both pay."""
     narrow, wide = learning.BLURS[24]
     pays = {narrow: 0, wide: 0}
     for seed in range(20):
@@ -171,7 +168,6 @@ def test_noise_is_blurred_where_it_would_not_pay():
 
 
 def test_outliers_alone_teach_nothing():
-    """All that is gained is in the cells with most, and the rest loses."""
     squares = np.exp(np.random.default_rng(2).standard_normal((16, 16)))
     squares[2, 3] = 1e5
     assert learning.learn(statistics_of(squares, 64.0), 16, [1]).tables is None
@@ -222,8 +218,8 @@ def rendered(scene, seed=0, spp=64, **parameters):
 
 
 def test_it_gains_and_says_so():
-    """A lamp in a hood is aimed at its opening; the error over that without is below 0.85. Trimmed, of means
-    over five seeds; the reference has 4,096 samples."""
+    """A lamp in a hood is aimed at its opening. Errors are trimmed, of means over five seeds; the reference
+    has 4,096 samples."""
     scene = spotlit()
     reference = np.mean([rendered(scene, 50 + i, 512, guiding="photons")[0] for i in range(8)], axis=0)
     never = [rendered(scene, i, guiding="photons") for i in range(5)]
@@ -261,8 +257,6 @@ def test_light_that_path_tracing_would_find_alone(monkeypatch):
 
 
 def test_where_nothing_is_gained_nothing_changes():
-    """In a furnace the image is that with guiding switched off to the last bit of sums, and the reason is
-    told."""
     light = {"type": "point", "position": [0, 0, 0], "intensity": 1.0}
     ball = {"type": "sphere", "radius": 2.0, "flip_normals": True, "bsdf": parts.grey(0.7)}
     eye = parts.perspective(origin=[0, 0, 1], target=[0, 0, 0], fov=90) | {"film": parts.film(32)}
@@ -302,7 +296,6 @@ def test_a_decision_is_done_again():
 
 
 def test_a_stopped_render_goes_on():
-    """Tables included."""
     scene = spotlit()
 
     def method():

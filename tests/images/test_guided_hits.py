@@ -85,7 +85,7 @@ def test_directions_follow_the_density(count):
 
 
 def test_the_guide_is_the_same_in_any_order():
-    """Photons arrive in the order of threads: the same density, to the bit, also if all lie in one place."""
+    """Photons arrive in the order of threads; also if all lie in one place."""
     found = photons(1000, 0.3)
     found.p = mi.Point3f(dr.select(found.lane % 2 == 0, 0.5, found.p.x), 0.5, 0)
     order = mi.UInt32(np.random.default_rng(2).permutation(1000).astype(np.uint32))
@@ -145,8 +145,7 @@ def large(lamp):
 
 
 def test_the_pilot_guides_where_it_pays(monkeypatch):
-    """In the caustic of a small lamp, and it is said; the decision done again is the same image; ``always``
-    guides whatever it costs, and nothing says the contrary."""
+    """``always`` guides whatever it costs."""
     scene = mi.load_dict(large(ball(0.02)))
     method = bdpt()
     image = np.array(mi.render(scene, integrator=method, spp=16))
@@ -194,9 +193,8 @@ def test_light_of_several_diffuse_vertices_is_predicted():
 
 
 def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
-    """Their outliers hide how candidates differ, whether their gain is predicted or not. At most half as many
-    of a pilot's parts find light if it can be guided as if nothing can be (of five seeds 1 to 6 of 16, and 10
-    to 14)."""
+    """Their outliers hide how candidates differ. At most half as many of a pilot's parts find light (of five
+    seeds 1 to 6 of 16, and 10 to 14)."""
     scene = mi.load_dict(under_glass(ball(0.3)))
     render = Render(scene, scene.sensors()[0], bdpt(max_depth=8).settings, 1, 64)
 
@@ -269,7 +267,7 @@ def test_merging_that_does_not_pay_is_left_out(light, needed, monkeypatch):
 
 def test_light_that_is_hit_too_rarely_is_merged():
     """A pilot dropped hits that a render rarely has, found no gain, and left out ``merging=true``: the image
-    was black. A tiny lamp is merged, and guided where the user excludes merging."""
+    was black."""
     described = large(ball(0.001))
     method = bdpt(merging=True)
     image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))

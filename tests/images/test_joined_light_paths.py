@@ -33,9 +33,6 @@ def images(scene, spp=256, seeds=10, **parameters):
     return rendered_images(scene, spp, seeds, **{"max_depth": 5} | parameters)
 
 
-# -- unbiased -------------------------------------------------------------------------------------------
-
-
 # -- the guess ------------------------------------------------------------------------------------------
 
 
@@ -47,8 +44,7 @@ FEW = {"t<=1": 1e-3, "s=1": 1.0}
 @pytest.mark.parametrize("zeros", [0.5, 1.0])
 def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold):
     """A guess may be off by any factor, and 0 where something is added; roulette then needs a number that the
-    draw has not used. Guesses are 0 for half of the light vertices, or all, where inner connections have most
-    of the weight and many are drawn evenly."""
+    draw has not used."""
     scene = cornell(16)
     true = proxy_vertices.guess
 
@@ -69,9 +65,8 @@ def test_the_draw_is_unbiased_whatever_is_guessed(monkeypatch, zeros, threshold)
     "material, factor", [("diffuse", 1.1), ("roughplastic", 1.25), ("roughconductor", 1.25)]
 )
 def test_guesses_are_about_right(material, factor, monkeypatch):
-    """An estimate is as noisy as its guess is wrong: with the same light subpaths the error is that of a draw
-    by what connections add, among diffuse surfaces within a tenth, among glossy ones within a quarter. (32
-    renders of the same seeds.)"""
+    """With the same light subpaths the error is that of a draw by what connections add, among diffuse
+    surfaces within a tenth, among glossy ones within a quarter. (32 renders of the same seeds.)"""
     boxes = mi.cornell_box()
     boxes = {name: boxes[name] | {"bsdf": MATERIALS[material]()} for name in ("small-box", "large-box")}
     scene = cornell(16, **boxes)
@@ -138,8 +133,7 @@ def test_short_renders_are_not_joined():
     ids=str,
 )
 def test_what_is_joined(change, joined):
-    """In a long render of many pixels, longer with many BSDFs (40), each of which guesses evaluate, and where
-    guesses know the BSDFs."""
+    """In a long render of many pixels, longer with many BSDFs (40), where guesses know the BSDFs."""
     given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "space": None, "many": False} | change
     asked = SimpleNamespace(
         prepared=SimpleNamespace(
@@ -176,8 +170,7 @@ def test_the_same_seed_gives_the_same_image():
 
 
 def test_single_samples_are_looked_at_one_light_subpath_at_a_time():
-    """What replays a lane knows of one light subpath, and of no tables of emission: the tool renders so by
-    itself, and refuses decisions that say otherwise, and tables."""
+    """What replays a lane knows of one light subpath, and of no tables of emission."""
     scene = cornell()
     method = mi.load_dict({"type": "bdpt", "max_depth": 6})
     with pytest.raises(Exception, match="set guiding=photons"):

@@ -31,9 +31,8 @@ def integrator(**parameters):
     ids=["one", "all", "path tracing"],
 )
 def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
-    """Emitters are selected by their sampling weight, not their radiance, so that a render in which the
-    others are black traces the same paths with the same weights. Of a crop window. Tolerance: order of atomic
-    additions."""
+    """Emitters are selected by their sampling weight, so that a render in which the others are black traces
+    the same paths with the same weights. Tolerance: order of atomic additions."""
     window = {"crop_offset_x": 1, "crop_offset_y": 2, "crop_width": 6, "crop_height": 5}
     method = integrator(skip="none", merging=False, **parameters)
     image, groups = layers(method, scene(**window))
@@ -46,8 +45,7 @@ def test_a_layer_is_the_image_of_its_emitters_alone(parameters):
 
 
 def test_connections_to_several_light_subpaths_know_their_emitter():
-    """A lane draws a connection to one of four light subpaths, of different emitters. The panel alone is red:
-    no red light in the layers of the others but the sky's, which is grey."""
+    """The panel alone is red: no red light in the layers of the others but the sky's, which is grey."""
     method = integrator(decisions=JOINED)
     image, groups = layers(method, scene(rfilter="box"), spp=64)
     assert method.statistics["decisions"][-1]["joined"] == 4
@@ -74,7 +72,6 @@ def test_a_merge_knows_its_emitter(plate):
 
 
 def test_mixed_light_is_that_of_other_lamps():
-    """The mix of a render is the render of lamps with radiances times the weights."""
     method, target = bdpt(max_depth=4, skip="none", light_groups="auto"), scene()
     method.render(target, spp=8, seed=3)
     weights = {"panel": 1.5, "globe": (0.2, 0.2, 0.3), "sky": 0}
@@ -118,7 +115,6 @@ def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
 
 
 def test_each_emitter_has_its_own_group():
-    """Of more than eight emitters the first eight by name have their own, the others are the rest."""
     target = scene()
     made = LightGroups.of(target, "auto")
     assert sorted(made.names) == sorted(LAMPS)
@@ -170,9 +166,8 @@ def _ids_of(target, made, group):
 
 
 def test_an_id_wins_over_a_made_name():
-    """Ids may differ only in a character that becomes _. A text that is an id means that emitter alone; in
-    ``auto`` an id that is a layer's name is the name of its emitter, whichever ids become it or a numbered
-    one."""
+    """Ids may differ only in a character that becomes _. In ``auto`` an id that is a layer's name is the name
+    of its emitter."""
     target = _points("Screen.A", "Screen_A", "Screen_A_2", "Screen A", "rest", "rest_2")
     for own in ("Screen.A", "Screen_A", "Screen_A_2", "Screen A"):
         assert _ids_of(target, LightGroups.of(target, f"x: {own}"), "x") == {own}
@@ -189,7 +184,7 @@ def test_an_id_wins_over_a_made_name():
 
 
 def test_brackets_in_ids_are_themselves():
-    """Names of copies have numbers in brackets or after a point. Only * and ? stand for other characters."""
+    """Only * and ? stand for other characters."""
     ids = ("lamp[1]", "lamp1", "lamp[!x]", "lamp*", "lamp?")
     target = mi.load_dict(
         {"type": "scene"} | {i: {"type": "point", "position": [n, 0, 0]} for n, i in enumerate(ids)}
@@ -211,8 +206,8 @@ def test_brackets_in_ids_are_themselves():
     ids=["pilot", "path tracing", "merging", "all"],
 )
 def test_a_pattern_may_match_no_emitter(parameters):
-    """One command renders all shots. The group is black, with a warning; the other layers are those of a
-    render without it; it goes on from a snapshot."""
+    """One command renders all shots: the group is black, with a warning, and the other layers are those
+    without it."""
     target, text = scene(rfilter="box"), "torch: torch*; low: globe, b*"
     method = bdpt(max_depth=4, light_groups=text, spp_per_pass=4, **parameters)
     with Warned() as warnings:
@@ -233,7 +228,6 @@ def test_a_pattern_may_match_no_emitter(parameters):
 
 
 def test_groups_without_any_emitter():
-    """All light is the rest; a group with another pattern says so."""
     made = LightGroups.of(scene(), "a: x*; b: y?")
     assert made.names == ("a", "b", "rest") and set(made.of_emitters) == {2}
     made = LightGroups.of(scene(), "a: x*, panel")
@@ -256,7 +250,6 @@ def test_groups_without_any_emitter():
     ],
 )
 def test_what_is_no_light_group(text, words):
-    """The error names the parameter, the value and what to do."""
     with pytest.raises(ValueError, match=f"bdpt: light_groups=.*{words}"):
         LightGroups.of(scene(), text)
 

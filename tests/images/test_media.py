@@ -128,9 +128,8 @@ TWINS += [flag_of_spectral_extinction, larger_scene, instance]
 
 @pytest.mark.parametrize("twins", TWINS)
 def test_scenes_that_are_the_same_to_light(twins):
-    """Images of one seed: 95 % of the pixels to 1e-3, the mean to 2e-3; with all strategies, and with what a
-    pilot decides for one (surfaces that are nothing to light cost rays, and two choices that hardly differ
-    may change places)."""
+    """Images of one seed: 95 % of the pixels to 1e-3, the mean to 2e-3; by all strategies, and by the choice
+    of a pilot for one (two choices that hardly differ may change places)."""
     a, b = (mi.load_dict(scene) for scene in twins())
     method = integrator(max_depth=4)
     images(b, method, 64, 3, 1)
@@ -217,8 +216,7 @@ def test_a_lens_behind_a_mask_in_fog():
 @pytest.mark.parametrize("light", ["sky", "sun"])
 def test_a_grid_without_boundary(light):
     """A grid that the sensor declares ends at its box, outside of which the disks of light from infinity do
-    not lie. Expected: camera subpaths alone, with the remedy; with it, a null sphere, all strategies and the
-    same image."""
+    not lie: camera subpaths alone, and all strategies in a null sphere."""
     grid = parts.grid(np.ones((3, 3, 3)), [-3] * 3, 6.0, 0.4, 0.8, id="m")
     endless = {"m": grid, **open_air(light)}
     endless["sensor"] |= {"medium": REF}
@@ -231,7 +229,7 @@ def test_a_grid_without_boundary(light):
 @pytest.mark.parametrize("light", ["sky", "sun"])
 def test_fog_behind_the_far_plane(light):
     """t = 0 took what lies behind the far plane out of light from infinity, which camera rays do not meet: 8
-    % of the sun's light on a wide lens. Expected: as if there were nothing behind the plane."""
+    % of the sun's light on a wide lens."""
     sun = parts.sun() | {"direction": [0.05, 0, 1]}
     puff = parts.ball("null", 0.1, (0, 0, 0.3), interior=parts.fog(2.0, 0.5))
     scene = {
@@ -249,9 +247,8 @@ def test_fog_behind_the_far_plane(light):
 
 
 def test_flights_by_all_channels():
-    """mitsuba2 #323: free flights had the density of one channel. Expected: in a chromatic ball under the sky
-    camera subpaths alone have less than a fifth of ``volpath``'s variance in the channel of least extinction
-    (here a tenth), and the mean of ``volpathmis``."""
+    """mitsuba2 #323: free flights had the density of one channel. Less than a fifth of ``volpath``'s variance
+    in the channel of least extinction (a tenth was measured)."""
     medium = parts.coloured(8.0) | {"sigma_t": parts.rgb(1.0, 0.5, 0.03), "albedo": 0.9}
     eye = parts.sensor(origin=(0, 0, 3), target=(0, 0, 0), fov=15, size=8)
     ball = parts.ball(radius=0.5, center=(0, 0, 0), interior=medium)
@@ -266,9 +263,9 @@ def test_flights_by_all_channels():
 
 
 def test_nothing_is_lost_outside_of_a_dense_grid():
-    """mitsuba3 #336: black spots beside a dense grid. Expected: an even sky is 1 in each pixel that does not
-    see the grid, also where that ends before its box does: to 1e-5 by camera subpaths; with all strategies by
-    Student's test, with standard errors below 1 %. Black where the grid is."""
+    """mitsuba3 #336: black spots beside a dense grid. An even sky is 1 in each pixel that does not see the
+    grid, also where that ends before its box does: to 1e-5 by camera subpaths; with all strategies by
+    Student's test."""
     medium = parts.grid(np.ones((4, 4, 4)), [-0.2, -0.2, -0.2], 0.4, 500.0, 0.0)
     eye = parts.sensor(origin=(0, 0, 3), target=(0, 0, 0), fov=25, size=16)
     box = parts.box([-0.4] * 3, 0.8, interior=medium)
@@ -290,7 +287,7 @@ def test_nothing_is_lost_outside_of_a_dense_grid():
 
 
 def test_an_infinite_voxel_ends():
-    """Tracking through an infinite majorant made no step. Samples that meet the grid count as not finite."""
+    """Tracking through an infinite majorant made no step."""
     values = np.ones((4, 4, 4))
     values[1, 2, 1] = np.inf
     method = integrator(max_depth=3, **ALL)
@@ -312,8 +309,7 @@ def test_sample_emitters_off_saves_shadow_rays():
 
 @pytest.mark.parametrize("why", CONTRADICTORY)
 def test_contradictory_scenes_get_camera_subpaths(why):
-    """LuxCoreRender #485: what media a subpath is in depends on where it comes from. Expected: `explain` says
-    why, and no light subpath is traced, also with ``skip=none``."""
+    """LuxCoreRender #485: what media a subpath is in depends on where it comes from."""
     scene = mi.load_dict(CONTRADICTORY[why]())
     for skip in ("none", "auto"):
         method = integrator(max_depth=4, skip=skip)
@@ -324,9 +320,7 @@ def test_contradictory_scenes_get_camera_subpaths(why):
 
 
 def test_sensors_are_asked_where_their_rays_start():
-    """Sensors on shapes, distant ones and near clips are not at the origin of the sensor's space. Expected:
-    no contradiction for a meter beside a ball of fog at the origin, for a distant sensor above it, for a
-    camera in a glass bell of air under which endless fog begins."""
+    """Sensors on shapes, distant ones and near clips are not at the origin of the sensor's space."""
     scene = {"type": "scene", "lamp": parts.point(position=[0, 3, 0])}
     fog = {"fog": parts.ball("null", 1.0, (0, 0, 0), interior=parts.fog(1, 0.8))}
     assert not contradiction(scene | fog | {"plate": square((3, 0, 0), sensor=meter())})
@@ -338,8 +332,7 @@ def test_sensors_are_asked_where_their_rays_start():
 
 
 def test_media_that_hide_light_from_infinity_are_explained():
-    """A medium without end that is empty hides none; one that is empty in two channels does. The far plane
-    has its remedy."""
+    """A medium without end that is empty hides none; one that is empty in two channels does."""
     for sigma_t, hides in ((0.0, False), (parts.rgb(0.3, 0, 0), True)):
         scene = open_air("sun")
         scene["sensor"] |= {"medium": {"type": "homogeneous", "sigma_t": sigma_t, "albedo": 0.5}}
@@ -380,7 +373,6 @@ def test_numbers_that_are_no_mediums_are_refused(numbers, message):
 
 @pytest.mark.parametrize("colours", [1, 3])
 def test_flights_through_coloured_grids_do_not_end_at_a_lens(colours):
-    """t = 0 is left out where grids have colours, with the reason."""
     values = np.ones((2, 2, 2, colours)) * [1, 0.5, 0.1][:colours]
     scene = parts.foggy(coloured_grid(values, [-1.2] * 3, 2.4), camera=parts.thinlens)
     reason = "t=0: what a flight through a grid carries of each colour"
@@ -395,9 +387,8 @@ def at_origin(wi, n):
 
 
 def test_microflakes_are_symmetric_with_their_extinction():
-    """No adjoint factor stands in connections of microflakes, whose density is not symmetric; nor in weights,
-    which leave sigma_t out. Expected: sigma_t(w) rho(w -> w') is sigma_t(w') rho(w' -> w) to 1e-5 (float32),
-    while rho alone differs by more than a half for some."""
+    """No adjoint factor stands in connections of microflakes, nor in weights, which leave sigma_t out: rho
+    alone is not symmetric, sigma_t rho is to 1e-5 (float32)."""
     medium = mi.load_dict(parts.fog(4, 0.9) | {"phase": microflakes()})
     rng = np.random.default_rng(3)
     a, b = (mi.warp.square_to_uniform_sphere(mi.Point2f(*rng.random((2, 4096)))) for _ in range(2))
@@ -414,10 +405,8 @@ def test_microflakes_are_symmetric_with_their_extinction():
 
 def test_our_frames_make_microflakes_sample_their_density():
     """Mitsuba 3.9.1's ``sggx`` samples with the transpose of the frame's matrix, which is another
-    distribution than its density unless the frame is its own transpose. Expected: for 24 directions of
-    arrival the directions sampled have the means of eight functions under the density, in
-    `media.interaction`'s frame, and in Mitsuba's own frame they have not. Chi-squared of the z of each mean
-    (65,536 samples and as many uniform directions), level 1e-3."""
+    distribution than its density unless the frame is its own transpose. Means of eight functions for 24
+    directions of arrival: chi-squared (65,536 samples and as many uniform directions), level 1e-3."""
     phase, ctx, n = mi.load_dict(microflakes()), mi.PhaseFunctionContext(None), 65536
     rng = mi.PCG32(n)
 

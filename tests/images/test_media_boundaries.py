@@ -95,10 +95,9 @@ def starts(scene):
 @pytest.mark.parametrize("tagged", [True, False], ids=["tagged", "plain"])
 @pytest.mark.parametrize("medium", [shared, fog], ids=["shared", "each"])
 def test_fog_between_opaque_walls(medium, tagged, optimize):
-    """Lines that look for contradictions went through walls, where no light goes, and to the back of the
-    lamp, which scatters nothing; equal media were told apart; a mesh of rectangles that Mitsuba has merged
-    has no valid box. Expected: no contradiction and one medium, in which the lamp shines; also where the lamp
-    states no medium, and all its rays meet the ceiling first."""
+    """Lines that look for contradictions went through walls and to the back of the lamp; equal media were
+    told apart; a mesh of rectangles that Mitsuba has merged has no valid box. Also where the lamp states no
+    medium, and all its rays meet the ceiling first."""
     up = {"to_world": below_the_ceiling(0.05, down=False)}
     for lamp in (None, {}, up):
         scene = box(medium, (lambda: {"exterior": medium()}) if tagged else None, lamp, optimize=optimize)
@@ -108,8 +107,8 @@ def test_fog_between_opaque_walls(medium, tagged, optimize):
 
 
 def test_light_in_a_room_of_opaque_walls():
-    """By default the image is, to rounding, that of the box in which walls and both sides of the lamp state
-    the medium; with a lamp that states none all strategies see what camera subpaths see."""
+    """The box in which walls and both sides of the lamp state the medium has the same image, to rounding;
+    with a lamp that states none all strategies see what camera subpaths see."""
     both = {"interior": shared(), "exterior": shared()}
     boxes = box(shared, lambda: {"exterior": shared()}, both), box(fog, optimize=False)
     one, other = (
@@ -124,8 +123,7 @@ def test_light_in_a_room_of_opaque_walls():
 @pytest.mark.parametrize("light", ["spot", "lamp"])
 def test_light_on_a_side_that_states_nothing(light, emits):
     """Light at the back of a one-sided surface, which sends out nothing and whose medium need not be stated,
-    started in the vacuum that this back has: 27 to 90 % of the light was lost. Expected: the fog that sensor
-    and front declare."""
+    started in vacuum: 27 to 90 % of the light was lost."""
     at = parts.transform().translate([0, 0, -2])
     glows = {"emitter": {"type": "area", "radiance": 1.0}}
     lights = {
@@ -173,7 +171,7 @@ def porch():
 
 @pytest.mark.parametrize("covered", [False, True], ids=["open", "porch"])
 def test_sky_through_a_small_window(covered):
-    """No ray around the sensor found the window, 10 cm wide, and the sky then started in fog without end: a
+    """No ray around the sensor found the window, 10 cm wide, and the sky started in fog without end: a
     contradiction, or 17 % too dark under a porch."""
     _, light = prepared(windowed(0.05, **(porch() if covered else {})))
     assert (light.contradiction, light.outside, light.hides_infinity) == ("", 0, False)
@@ -181,7 +179,7 @@ def test_sky_through_a_small_window(covered):
 
 def test_a_lamp_in_a_room_seen_from_outside():
     """Four of five rays of a lamp among plain walls meet no boundary, and started in the vacuum of the sensor
-    outside: 4 % too bright. All start in the fog of the room, which the others find."""
+    outside: 4 % too bright."""
     lamp, eye = parts.lamp(center=[2, 1, 2], radius=0.5), parts.sensor(origin=(0, 5.1, 0.01), near=1e-3)
     _, light = prepared(windowed(0.75, lamp=lamp, sensor=eye, sky=parts.point(position=[0, 20, 0])))
     light.settle()
@@ -190,7 +188,7 @@ def test_a_lamp_in_a_room_seen_from_outside():
 
 def test_light_from_infinity_over_an_open_sea():
     """Camera subpaths under a sea without walls are in water for ever, light from infinity starts in air: 6 %
-    too bright. Expected: no light subpaths, and why."""
+    too bright."""
     sea = {"type": "rectangle", "bsdf": {"type": "dielectric"}, "interior": fog(0.3), "id": "sea"}
     sea["to_world"] = parts.transform().rotate([1, 0, 0], -90).scale(50)
     scene = {"type": "scene", "sensor": parts.sensor(origin=(0, 2, 4), target=(0, 0, 0)), "sea": sea}
@@ -269,9 +267,8 @@ PAIRS = {
 
 @pytest.mark.parametrize("variant", [variants.of("rgb"), variants.of("spectral")])
 def test_media_are_told_apart_by_what_they_are(variant):
-    """Two objects of equal numbers were two media, whose boundaries contradict each other: no light subpaths,
-    44 times the variance. Two grids that differ beyond what was sampled were one medium. Expected: equal
-    where all that a medium holds and answers is, and no grid is held."""
+    """Two objects of equal numbers were two media, whose boundaries contradict each other: 44 times the
+    variance. Two grids that differ beyond what was sampled were one medium."""
     mi.set_variant(variant)
     for name, (one, other, equal) in PAIRS.items():
         media = [mi.load_dict(fog(0.1)), mi.load_dict(one()), mi.load_dict(other())]
@@ -279,15 +276,12 @@ def test_media_are_told_apart_by_what_they_are(variant):
 
 
 def test_media_that_hold_one_grid():
-    """Two media that hold the same volume are equal, if all else is."""
     volume = mi.load_dict(grid()["sigma_t"])
     media = [mi.load_dict(grid(scale=scale) | {"sigma_t": volume}) for scale in (3.0, 3.0, 2.9)]
     assert representatives([MediumProperties(m) for m in media]) == [0, 0, 2]
 
 
 def test_media_of_python_are_equal_to_themselves_only():
-    """What a plugin in Python is, its parameters do not tell, also where the phase function alone is of
-    Python."""
     parts.register_plugins()
     own = (
         {"type": "own_fog", "extinction": 4.0, "albedo": 0.9},
@@ -338,8 +332,7 @@ CONNECTED = {
 
 def test_kernels_ask_for_the_medium_only_where_emissions_differ():
     """Among walls without boundary a ray is reflected 64 times: with a glass of milk in a room light subpaths
-    took three times as long. A lamp all of whose emissions start in one medium is looked at before the
-    kernel."""
+    took three times as long."""
     room = mi.cornell_box() | {"vase": parts.ball("dielectric", 0.1, (0.3, -0.8, 0.4), interior=milk())}
     for scene, asks in ((room, False), (CONNECTED["a lamp partly in milk"](), True)):
         _, light = prepared(mi.load_dict(scene))
@@ -350,10 +343,9 @@ def test_kernels_ask_for_the_medium_only_where_emissions_differ():
 
 @pytest.mark.parametrize("name", CONNECTED)
 def test_shadow_rays_arrive_in_the_medium_that_light_starts_in(name):
-    """A path is the same from both ends. Random points that the camera sees past null surfaces are connected
-    with random points of lamps (light from infinity: with its direction): shadow rays that are not blocked
-    arrive in the medium that `LightMedia.at` states for the reversed ray; but for one in a thousand, which
-    rounding puts on the other side of an edge."""
+    """A path is the same from both ends: shadow rays between points past null surfaces and lamps arrive in
+    the medium that `LightMedia.at` states for the reversed ray; but for one in a thousand, by rounding at an
+    edge."""
     made = CONNECTED[name]()
     scene = mi.load_dict(made) if isinstance(made, dict) else made
     found, count, rng = PreparedScene(scene, scene.sensors()[0]), 1 << 14, np.random.default_rng(1)

@@ -216,11 +216,10 @@ def of_a_square(share):
     ids=["sheet, a quarter", "sheet", "box, a quarter", "ball, half", "ball"],
 )
 def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
-    """A disc that is larger than what it lies on has fewer photons than its area says: light is lost at edges
-    and on curved surfaces, the more the larger the radius. Expected, over the image without merging: of a
-    sheet what a disc leaves of a square, 0.90 and 0.62; of a thin box as much, and not all; of a ball most at
-    half of its radius, and at its radius a quarter to 0.6. Tolerance: three standard errors of 0.013 (ball:
-    0.03), beside 0.02 for the perspective."""
+    """A disc that is larger than what it lies on has fewer photons than its area says. Expected, over the
+    image without merging: of a sheet what a disc leaves of a square, 0.90 and 0.62; of a thin box as much,
+    and not all; of a ball most at half of its radius, and at its radius a quarter to 0.6. Tolerance: three
+    standard errors of 0.013 (ball: 0.03), beside 0.02 for the perspective."""
     monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
     monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1e-3)  # 2^18 photons
     monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
@@ -236,7 +235,6 @@ def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
 
 
 def test_nothing_leaks_through_a_thin_wall():
-    """A floor that is lit through glass from below alone is black from above."""
     scene = under_glass(point() | {"position": [0.5, 0, -2.0]})
     below = transform().translate([0, 0, -0.5]).scale([4, 4, 0.1])
     scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
@@ -251,7 +249,6 @@ def under_glass_and_a_point():
 
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_makes_no_difference(change):
-    """The same tiles of the floor as without the change (in the pixels that both have)."""
     assert_no_difference(change, point(), under_glass_and_a_point(), spp=256, merging=True)
 
 
@@ -307,8 +304,8 @@ def traced(count=1 << 14):
 
 
 def test_photons_are_the_same_in_any_order(monkeypatch):
-    """Photons are kept in the order in which threads find them, and sums of a draw depend on it; there may be
-    more than there was memory for (traced again)."""
+    """Photons are kept in the order in which threads find them; there may be more than there was memory
+    for."""
     of_pass, counts = traced()
     first = of_pass.photons
     count, starts = dr.width(first.cell), np.array(first.starts).astype(int)
@@ -327,8 +324,7 @@ def columns(photons):
 
 
 def test_cells_may_share_a_bucket(monkeypatch):
-    """With four buckets the image of the same photons; it does not depend on which photon of a disc is
-    drawn."""
+    """The image does not depend on which photon of a disc is drawn."""
     scene = mi.load_dict(under_glass(point()))
     expected = images(scene, 16, 1, merging=True)
     for module in (passes, merging):
@@ -348,13 +344,6 @@ def test_which_photons_are_near():
         assert found == [True, True, False, True, rounded, True, False, rounded]
 
 
-def test_discs_hold_few_photons():
-    """One subpath for eight of a pass's samples, at most 64 for each disc that its film has room for."""
-    assert passes.photons_of_pass(1 << 20, 1 << 14, 1.0) == 1 << 17
-    assert passes.photons_of_pass(1 << 20, 1 << 8, 2.0) == int(64 * (1 << 8) / (4 * np.pi))
-    assert passes.photons_of_pass(1 << 20, 1 << 8, 1e6) == 64
-
-
 # -- renders -----------------------------------------------------------------------------------------------
 
 
@@ -363,7 +352,7 @@ LEFT_OUT = {"layers": "strategies", "merging": "auto"}
 
 @pytest.mark.parametrize("parameters", [{}, {"layers": "variance"}, LEFT_OUT], ids=str)
 def test_a_resumed_render_is_the_uninterrupted_one(parameters):
-    """So is what it leaves out. Radius and photons of a pass follow from the passes done."""
+    """Radius and photons of a pass follow from the passes done."""
     scene, parameters = mi.load_dict(under_glass(point())), {"merging": True, "spp_per_pass": 8} | parameters
     whole, again = bdpt(**parameters), bdpt(**parameters)
     expected = np.array(whole.render(scene, seed=3, spp=64))
@@ -385,7 +374,7 @@ def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
 
 
 def test_joined_renders_are_their_mean():
-    """By samples, to rounding of sums (box filter); they say that they are not unbiased."""
+    """To rounding of sums (box filter); they are not unbiased."""
     scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
     whole, *methods = (bdpt(merging=True, spp_per_pass=8) for _ in range(3))
     snapshots = [
@@ -402,8 +391,8 @@ def test_joined_renders_are_their_mean():
 
 @pytest.mark.parametrize("spp", [1, 64])
 def test_merging_where_light_is_missing(spp):
-    """Without a parameter the image of ``merging=true`` where light is missing, with a pilot and without one,
-    and its reason; where next to none is missing, that of ``merging=false``."""
+    """The image of ``merging=true`` where light is missing, with a pilot and without one; else that of
+    ``merging=false``."""
     hidden, seen = (mi.load_dict(under_glass(lamp)) for lamp in (point(), ball()))
     default = bdpt()
     for scene, merged in ((hidden, True), (seen, False)):
@@ -435,8 +424,7 @@ def test_what_a_render_says():
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
 def test_no_light_is_called_lost_that_merging_finds(kind):
-    """Paths of more than 64 edges, and those through the lens itself, are lost with merging too, and the
-    share of unsampled light was estimated by all."""
+    """Paths of more than 64 edges, and those through the lens itself, are lost with merging too."""
     scene = mi.load_dict(under_glass(point(), kind=kind))
     more = {"light_paths": 0} if kind == "thinlens" else {}  # without light subpaths no t = 0
     method = bdpt(merging=True, max_depth=-1, **more)
@@ -470,7 +458,7 @@ def test_strategy_image_of_merges(monkeypatch):
 
 
 def test_an_even_sky():
-    """Under the sky alone nothing is merged: the image is that of the same seed (to the rounding of sums)."""
+    """Nothing is merged: the same image, to the rounding of sums."""
     sky = {"type": "constant", "radiance": 0.2}
     scene = mi.load_dict(under_glass(sky))
     a, b = (images(scene, 16, 1, merges=False, merging=merging) for merging in (True, False))
@@ -489,9 +477,8 @@ def small_glass(lamp, **sensor):
 
 
 def test_photons_are_aimed(monkeypatch):
-    """Of the lamp's directions 1 in 3,000 meets a small ball of glass. With photons aimed at glass and mirror
-    the tiles are those without (of a tenth of the brightest or more: elsewhere too few photons are not aimed
-    for a test); the part of the variance that is merging's is a fifth at most."""
+    """Of the lamp's directions 1 in 3,000 meets a small ball of glass. The tiles are those of photons that
+    are not aimed (of a tenth of the brightest or more), the variance that is merging's a fifth at most."""
     scene, settings = mi.load_dict(small_glass(point())), {"max_depth": 5, "merging_radius": 1.0}
     a = strategy_images(scene, 64, 16, **settings)[1]["weighted.merged"]
     monkeypatch.setattr(aim, "_specular_boxes", lambda *_: [])
@@ -514,9 +501,9 @@ def test_a_lens_where_photons_are_aimed(monkeypatch):
 
 
 def test_density_of_aimed_directions():
-    """The mixture's density is that of directions over the sphere: integrals over 2^20 uniform ones of it,
-    and of its product with each coordinate, are 1 and the means of 2^20 samples, within six standard errors;
-    from a place inside of one of two spheres, and from one outside of both."""
+    """Integrals over 2^20 uniform directions of the density, and of its product with each coordinate, are 1
+    and the means of 2^20 samples, within six standard errors; from inside of one of two spheres, and from
+    outside of both."""
     count = 1 << 20
     rng = np.random.default_rng(3)
     balls = ((0, 0, 1), 0.5), ((2, 1, 0), 1)
@@ -537,7 +524,6 @@ def test_density_of_aimed_directions():
 
 
 def test_what_needs_no_merging():
-    """Without specular surfaces."""
     scene = mi.load_dict(under_glass(ball(), plate=matte()))
     method = bdpt(merging=True)
     assert "skipped (impossible): merging: without specular surfaces" in method.explain(scene)
@@ -546,7 +532,7 @@ def test_what_needs_no_merging():
 
 
 def test_what_is_refused():
-    """Errors name the parameter, what is in the way, and the remedy; by default one warning."""
+    """By default one warning."""
     method, default = bdpt(merging=True), bdpt()
     moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}

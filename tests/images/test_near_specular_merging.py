@@ -59,11 +59,10 @@ def through_a_lens():
     [(near_pane, 0.2, True), (near_pane, 0.2, False), (through_a_lens, 0.05, True)],
 )
 def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
-    """What bounds leave out still has its weight, so that it would be missing: 15 % of the image was missing
-    under a pane so close to the camera that discs at the floor are 36 times larger. A small ``slack`` leaves
-    out many. Of the roulettes that of photon subpaths acts first; if they are not ``ended``, that of photons
-    acts, and through a lens that of camera vertices. Expected: the merged light without bounds, with the same
-    seeds, within 8 % (a few standard errors of the roulette)."""
+    """What bounds leave out still has its weight: 15 % of the image was missing under a pane so close to the
+    camera that discs at the floor are 36 times larger. A small ``slack`` leaves out many. Photon subpaths'
+    roulette acts first; if they are not ``ended``, that of photons, and through a lens that of camera
+    vertices. Tolerance: a few standard errors of the roulette."""
     if not ended:
         never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
         monkeypatch.setattr(merging.Merging, "survival", never)
@@ -77,9 +76,8 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
 
 
 def test_few_photons_far_from_what_is_sharp(monkeypatch):
-    """Scenes with one thing of rough glass somewhere must not pay for it: where it lies behind a room of
-    matte walls, 1 % of photon subpaths leave a photon (corners, where connections are few), and no vertex is
-    merged."""
+    """Where rough glass lies behind a room of matte walls, 1 % of photon subpaths leave a photon (corners,
+    where connections are few), and no vertex is merged."""
     described = mi.cornell_box() | {
         "far": {"type": "sphere", "center": [0, 0, -8], "radius": 0.2, "bsdf": rough(0.01)}
     }
@@ -106,7 +104,6 @@ def test_undersampled_lamps_that_are_not_finite_are_named():
 
 
 def test_stored_vertices_keep_their_merges():
-    """Expected: what inner connections read of a light vertex are the stored partial sums and flags."""
     sums = [mi.Float(0.1 * i, i) for i in range(1, 5)]
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
     anchor = rays.Anchor(si.p, si.n, mi.Float(0, 0), mi.Float(0, 0))
@@ -154,8 +151,7 @@ def test_stored_vertices_keep_their_merges():
     ids=["rough", "ideal", "ideal, no light subpaths"],
 )
 def test_passes_are_short_where_many_paths_are_merged(plate, parameters, expected, monkeypatch):
-    """Merges grow with the product of a pass's photons and queries: passes of 16 samples per pixel (here of
-    any number of samples) with near-specular lobes, or without light subpaths; else of 32."""
+    """Merges grow with the product of a pass's photons and queries."""
     monkeypatch.setattr(passes, "_LEAST_SAMPLES", 1)
     integrator = internals.bdpt(max_depth=5, **parameters, **MERGED)
     mi.render(mi.load_dict(under_glass(point(), plate=plate)), integrator=integrator, spp=48)

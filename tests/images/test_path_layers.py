@@ -83,8 +83,7 @@ def test_layers_add_up_to_the_image(parameters, of_scene):
 
 @pytest.mark.parametrize("parameters", [{"skip": "none"}, {"light_paths": 0}], ids=["all", "path tracing"])
 def test_layers_change_nothing_else(parameters):
-    """The image, and the layers of light groups, are those of a render without. Tolerance: order of atomic
-    additions."""
+    """Tolerance: order of atomic additions."""
     target, parameters = scene(**SURFACES["near-specular"]), parameters | {"light_groups": "auto"}
     image, _ = divided(integrator(**parameters), target)
     _, groups = layers(integrator(**parameters), target)
@@ -202,8 +201,7 @@ LABELS = [f"{name} {colour}" for name in NAMES for colour in "RGB"]
     ids=["glass", "guiding", "all", "drawn", "joined", "path tracing", "null", "null by path tracing"],
 )
 def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
-    """`by_sampling` counts rough events of paths that it samples from the camera, without any connection:
-    each layer's mean, by Welch's t-test of the means of 12 renders; that of the image within 1 %."""
+    """Each layer's mean, by Welch's t-test of the means of 12 renders; that of the image within 1 %."""
     target = scene(lit=("panel", "globe", "sky"), rfilter="box", **SURFACES[surfaces])
     expected, found = expected_layers(surfaces), means(target, 32, **parameters)
     welch.assert_agree(welch.welch(found, expected, labels=LABELS), at_least=8)
@@ -212,8 +210,8 @@ def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
 
 @pytest.mark.parametrize("kind", ["roughconductor", "roughdielectric"])
 def test_roughness_of_near_specular_lobes(kind):
-    """At normal incidence the alpha that the manual names divides events with a density of `NARROW` from both
-    sides from others. Tolerance: the two digits of the manual, and the 4 % of light that glass reflects."""
+    """At normal incidence the alpha of the manual divides events with a density of `NARROW` from others.
+    Tolerance: the manual's two digits, and the 4 % of light that glass reflects."""
     page = Path(__file__).parents[2] / "docs/user/light_groups.md"
     manual = float(re.search(rf"`{kind}`[^;]*?below (0\.\d+)", page.read_text())[1])
     side = -1 if kind == "roughdielectric" else 1
@@ -229,8 +227,8 @@ def test_roughness_of_near_specular_lobes(kind):
 
 
 def test_other_objects_do_not_change_layers():
-    """Whether metal of alpha .07 could be near-specular depended on what else was in the scene. A floor seen
-    at grazing angles has the same layers, two of them, beside an unseen polished ball and without."""
+    """Whether metal of alpha .07 could be near-specular depended on what else was in the scene: here an
+    unseen polished ball."""
     eye = camera(origin=(-3, 0, 0.4), target=(0, 0, 0), up=(0, 0, 1), fov=1, size=4)
     metal = {"type": "roughconductor", "alpha": 0.07}
     room = {"type": "scene", "sensor": eye, "floor": square(bsdf=metal), "sky": {"type": "constant"}}
@@ -272,8 +270,7 @@ def test_merged_light_is_caustic(plate):
 
 
 def test_a_resumed_and_a_joined_render_keep_the_layers():
-    """And those of light groups; two renders of different seeds, joined, have the mean of theirs. Tolerance:
-    rounding."""
+    """And those of light groups. Tolerance: rounding."""
     target = scene(rfilter="box")
     method = integrator(skip="none", spp_per_pass=4, light_groups="auto")
     whole = np.array(method.render(target, spp=8, seed=3))
