@@ -56,16 +56,6 @@ def results(scenes=("a_caustic_with_a_long_name", "b")):
     return Results(pd.DataFrame(rows), dict.fromkeys(scenes, KNOWN))
 
 
-def drawn(monkeypatch, plot, columns, scenes=("a_caustic_with_a_long_name", "b")):
-    """The figure of a plot, as it is saved."""
-    found = []
-    monkeypatch.setattr(
-        figures, "save", lambda figure, path: (figure.draw_without_rendering(), found.append(figure))
-    )
-    figures.PLOTS[plot](results(scenes), None, columns, scenes)
-    return found[0]
-
-
 def block(count, height=48, width=32, title="a_caustic_with_a_long_name"):
     """Images of a bright, noisy window at the bottom right, the noisier the earlier, and their reference."""
     rng, target = np.random.default_rng(1), np.full((height, width, 3), 0.5)
@@ -87,8 +77,6 @@ def saved(monkeypatch, module):
 
 
 def test_windows_lie_where_errors_differ():
-    """The first of two disjoint windows within the window of fireflies, the second at least a side apart,
-    also where the largest errors fill more than one window; without room for that they only touch."""
     made = block(2)
     (left, top, side), (left2, top2, _) = crops.windows(made.columns[0].errors, made.columns[1].errors)
     assert side == 5 and left >= 20 - 1 and top >= 36 - 1
@@ -103,9 +91,6 @@ def test_windows_lie_where_errors_differ():
 
 
 def test_crops_are_of_the_sweep(tmp_path):
-    """The images of the median seed at the deciding budget, rivals first, with their samples, seconds and the
-    trimmed relMSE of the tables, less the reference's own; integrators without images are left out, and a
-    scene without any is an error."""
     rows = results(("b",)).rows
     rows = rows.assign(reference_rel_mse_trimmed=0.004, key=rows["method"] + rows["seed"].astype(str))
     found = Results(rows, {"b": KNOWN}, compared=64)
@@ -132,30 +117,11 @@ def test_crops_are_of_the_sweep(tmp_path):
     assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
 
 
-def test_curves_are_raw_and_trimmed(monkeypatch):
-    """Of each integrator the means of raw errors, solid with markers, and of trimmed ones, half of them,
-    dashed; hollow markers where the error is a lower bound; a line of slope -1."""
-    figure = drawn(monkeypatch, "samples", 1, ("b",))
-    (axis,) = figure.axes
-    expected = results(("b",)).of("b", "bdpt", 16)["rel_mse"].mean()
-    lines = {(line.get_color(), line.get_linestyle()): line for line in axis.lines}
-    blue, orange = (figures.STYLES[name][0] for name in ("bdpt", "path"))
-    assert lines[blue, "-"].get_xydata()[1] == pytest.approx([16, expected])
-    np.testing.assert_allclose(lines[blue, "--"].get_ydata() * 2, lines[blue, "-"].get_ydata())
-    hollow = [line for line in axis.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
-    assert [line.get_color() for line in hollow] == [orange]
-    x, y = next(line for line in axis.lines if line.get_color() == "black").get_data()
-    assert y[1] / y[0] == pytest.approx(x[0] / x[1])
-    assert axis.get_xscale() == axis.get_yscale() == "log"
-
-
 ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}
 """Options of figures by default."""
 
 
 def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
-    """The integrators that are named, and the first; windows about the places, within the image; what is
-    wrong is named."""
     kept = replace(results(("b",)), aside=(METHODS[1],))
     assert METHODS[1] not in figures._among(kept, None).methods
     assert figures._among(kept, METHODS[1:2]).rivals == [METHODS[1]]
@@ -183,7 +149,6 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
 
 
 def test_single_renders_among_several_have_no_point():
-    """Points of two renders or more; where all are single, all."""
     kept = results(("b",))
     few = replace(kept, rows=kept.rows.query("budget < 256 or seed == 0"))
     assert figures._points(few, "b", "bdpt", "spp", "rel_mse")["x"].tolist() == [4, 16, 64]
@@ -192,28 +157,12 @@ def test_single_renders_among_several_have_no_point():
 
 
 def test_a_single_seed_has_no_efficiencies(monkeypatch, tmp_path):
-    """What is missing, and the key that mends it."""
     kept = results(("b",))
     one = replace(kept, rows=kept.rows.query("seed == 0"))
     monkeypatch.setattr(figures, "load", lambda *_: (one, {}, {}))
     words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "efficiency"}
     with pytest.raises(CommandError, match="two renders of each integrator; set seeds = 2 or more"):
         figures.run(Namespace(**ALL | words, columns=1))
-
-
-def test_a_figure_taller_than_a_page_is_said(monkeypatch, tmp_path, capsys):
-    """A warning with the height and the option that mends it; none for one scene."""
-    kept, found = results(("a", "b")), saved(monkeypatch, crops)
-    monkeypatch.setattr(figures, "load", lambda *_: (kept, dict.fromkeys("ab"), {}))
-    monkeypatch.setattr(figures, "cropped", lambda folder, results, made, scene: block(1, 32, 32, scene))
-    words = {"project": tmp_path, "folder": "x", "output": tmp_path / "a.pdf", "plot": "crops"}
-    for scenes in (None, ["b"]):
-        figures.run(Namespace(**ALL | words | {"scenes": scenes}, columns=2))
-    assert re.search(
-        r"a.pdf is 4\d cm tall, more than the text on a journal's page.*: draw fewer scenes by --scenes",
-        capsys.readouterr().out,
-    )
-    assert found[1].get_size_inches()[1] * 2.54 < figures.PAGE
 
 
 @pytest.mark.parametrize("ending", ["pdf", "svg", "png"])
@@ -235,7 +184,6 @@ def test_the_format_is_that_of_the_ending(tmp_path, ending):
 
 
 def test_other_endings_are_refused(tmp_path):
-    """Before the sweep is read, with the endings that there are."""
     options = Namespace(project=tmp_path, folder="x", output=tmp_path / "a.jpg", plot="samples", scenes=None)
     with pytest.raises(CommandError, match="a.jpg' must end in .pdf, .svg, .png"):
         figures.run(options)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import fireflies
 import mitsuba as mi
 import numpy as np
 import pandas as pd
@@ -77,14 +76,31 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def command(*words):
-    """Output of ``python -m mitsuba_bdpt`` with these words, which has to succeed without a warning."""
-    done = subprocess.run([sys.executable, "-m", "mitsuba_bdpt", *words], capture_output=True, text=True)
-    assert done.returncode == 0 and "Warning" not in done.stderr, done.stderr
-    return done.stdout
+@pytest.fixture
+def command(capfd):
+    """Runs a command that has to succeed without a warning; its output."""
+
+    def run(*words):
+        capfd.readouterr()
+        status, said = main([*words]), capfd.readouterr()
+        assert status == 0 and "Warning" not in said.err, said.err
+        return said.out
+
+    return run
 
 
-def test_a_scene_of_the_users_is_swept_reported_and_shown(here):
+@pytest.fixture
+def refused(capsys):
+    """Runs a command that has to answer with the exit status of a mistake; its last line."""
+
+    def run(*words):
+        assert main([*words]) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    return run
+
+
+def test_a_scene_of_the_users_is_swept_reported_and_shown(here, command):
     said = command("sweep", "mine", "--project", "project")
     assert "room: no reference at 16 and depth 4 yet; making one" in said and ": 30 rows" in said
     results = here / "project" / "results" / "mine"
@@ -118,14 +134,12 @@ def test_other_commands_take_the_users_scene(here, capsys):
     assert f"Time and errors of {named}bdpt skip=none over path sampler=stratified." in out
     assert main(["equal-time", room, "--spp", "4", *common]) == 0
     assert main(["pyramid", room, "--spp", "4", *common]) == 0
-    assert fireflies.main([room, "--spp", "4", "--seeds", "1", "--level", "0.05", *common]) == 0
-    out = capsys.readouterr().out
-    assert "making one" not in out and "SmoothDiffuse" in out
+    assert "making one" not in capsys.readouterr().out
     made = {path.name for path in (here / "project" / "renders").iterdir()}
     assert {"equal_time_room.png", "pyramid_room.exr", "pyramid_room_weighted.png"} <= made
 
 
-def test_the_first_integrator_may_be_any(here):
+def test_the_first_integrator_may_be_any(here, monkeypatch, capsys):
     preset = here / "project" / "presets" / "alone.toml"
     head = PRESET.partition("[[integrator]]")[0]
     preset.write_text(head + '[[integrator]]\ntype = "path"\n')
@@ -133,6 +147,13 @@ def test_the_first_integrator_may_be_any(here):
         assert main([*words, "--project", "project"]) == 0
     text = (here / "project" / "results" / "alone" / "README.md").read_text()
     assert "| `room` " in text and "efficiency.png" not in text
+
+    def refused(path):
+        raise OSError(errno.EROFS, "Read-only file system", str(path.with_name(".README.md.1.tmp")))
+
+    monkeypatch.setattr(report, "check_writable", refused)
+    assert main(["report", "alone", "--project", "project"]) == 2
+    assert "alone' cannot be written (Read-only file system), which has the report" in capsys.readouterr().err
 
 
 def test_commands_in_messages_can_be_pasted(here, capsys):
@@ -202,9 +223,7 @@ def test_commands_render_at_a_width_that_fits(here, capsys, words):
 
 
 def test_samples_are_those_that_a_sampler_takes(here, capfd):
-    """No warning, also where the scene file has a count that the sampler of references does not take; rows
-    and captions have the samples that were rendered: of 32 and 128 `multijitter` makes 5 x 7 and 11 x 12,
-    `bdpt` none."""
+    """Of 32 `multijitter` makes 5 x 7."""
     count = '<sampler type="independent"><integer name="sample_count" value="32"/></sampler>'
     (here / "elsewhere" / "room.xml").write_text(ROOM.format(height=64, sampler=count))
     preset = 'resolution = 8\nscenes = ["elsewhere/room.xml"]\nspp = [32]\nseeds = 2\n[[integrator]]\n'
@@ -275,9 +294,7 @@ def test_films_keep_their_shape(here, width, height, sensors, crop, wanted):
 
 @pytest.mark.parametrize("sampler", ["", STRATIFIED])
 def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
-    """Without parameters in the file the film and the sampler are as asked for; the picture is that of the
-    file's own film, half as wide: pixels agree with means of 2 x 2 ones (box filters and the same light: to
-    the noise of 1024 samples)."""
+    """Means of 2 x 2 pixels agree (box filters, the same light) to the noise of 1024 samples."""
     file = here / "elsewhere" / "room.xml"
     text = ROOM.format(height=32, sampler=sampler)
     file.write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
@@ -314,13 +331,8 @@ def test_recipes_say_what_makes_a_reference(here):
     assert maker("radiance = { limit = 1.0, lacks = 2.0 }") == "known answer"
     assert (reference.read_reference(references / "room_8_4.exr").image == 0.875).all()
     for wrong, message in (
-        ("windows = [[0, 0, 2, 1]]", r"\[room\]: windows.0.2=2: .* less than or equal to 1"),
         ("windows = [[0.5, 0, 0.5, 1]]", "must be left, top, right, bottom"),
-        ("windows = 3", "windows=3"),
-        ("window = 1", "window=1: there is no such key; did you mean windows"),
-        ('by = "merging"\nmerging_radius = 0', "merging_radius=0: .* greater than 0"),
         ("merging_radius = 0.5", "merging_radius=0.5 needs by = 'merging'"),
-        ("radiance = { limit = true }", "radiance.limit=True: .* number; radiance.lacks is missing"),
     ):
         recipe.write_text(f"[room]\n{wrong}\n")
         with pytest.raises(CommandError, match=message):
@@ -379,14 +391,7 @@ def test_a_default_that_nothing_uses_is_no_parameter(here):
     assert SceneFile("room", file).size(16) == (16, 8)
 
 
-def refused(*words) -> str:
-    """The one line that a command with these words answers, with the exit status of a mistake."""
-    done = subprocess.run([sys.executable, "-m", "mitsuba_bdpt", *words], capture_output=True, text=True)
-    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
-    return done.stderr.strip().splitlines()[-1]
-
-
-def test_mistakes_that_only_a_render_finds_are_one_line(here):
+def test_mistakes_that_only_a_render_finds_are_one_line(here, refused):
     room, preset = here / "elsewhere" / "room.xml", here / "project" / "presets" / "mine.toml"
     options = ["--scenes", str(room), "--resolution", "16", "--spp", "4", "--pairs", "1"]
     words = ["compare", "bdpt skp=none", "bdpt", *options, "--project", "project"]
@@ -436,28 +441,19 @@ def test_damaged_files_are_named_with_what_to_do(here, capsys):
     reference_words = ["reference", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
     reference_words += ["--spp", "1", "--seconds", "1"]
     report_words = ["report", "out", "--project", "project"]
+    again, rows = ["equal-time", *reference_words[1:-2]], here / "out" / "rows.parquet"
     for file, keep, words, message in (
         (made, 2, report_words, "room_16_4.exr' is damaged .*; delete it, to make it anew"),
-        (
-            made,
-            20,
-            ["equal-time", *reference_words[1:-2]],
-            "room_16_4.exr' is .*anew, by mitsuba-bdpt reference",
-        ),
-        (
-            here / "out" / "rows.parquet",
-            2,
-            [*sweep_words, "--scenes", "room"],
-            "run the sweep without --scen",
-        ),
+        (made, 20, again, "room_16_4.exr' is .*anew, by mitsuba-bdpt reference"),
+        (rows, 2, [*sweep_words, "--scenes", "room"], "run the sweep without --scen"),
     ):
-        whole = file.read_bytes() if file.exists() else b""
-        file.write_bytes(whole[: len(whole) // keep] if keep else b"{")
+        whole = file.read_bytes()
+        file.write_bytes(whole[: len(whole) // keep])
         capsys.readouterr()
         assert main(words) in (1, 2), file
         said = capsys.readouterr()
         assert re.search(message, said.out + said.err), (file, said)
-        file.write_bytes(whole) if whole else file.unlink()
+        file.write_bytes(whole)
 
 
 def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
@@ -478,18 +474,6 @@ def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
     assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
     assert "output='file/rows.csv' cannot be written (File exists)" in capsys.readouterr().err
     assert not (here / "project" / "renders").exists()
-
-
-def test_a_report_that_cannot_be_written_names_the_folder(here, capsys, monkeypatch):
-    assert main(["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]) == 0
-
-    def refused(path):
-        raise OSError(errno.EROFS, "Read-only file system", str(path.with_name(".README.md.1.tmp")))
-
-    monkeypatch.setattr(report, "check_writable", refused)
-    assert main(["report", "out", "--project", "project"]) == 2
-    said = capsys.readouterr().err
-    assert "folder='out' cannot be written (Read-only file system), which has the report; copy" in said
 
 
 def test_an_edited_scene_is_rendered_anew(here, capsys):
@@ -531,7 +515,7 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
     )
 
 
-def test_samples_of_a_render_that_stops_are_its_own(here):
+def test_samples_of_a_render_that_stops_are_its_own(here, command):
     stopping = PRESET.split("[[integrator]]")[0].replace("[2, 4]", "[256]").replace("[8, 2]", "[1]")
     own = '[[integrator]]\ntype = "bdpt"\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
@@ -546,15 +530,14 @@ def test_samples_of_a_render_that_stops_are_its_own(here):
 def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
     digests = iter("abcdefgh" * 99)
     monkeypatch.setattr("mitsuba_bdpt.measure.preset.source_digest", lambda: next(digests))
+    preset = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "2") + '[[integrator]]\ntype = "path"\n'
+    (here / "project" / "presets" / "mine.toml").write_text(preset)
     words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
     assert main(words) == 0
-    assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 30
+    assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 4
 
 
 def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):
-    """Those that are black or cannot be rendered are left out and named, the rows of the others are written,
-    the status is 1; so it is where the rows of a scene are damaged, and where a film has no colours, which is
-    said before anything is rendered."""
     room = ROOM.format(height=64, sampler="")
     lamp = re.search(r"<emitter.*</emitter>", room, re.DOTALL)[0]
     for name, text in (("dark", room.replace(lamp, "")), ("fog", room.replace(lamp, REFUSED + lamp))):

@@ -142,7 +142,6 @@ def test_the_page_in_a_browser(tmp_path):
 
 
 def test_a_page_of_the_users_is_not_overwritten(tmp_path, capsys):
-    """Refused before the sweep is read; the title of each page says what has made it."""
     (tmp_path / "page.html").write_text("<title>mine</title>")
     assert main(["page", str(tmp_path)]) == 2
     assert "page.html' exists and was made by something else; move it away, or" in capsys.readouterr().err
@@ -159,8 +158,6 @@ def test_images_are_half_precision():
 
 
 def test_the_page_holds_the_report():
-    """The report's tables and text as HTML, escaped, without its title; its plots are in the page, not beside
-    it."""
 
     def draw(folder):
         (folder / "seconds.png").write_bytes(b"a plot")

@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.measure import paper, pyramid
+from mitsuba_bdpt.measure import pyramid
 from mitsuba_bdpt.measure.project import Project
 from repository import PROJECT
 
@@ -87,23 +87,6 @@ def test_panels_have_all_strategies():
         (2, 1, 2),
         (3, 2, 2),
     }
-
-
-def test_strategies_stand_where_they_belong(tmp_path):
-    """Of k = 2 and 3 edges alone (2, 1, 2) and (3, 3, 1) bring light; their panels, dark, lie at s = 1 of
-    four and s = 3 of five places; the other places are empty, and k = 4, without light, has no row."""
-    white = np.ones((16, 16, 3))
-    keys = [(k, s, k + 1 - s) for k in (2, 3, 4) for s in range(k + 2)]
-    found = {key: 0.0 * white + 0.02 if key in ((2, 1, 2), (3, 3, 1)) else None for key in keys}
-    pyramid.draw(found, tmp_path / "a.png", 0.0)
-    picture = matplotlib.image.imread(tmp_path / "a.png")[..., :3]
-    height, width = picture.shape[:2]
-    panel = (width - 0.5 * paper.DPI) / 5
-    for row, (k, lit) in enumerate(((2, 1), (3, 3))):
-        y = int((row + 0.6) * height / 2)
-        for s in range(k + 2):
-            x = int(0.5 * paper.DPI + panel * (s + (3 - k) / 2 + 0.5))
-            assert (picture[y, x].max() < 0.9) == (s == lit), (k, s)
 
 
 def test_scenes_by_name_or_file(tmp_path):

@@ -4,11 +4,13 @@ import csv
 import json
 import math
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -74,15 +76,40 @@ METHODS = ("ours", "path", "ptracer")
 REPOSITORY = Project(ROOT)
 
 
+def new_project(path):
+    """A project with the scenes of this one and their recipes."""
+    for name in ("presets", "references"):
+        (path / name).mkdir()
+    for name in ("scenes", "presets/benchmark.toml", "references/scenes.toml"):
+        (path / name).symlink_to(ROOT / name)
+    return path
+
+
 @pytest.fixture
 def folder(tmp_path):
-    """A project of the test's own, with the scenes of this one and their recipes."""
-    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    (tmp_path / "presets").mkdir()
-    (tmp_path / "presets" / "benchmark.toml").symlink_to(REPOSITORY.preset("benchmark"))
-    (tmp_path / "references").mkdir()
-    (tmp_path / "references" / "scenes.toml").symlink_to(ROOT / "references" / "scenes.toml")
-    return tmp_path
+    return new_project(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A project whose sweep of `PRESET` into out/ is over."""
+    folder = new_project(tmp_path_factory.mktemp("done"))
+    assert sweep_of(folder, preset_file(folder), "-o", folder / "out", "--reference-seconds", 60) == 0
+    return folder
+
+
+@pytest.fixture
+def known(done, folder):
+    """The project of the test has the reference of `PRESET`."""
+    for file in (done / "references").glob("*.exr"):
+        shutil.copy(file, folder / "references")
+
+
+@pytest.fixture
+def finished(done, folder, known):
+    """The words of a sweep of `PRESET` in the project of the test that is over, and its folder."""
+    shutil.copytree(done / "out", folder / "out")
+    return (preset_file(folder), "-o", folder / "out"), folder / "out"
 
 
 @pytest.fixture
@@ -104,11 +131,16 @@ def job(project):
 def swept(folder):
     """Sweeps the preset in a file, errors raised: the exit status."""
 
-    def run(path, *more):
-        words = ["sweep", str(path), "--project", str(folder), *map(str, more)]
-        return sweep.run(build_parser().parse_args(words))
+    return partial(sweep_of, folder)
 
-    return run
+
+def sweep_of(folder, path, *more):
+    words = ["sweep", str(path), "--project", str(folder), *map(str, more)]
+    return sweep.run(build_parser().parse_args(words))
+
+
+def rows_of(output):
+    return pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
 
 
 def reference_of(project, max_depth, name="cornell_box"):
@@ -125,9 +157,7 @@ def preset_file(folder, text=PRESET):
 
 
 def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
-    """The stored image is the rendered one within half precision (2^-11 relative), its own error is at most
-    0.9 % of that of `bdpt` with 4 samples per pixel (of three renders), the means for bias checks are those
-    of at least 8 renders, and the provenance says what made it."""
+    """Half precision: 2^-11 relative; its own error is 0.9 % of that of `bdpt` with 4 samples."""
     made, reached = making.make(job(2))
     assert reached
     kept = reference_of(project, 2)
@@ -145,7 +175,6 @@ def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
 
 
 def test_furnaces_are_known_without_error(project, job):
-    """1 - 2^-3 in every pixel of furnace_emission at depth 3, by no integrator."""
     making.make(job(3, "furnace_emission"))
     kept = reference_of(project, 3, "furnace_emission")
     assert (kept.image == 0.875).all() and kept.error == 0
@@ -182,8 +211,7 @@ def test_windows_of_halves_have_more_samples():
 
 
 def test_a_run_goes_on_from_the_stored_reference(folder):
-    """The same image, error and tile means as by one run, up to half precision (2^-11 of a value); seeds that
-    were used do not come again."""
+    """Up to half precision (2^-11 of a value)."""
     rng = np.random.default_rng(3)
     halves, window = making.Halves("box"), (slice(0, 4), slice(4, 8))
     for _ in range(agreement.FEWEST_RUNS):
@@ -207,9 +235,7 @@ def test_a_run_goes_on_from_the_stored_reference(folder):
 
 
 def test_windows_cover_the_glass_and_show_the_same():
-    """All pixels of `glass_caustics` whose camera ray meets glass or a mirror lie in the windows, which fill
-    less than a fifth of the image; a window shows that part of the whole image: depths, which range over 2,
-    agree to 0.02 on average (random positions at the outlines)."""
+    """Depths, which range over 2, agree to 0.02 on average (random positions at the outlines)."""
     job = Job(REPOSITORY, REPOSITORY.scene("glass_caustics"), 64)
     scene = REPOSITORY.scene("glass_caustics").load(64)
     windows = [
@@ -233,17 +259,6 @@ def test_windows_cover_the_glass_and_show_the_same():
     assert np.abs(part - whole).mean() < 0.02
 
 
-def test_references_go_on_where_they_stopped(project, job):
-    """Without time there are eight renders of 4 samples, which are not good enough; a second run adds to
-    them; a third has nothing to do."""
-    first, reached = making.make(job(2, seconds=0, by="bdpt"))
-    assert not reached and first.provenance["spp"] == 32
-    second, reached = making.make(job(2, by="bdpt"))
-    assert reached and second.provenance["spp"] > 100
-    third, reached = making.make(job(2, seconds=0, by="bdpt"))
-    assert reached and third.provenance["spp"] == second.provenance["spp"]
-
-
 def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
     render, count = making.mi.render, iter(range(99))
 
@@ -262,9 +277,7 @@ def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
 
 
 def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch):
-    """Of 266 s 236 remain after measuring, 80 % of which hold eight renders of 16 samples, and the rest three
-    more rounds; `bdpt`, which is judged, is not rendered. Without time eight renders of 4, and a warning
-    before. Another run continues with other seeds, and keeps the means until it has better ones."""
+    """Of 266 s 236 remain after measuring: 80 % hold eight renders of 16 samples, the rest six more."""
     clock, seen = [0.0], []
     render, name = making.mi.render, "cornell_box"
 
@@ -292,9 +305,7 @@ def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch)
 
 
 def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
-    """For renders of 64 samples eight of 128, after two that are timed, and a few more, until its own error
-    is below a tenth of theirs, raw and trimmed, long before the time is over; a better one is made when asked
-    for. Renders have a 32nd of their samples here, and take 10 ms per sample."""
+    """Renders have a 32nd of their samples here, and take 10 ms per sample."""
     seen, render = [], making.mi.render
 
     def rendered(scene, *, spp, seed, **more):
@@ -326,11 +337,6 @@ def test_a_reference_with_merging_replaces_one_without(project, job):
     made, reached = making.make(job(5, name, seconds=0))
     assert not reached and made.merged and made.error > plain.error
     assert reference_of(project, 5, name).merged
-    made, _ = making.make(job(5, name))
-    stored = replace(made, provenance=made.provenance | {"sampler": "another"})
-    reference.write(reference.reference_path(project, name, 8, 5), stored)
-    kept, reached = making.make(job(5, name, seconds=0))
-    assert not reached and kept.provenance["sampler"] == "another"
 
 
 def test_references_that_half_precision_cannot_hold_are_refused(folder):
@@ -355,12 +361,9 @@ def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
 # -- sweeps -----------------------------------------------------------------------------------
 
 
-def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch, job, swept):
-    making.make(job(3))
-    path, output = preset_file(folder), folder / "out"
-    words = path, "-o", output
-    assert swept(*words) == 0
-    table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swept):
+    words, output = finished
+    table = rows_of(output)
     assert len(table) == 8 and (output / "rows.csv").read_text().count("\n") == 9
     assert {(r["method"], r["budget"], r["seed"]) for r in table} == {
         (m, b, s) for m in ("ours", "path") for b in (2, 4) for s in (1, 2)
@@ -375,22 +378,19 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(folder, capsys, monkeypatch
     rendered = []
     measure = sweep.measure
     monkeypatch.setattr(sweep, "measure", lambda b, c: rendered.append(c.key) or measure(b, c))
-    assert swept(*words) == 0 and rendered == [table[3]["key"]]
-    assert len(pyarrow.parquet.read_table(output / "rows.parquet")) == 8
+    assert swept(*words) == 0 and rendered == [table[3]["key"]] and len(rows_of(output)) == 8
 
 
-def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
-    """The same cells as here, by the same keys, with their images (the same seeds, so the same up to
-    rounding) and errors; further seeds until the interval is narrow enough; nothing is rendered twice."""
-    making.make(job(3))
+def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, known, swept):
+    """The same seeds, so the same errors up to rounding."""
     path = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 3") + MORE)
     assert swept(path, "-o", folder / "here") == 0
     there = ["-o", folder / "there", "--scheduler", workers.scheduler_address]
     assert swept(path, *there) == 0
-    tables = [
-        pyarrow.parquet.read_table(folder / name / "rows.parquet").to_pylist() for name in ("here", "there")
+    ours = [
+        {row["key"]: row for row in rows_of(folder / name) if row["method"] == "ours"}
+        for name in ("here", "there")
     ]
-    ours = [{row["key"]: row for row in table if row["method"] == "ours"} for table in tables]
     common = set(ours[0]) & set(ours[1])
     assert len(common) >= 6
     for key in common:
@@ -401,27 +401,25 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, job, swept):
     assert swept(path, *there) == 0
 
 
-def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, job, swept):
-    making.make(job(3))
+def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, known, swept):
     monkeypatch.setattr("mitsuba_bdpt.measure.preset.software", lambda: {"mitsuba-bdpt": "other"})
     there = ["-o", folder / "out", "--scheduler", workers.scheduler_address]
     with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
         swept(preset_file(folder), *there)
 
 
-def test_one_scene_of_a_preset_anew(folder, job, swept):
-    making.make(job(3))
+def test_one_scene_of_a_preset_anew(folder, job, swept, known):
     making.make(job(3, "furnace_emission"))
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
     path, output = preset_file(folder, text), folder / "out"
     words = path, "-o", output
     assert swept(*words) == 0
-    before = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    before = rows_of(output)
     for file in (output / "cells").iterdir():
         file.unlink()
     words = *words[:3], "--scenes", "furnace_emission"
     assert swept(*words) == 0
-    after = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    after = rows_of(output)
     assert [row["key"] for row in after] == [row["key"] for row in before]
     kept = [row["scene"] == "cornell_box" for row in before]
     assert [a == b for a, b in zip(after, before, strict=True)] == kept and not all(kept) and any(kept)
@@ -442,12 +440,8 @@ class Clock(sweep.Bench):
         return Timed(np.ones((8, 8, 3)) + 0.1 * seed, seconds, seconds)
 
 
-def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
-    """`path` is four times as fast and gets four times the samples at every budget, by a ratio that is
-    measured at the largest one; no measured render is the first with its number of samples, which compiles;
-    stratified samplers get the nearest power of two (of 8, 12 and 28: 8, 16 and 32, of which multijitter
-    makes 5 x 7)."""
-    making.make(job(3))
+def test_equal_time_by_a_clock(folder, monkeypatch, known, swept):
+    """Stratified samplers get the nearest power of two: of 8, 12 and 28 8, 16, and 32, made as 5 x 7."""
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
     text += 'sampler = "multijitter"\nmatch = "seconds"\n'
     path, output = preset_file(folder, text), folder / "out"
@@ -455,40 +449,13 @@ def test_equal_time_by_a_clock(folder, monkeypatch, job, swept):
     monkeypatch.setattr(sweep, "Bench", Clock)
     words = path, "-o", output
     assert swept(*words) == 0
-    table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    table = rows_of(output)
     spp = {(r["method"], r["budget"]): r["spp"] for r in table}
     assert [spp["ours", b] for b in (2, 3, 7)] == [2, 3, 7]
     assert [spp["path", b] for b in (2, 3, 7)] == [8, 12, 28]
     assert [spp["strata", b] for b in (2, 3, 7)] == [8, 16, 35]
     assert all(r["seconds"] < 0.1 for r in table)
     assert len(list((output / "ratios").glob("*.json"))) == 2
-
-
-def test_ctrl_c_ends_a_sweep(folder, job, swept):
-
-    class Interrupted(mi.SamplingIntegrator):
-        def __init__(self, props):
-            super().__init__(props)
-            self.max_depth = props["max_depth"]
-
-        def render(self, *args, **kwargs):
-            raise KeyboardInterrupt
-
-    mi.register_integrator("interrupted", Interrupted)
-    making.make(job(3))
-    path = preset_file(folder, PRESET.replace('type = "path"', 'type = "interrupted"'))
-    words = path, "-o", folder / "out"
-    with pytest.raises(KeyboardInterrupt):
-        swept(*words)
-
-
-def test_a_reference_of_a_version_before_is_replaced(job, monkeypatch, capsys):
-    making.make(job(2))
-    monkeypatch.setattr(scenes.SceneFile, "sha256", "second")
-    assert making.obtained(job(2, seconds=0)).provenance["scene_sha256"] == "second"
-    said = capsys.readouterr().out
-    assert "cornell_box: the scene has changed since its reference at 8 and depth 2 was made; making" in said
-    assert len([*job(2).path.parent.glob("*.exr")]) == 1
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "references").glob("*.exr")), ids=lambda path: path.stem)
@@ -501,14 +468,13 @@ def test_committed_references_are_of_their_scenes(path):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
-@pytest.mark.parametrize("pixels", [np.zeros((64, 64, 3)), np.random.default_rng(0).random((256, 256, 3))])
-def test_a_full_disk_leaves_the_old_image(folder, pixels):
+def test_a_full_disk_leaves_the_old_image(folder):
     file = folder / "image.exr"
     write_layers(file, {"": np.ones((64, 64, 3))}, {})
     before = file.read_bytes()
     whole._temporary(file).symlink_to("/dev/full")
     with pytest.raises(OSError, match="could not be written whole .*; is the disk full.*image.exr"):
-        write_layers(file, {"": pixels}, {})
+        write_layers(file, {"": np.random.default_rng(0).random((256, 256, 3))}, {})
     assert file.read_bytes() == before and not list(folder.glob(".*"))
 
 
@@ -544,8 +510,7 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
     assert [file.depth(name, 9) for name in ("pool", "cornell_box")] == [4, 3]
 
 
-def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
-    making.make(job(3))
+def test_a_failing_cell_does_not_cost_the_others(folder, capsys, known, monkeypatch, swept):
     bad = 'type = "bdpt"\nname = "bad"\nlayers = "variance"'
     path = preset_file(folder, PRESET.replace('type = "path"', bad))
     words = path, "-o", folder / "out"
@@ -555,6 +520,13 @@ def test_a_failing_cell_does_not_cost_the_others(folder, capsys, job, swept):
         len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: layers=variance", out)) == 4
         and ": 4 rows" in out
     )
+
+    def interrupted(bench, cell):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep, "measure", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        swept(*words)
 
 
 def test_a_plugin_that_does_not_exist_is_refused(folder, job, swept):
@@ -578,10 +550,7 @@ os.replace = killed
 """
 
 
-def test_a_killed_sweep_loses_one_cell_at_most(folder, project, job):
-    """After kill -9 while the sixth file is being written the five in cells/ are whole, and the next run
-    completes."""
-    making.make(job(3))
+def test_a_killed_sweep_loses_one_cell_at_most(folder, project, known):
     path, output = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 10")), folder / "out"
     code = (
         "import sys; from mitsuba_bdpt.cli.arguments import main\n"
@@ -604,18 +573,15 @@ def test_flip_is_of_the_first_seed():
     assert errors(ref.image, ref, "", True)["flip"] == 0
 
 
-def test_rows_follow_a_better_reference(folder, monkeypatch, project, job, swept):
-    making.make(job(3))
-    path, output = preset_file(folder), folder / "out"
-    words = path, "-o", output
-    assert swept(*words) == 0
-    before = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
+    words, output = finished
+    before = rows_of(output)
     kept = reference_of(project, 3)
     better = replace(kept, image=1.25 * kept.image, difference=0 * kept.image)
     reference.write(reference.reference_path(project, "cornell_box", 8, 3), better)
     monkeypatch.setattr(sweep, "measure", None)
     assert swept(*words) == 0
-    after = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+    after = rows_of(output)
     for a, b in zip(before, after, strict=True):
         assert a["seconds"] == b["seconds"] and a["mean"] == pytest.approx(b["mean"], rel=1e-6)
         assert b["mape"] != a["mape"] and b["reference_rel_mse"] == 0
@@ -625,15 +591,14 @@ def test_rows_follow_a_better_reference(folder, monkeypatch, project, job, swept
     assert after[0]["rel_mse"] == pytest.approx(metrics.rel_mse(pixels, new))
 
 
-def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept):
-    making.make(job(3))
+def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, known, swept):
     path, output = preset_file(folder, PRESET + '[[integrator]]\ntype = "ptracer"\n' + MORE), folder / "out"
     words = path, "-o", output
     ratio = lambda self, scene, rival: SimpleNamespace(low=0, high=3.9 / len(self.rows))  # noqa: E731
     monkeypatch.setattr(analysis.Results, "efficiency", ratio)
     for _ in range(2):
         assert swept(*words) == 0
-        table = pyarrow.parquet.read_table(output / "rows.parquet").to_pylist()
+        table = rows_of(output)
         seeds = {m: [r["seed"] for r in table if r["method"] == m and r["budget"] == 4] for m in METHODS}
         # Two rows a seed: 3.9 / 8 from four seeds is below 0.5.
         assert seeds == {"ours": [1, 2, 3, 4, 5], "path": [1, 2, 3, 4, 5], "ptracer": [1, 2]}
@@ -643,20 +608,15 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
     ("edit", "message"),
     [
         (("resolution = 8", "resolution = 50"), "tiny.toml: resolution=50: .* multiple of 4"),
-        (('["cornell_box"]', '"cornell_box"'), "scenes='cornell_box': .* tuple"),
         (('["cornell_box"]', '["cornell_box", "cornell_box"]'), "names one twice"),
-        (('["cornell_box"]', "[3]"), r"scenes.0=3: .* string"),
         (("[2, 4]", "[2, 2]"), r"spp=\[2, 2\] must differ"),
-        (("[2, 4]", "[2, -4]"), r"spp.1=-4: .* greater than or equal to 1"),
         (("[2, 4]", "[true]"), r"spp.0=True: .* integer"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] be as many"),
         (("seeds = 2", "seed = 2"), r"seed=2: there is no such key; did you mean seeds\?"),
         (('scenes = ["cornell_box"]', ""), "scenes is missing"),
-        (("seeds = 2", 'clock = "sun"'), r"clock='sun': .* 'wall' or 'processor'"),
         (("cornell_box", "nowhere"), "scene='nowhere'"),
         (('type = "bdpt"', 'type = "bdpt"\nseeds = 1'), "the first integrator, 'ours', sets the time"),
         (('type = "bdpt"', 'type = "bdpt"\nmatch = "seconds"'), "the first integrator, 'ours', sets"),
-        (('match = "seconds"', "media = 1"), "integrator.1.media=1: .* boolean"),
         (('match = "seconds"', 'scenes = ["pool"]'), "scenes of integrator 'path': 'pool' is not among"),
         (('type = "path"', 'name = "path"'), "tiny.toml: integrator.1.type is missing$"),
         (('type = "path"', 'type = "path"\nmax_depth = 3'), "max_depth of one integrator would compare"),
@@ -664,13 +624,11 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, job, swept
         (('match = "seconds"', "x = [1]"), r"integrator.1.x=\[1\]: must be a number, a text"),
         (('match = "seconds"', "[scene.pool]\nspp = [1]\nseeds = 1"), r"\[scene.pool\]: 'pool' is not among"),
         (('match = "seconds"', "[scene.cornell_box]\ndepth = 1"), "cornell_box.depth=1: .*max_depth"),
-        (("seeds = 2", "scene.cornell_box = 3\nseeds = 2"), r"scene.cornell_box=3"),
         (('match = "seconds"', "seeds = 1" + MORE), "'path' of .* is limited by scenes or seeds"),
         (('match = "seconds"', MORE.replace('"path"', '"none"')), r"'none' of \[more\] integrators"),
         (('match = "seconds"', MORE.replace('"ours", ', "")), r"more.integrators=\['path'\]"),
         (('match = "seconds"', MORE.replace('"ours", "path"', '"path", "ours"')), "must be the first one"),
         (('match = "seconds"', MORE.replace("[3, 9]", "[9, 3]")), r"must be \[at least, at most\]"),
-        (('match = "seconds"', MORE.replace("0.5", "0")), "more.width=0: .* greater than 0"),
         (
             ('match = "seconds"', MORE.replace('["cornell_box"]', '["pool"]')),
             r"\[more\]: 'pool' is not among",
@@ -700,12 +658,6 @@ def test_rivals_are_those_that_see_the_media(name):
     assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
     assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
     assert making._way(scene, "path") == {"type": path_tracers(scene.has_media)[0]}
-
-
-def test_equal_time_is_the_default(tmp_path):
-    text = PRESET.replace('match = "seconds"', "") + '[[integrator]]\ntype = "ptracer"\nmatch = "spp"\n'
-    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
-    assert [m.match for m in preset.methods] == ["spp", "seconds", "spp"]
 
 
 def test_three_lines_are_a_preset(tmp_path):
@@ -761,9 +713,6 @@ def test_a_folder_of_scenes_is_a_preset(tmp_path, others, monkeypatch):
 
 
 def test_scenes_of_the_command_line(tmp_path, others, swept, capsys):
-    """A preset without scenes renders the files that --scenes names, and says so without them; rows of an
-    earlier run stay, and another run with the first scene renders nothing anew; a scene that cannot be loaded
-    is named first, and the exit status is 1."""
     file = preset_file(tmp_path, OPEN)
     output = tmp_path / "out"
     with pytest.raises(CommandError, match="scenes is missing; list them, or name scene files by --scenes"):
@@ -781,8 +730,6 @@ def test_scenes_of_the_command_line(tmp_path, others, swept, capsys):
 
 
 def test_widths_fit_the_film(tmp_path, others):
-    """Of a film of 12 x 10 pixels, of which no width of 128 divides into tiles of whole pixels, the nearest
-    width that does, 120 with a height of 100; and a reason where there is none."""
     for name, sides in (("attic", (12, 10)), ("cellar", (1009, 4))):
         text = SCENE
         for side in sides:
@@ -796,10 +743,7 @@ def test_widths_fit_the_film(tmp_path, others):
     assert "1009 x 4 pixels, which divides into 4 x 4 tiles at no width near 128" in preset.left_out[0]
 
 
-def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
-    """A column with the median seconds of an integrator's first images, measured once, at the smallest
-    budget, in the report as a table; a scene without file has none."""
-    making.make(job(3))
+def test_first_images_are_rows_too(folder, monkeypatch, known, swept):
     text = PRESET.replace("seeds = 2", "seeds = 2\nfirst_image = 3")
     values, asked = iter([1.0, 9.0, 3.0, 1.0, 2.0, 1.5] * 2), []
 
@@ -811,16 +755,13 @@ def test_first_images_are_rows_too(folder, monkeypatch, job, swept):
     monkeypatch.setattr(probes, "first_image", first)
     for _ in range(2):
         assert swept(preset_file(folder, text), "-o", folder / "out") == 0
-    found = pyarrow.parquet.read_table(folder / "out" / "rows.parquet").to_pylist()
+    found = rows_of(folder / "out")
     seconds = {row["method"]: row["seconds_first_image"] for row in found}
     assert seconds == {"ours": 3.0, "path": 1.5} and len(asked) == 6
     assert {(one["spp"], one["resolution"], one["max_depth"]) for one in asked} == {(2, 8, 3)}
-    text = report.first_images_table(analysis.Results(pd.DataFrame(found), {}))
-    assert [cell.strip() for cell in text.splitlines()[-2].split("|")[2:4]] == ["3 s", "1.5 s, 2x"]
-    text = PRESET.replace("seeds = 2", 'seeds = 2\nfirst_image = 3\nclock = "processor"')
+    text = text.replace("seeds = 2", 'seeds = 2\nclock = "processor"')
     assert swept(preset_file(folder, text), "-o", folder / "out") == 0
-    found = pyarrow.parquet.read_table(folder / "out" / "rows.parquet").to_pylist()
-    assert {row["seconds_first_image"] for row in found} == {30.0, 15.0}
+    assert {row["seconds_first_image"] for row in rows_of(folder / "out")} == {30.0, 15.0}
     given = Project(folder, {"mine": REPOSITORY.scene("cornell_box")})
     with pytest.raises(CommandError, match="first_image=1 needs scene files"):
         preset_of(Path("preset"), {"first_image": 1}, given)
@@ -836,9 +777,7 @@ def test_a_first_image_without_kernel_cache():
         probes.first_image(wanted | {"file": "gone.xml"})
 
 
-def test_time_left_follows_from_work(monkeypatch, capsys):
-    """After a render of a quarter of the work in 10 s, 30 s are left, less where a limit is nearer; lines at
-    most each half a minute where there is no terminal, with the number of renders."""
+def test_time_left_follows_from_work(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("rich.console.monotonic", lambda: clock[0])
     with showing.Renders() as made, showing.Renders(limit=25) as limited:
@@ -850,17 +789,9 @@ def test_time_left_follows_from_work(monkeypatch, capsys):
         for shown in (made, limited):
             shown.end("box", 4)
         assert made.seconds_left() == 30 and limited.seconds_left() == 15
-        assert not capsys.readouterr().err
-        clock[0] = 31
-        made.end("pool", 8)
-        assert capsys.readouterr().err == "2 of 3 renders, 0:00:10 left: pool\n"
-        made.plan([12])
-        assert made.words("x").startswith("2 of 4 renders, 0:00:41 left")
 
 
 def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
-    """Of 100 seconds the missing references of two scenes take 25 each at most, and the renders what is left;
-    --reference-seconds and no limit as they say. What took longer is said."""
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool"]')
     preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
     asked = []
@@ -929,8 +860,7 @@ def test_the_table_is_tidy(tmp_path):
 
 
 @pytest.mark.parametrize(("more", "points"), [("", "sobol"), ('points = "independent"\n', "independent")])
-def test_samplers_of_rows_are_those_of_the_table(folder, job, swept, more, points):
-    making.make(job(3))
+def test_samplers_of_rows_are_those_of_the_table(folder, known, swept, more, points):
     text = PRESET.replace('type = "bdpt"\n', f'type = "bdpt"\nsampler = "multijitter"\n{more}')
     path, output = preset_file(folder, text.replace("[2, 4]", "[2]")), folder / "out"
     assert swept(path, "-o", output) == 0
@@ -943,11 +873,7 @@ def test_samplers_of_rows_are_those_of_the_table(folder, job, swept, more, point
 
 
 def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
-    """Renders of a second per sample, 2 and 4 samples, by two integrators and two seeds, each twice as long
-    where its budget compiles: 8, 16, 4 and 8 s. In 29 s all but the last are rendered, in 23 s small ones of
-    later seeds in place of the large one that does not fit; the cut ones are named with the option that has
-    time for them, and a second run with it renders them. Two seeds of the smallest budget are rendered even
-    without time: figures need pairs."""
+    """Two integrators and seeds; a budget takes twice as long where it compiles: 8, 16, 4 and 8 s."""
     preset = read_preset(preset_file(tmp_path), REPOSITORY)
     found, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
@@ -1009,10 +935,7 @@ def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
     assert made.cut == {"furnace_emission": "text"} or made.cut == {"cornell_box": "text"}
 
 
-def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, job, swept):
-    """In 0.1 s, what renders of 64 samples take as 0.064 s in the first run is known to be too long for those
-    of 256, and named with time for them."""
-    making.make(job(3))
+def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, known, swept):
     path, output = preset_file(folder, PRESET.replace("[2, 4]", "[2, 64, 6400]")), folder / "out"
     monkeypatch.setattr(sweep, "Bench", Clock)
     made = sweep.Sweep(Project(folder), read_preset(path, Project(folder)), output)
@@ -1027,8 +950,7 @@ def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, job, s
 
 
 def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
-    """A render of 0.5 s and 0.1 s per sample: of the first budget in proportion, of two by the line through
-    both; at least half of the proportion, for noise; that of a known budget is the last one."""
+    """At least half of the proportion, for noise."""
     preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
     cells = sweep.Cells(REPOSITORY, preset, preset.subjects[0])
     made = limited.Pending(cells, cells.planned(), {})
@@ -1043,8 +965,7 @@ def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
 
 
 def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
-    """Of budgets to 400 samples, 1.25 ms each of both integrators and four renders, a quarter of the limit
-    allows 4 (16 ms of the limit: the smallest, in any case), 40 (1.6 s: 320 of 5 ms) and 400 (no limit)."""
+    """1.25 ms a sample of both; a quarter of 1.6 s holds 320 renders of 5 ms."""
     text = PRESET.replace("[2, 4]", "[4, 40, 400]")
     preset = read_preset(preset_file(folder, text), REPOSITORY)
     cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
@@ -1059,8 +980,7 @@ def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch
 PER = {"ours": 1e-3, "path": 0.25e-3}
 
 
-def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, job, swept):
-    making.make(job(3))
+def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known, swept):
     path, output = preset_file(folder), folder / "out"
     monkeypatch.setattr(sweep, "Bench", Clock)
     words = path, "-o", output
