@@ -1,7 +1,6 @@
 """Renders on a cluster: two worker processes on this machine."""
 
 import json
-import math
 import os
 import signal
 import threading
@@ -17,7 +16,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning import pilot
-from mitsuba_bdpt.workers import connected, results
+from mitsuba_bdpt.workers import results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
 <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="8"/>
@@ -47,9 +46,7 @@ def test_parts_cover_the_samples_with_seeds_of_their_own():
     "name, merges", [("cornell_box", False), ("fog_lamp", False), ("smallvcm_cornell_point", True)]
 )
 def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, merges):
-    """The image is that of the same parts rendered here one after the other and joined, also with merging,
-    whose radius goes on from part to part; the pilot ran once, its decisions are in the statistics.
-    Tolerance: rounding of atomic sums and of half precision."""
+    """To the rounding of atomic sums and of half precision."""
     path, given = SCENE.with_stem(name), ["-P", "merging=true"] * merges
     assert main(arguments(workers, tmp_path / "a.exr", *given, scene=path)) == 0
     pixels, statistics = rendered.image(tmp_path / "a.exr", "RGB")
@@ -89,8 +86,6 @@ def test_parts_get_decisions_where_there_is_a_choice(properties, decided):
 
 
 def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
-    """Its seconds, the values that it lost (as the client counts them, here 7) and why it leaves strategies
-    out are those of the pilot that the client asked; with decisions by hand there are none."""
     measure = pilot.measure
     monkeypatch.setattr(pilot, "measure", lambda *a: replace(measure(*a), non_finite=7))
     assert main(arguments(workers, tmp_path / "a.exr")) == 0
@@ -131,7 +126,6 @@ def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch)
 
 
 def test_parts_are_added_in_their_order():
-    """Whatever comes first, parts are joined 0, 1, 2, …; a second copy of one is ignored."""
 
     class Text:
         def __init__(self, text):
@@ -194,12 +188,6 @@ def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
     assert "127.0.0.1:1" in capsys.readouterr().err
 
 
-def test_a_failing_part_is_named(workers):
-    failed = pytest.raises(RuntimeError, match="part 0 failed on the cluster: math domain error")
-    with connected(workers.scheduler_address) as cluster, failed:
-        list(results(cluster, math.sqrt, [(-1.0,)]))
-
-
 @pytest.mark.parametrize("come", [0, 3])
 def test_parts_that_have_come_are_kept(workers, tmp_path, monkeypatch, capsys, come):
     """An image of those that had come before, though the first of all is missing, the error, and exit status
@@ -220,8 +208,7 @@ def test_parts_that_have_come_are_kept(workers, tmp_path, monkeypatch, capsys, c
 
 
 def test_an_edited_scene_is_loaded_anew(workers, tmp_path):
-    """After an edit of the file, the next render on the same workers shows it: twice the light, twice the
-    mean (10 % for noise)."""
+    """10 % for noise."""
     scene = tmp_path / "scene.xml"
     means = []
     for radiance in ("1", "2"):

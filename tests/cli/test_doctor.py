@@ -59,14 +59,10 @@ def test_other_commands_report_the_failure_without_a_traceback():
 def test_crash_of_the_child_is_put_into_words():
     findings = doctor.render_in_child(
         "llvm_ad_rgb",
-        child(
-            -signal.SIGABRT,
-            '{"variants": ["llvm_ad_rgb"], "backends": ["LLVM"]}\n',
-            "LLVM ERROR: Cannot select\n",
-        ),
+        child(-signal.SIGABRT, '{"variants": ["llvm_ad_rgb"], "backends": ["LLVM"]}\n', "LLVM ERROR: no\n"),
     )
     assert [finding.state for finding in findings] == ["ok", "FAIL"]
-    assert "killed by SIGABRT (LLVM ERROR: Cannot select)" in findings[1].text
+    assert "killed by SIGABRT (LLVM ERROR: no)" in findings[1].text
     assert "Mend it with" in findings[1].text or "Unset" in findings[1].text
 
 
@@ -83,37 +79,27 @@ def test_an_error_of_the_child_has_its_reason(backends, text):
     assert found[-1] == doctor.Finding("FAIL", "test image", text)
 
 
-@pytest.mark.parametrize("mean", ["0.0", "NaN", "1e9"])
-def test_wrong_image_is_a_failure(mean):
-    findings = doctor.render_in_child("llvm_ad_rgb", child(0, f'{{"llvm": "23", "mean": {mean}}}'))
-    assert findings[-1].state == "FAIL" and "its mean is" in findings[-1].text
-
-
-def test_hanging_child_is_a_failure():
+def test_what_fails_is_said(monkeypatch):
     def hang(command, **kwargs):
         raise subprocess.TimeoutExpired(command, kwargs["timeout"])
 
-    (finding,) = doctor.render_in_child("llvm_ad_rgb", hang)
-    assert finding.state == "FAIL" and "not finished" in finding.text
+    monkeypatch.setattr(doctor, "PACKAGES", ("surely-not-installed",))
+    wrong = [child(0, f'{{"llvm": "23", "mean": {mean}}}') for mean in ("0.0", "NaN", "1e9")]
+    found = [doctor.render_in_child("llvm_ad_rgb", process)[-1] for process in (*wrong, hang)]
+    for finding, text in zip(
+        (*found, doctor.versions()[-1]),
+        (*["its mean is"] * 3, "not finished", "pip install surely-not-installed"),
+        strict=True,
+    ):
+        assert finding.state == "FAIL" and text in finding.text
 
 
 def test_which_variants_can_render_here():
     installed = ["scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral_polarized", "cuda_ad_rgb", "metal_ad_rgb"]
     finding = doctor.variants(installed, ["LLVM"])
-    assert finding.state == "ok" and finding.text.startswith(
-        "here: llvm_ad_rgb, llvm_ad_spectral_polarized; not: scalar_rgb ("
-    )
-    assert "cuda_ad_rgb (no CUDA device or driver was found)" in finding.text
-    assert doctor.variants(installed, ["LLVM", "CUDA"]).text.startswith(
-        "here: llvm_ad_rgb, llvm_ad_spectral_polarized, cuda_ad_rgb; not: "
-    )
+    assert finding.state == "ok" and "here: llvm_ad_rgb, llvm_ad_spectral_polarized; not: " in finding.text
+    assert "spectral_polarized, cuda_ad_rgb; not: " in doctor.variants(installed, ["LLVM", "CUDA"]).text
     assert doctor.variants(["llvm_ad_rgb"], []).state == "note"
-
-
-def test_missing_package_is_named_with_its_remedy(monkeypatch):
-    monkeypatch.setattr(doctor, "PACKAGES", ("surely-not-installed",))
-    finding = doctor.versions()[-1]
-    assert finding.state == "FAIL" and "pip install surely-not-installed" in finding.text
 
 
 def test_unwritable_kernel_cache_is_a_note(monkeypatch, tmp_path):

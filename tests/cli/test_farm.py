@@ -35,8 +35,6 @@ def folder(tmp_path, monkeypatch):
 
 
 def test_sigterm_ends_as_ctrl_c_does():
-    """What is done is written, an image and a checkpoint, and the exit status is 128 + 15; a second signal
-    changes nothing."""
     command = [sys.executable, "-m", "mitsuba_bdpt", *SMALL, "--spp", "4000000", "--checkpoint", "600"]
     process = subprocess.Popen(
         [*command, "-o", "ended.exr", "--preview", "0"],
@@ -58,19 +56,11 @@ def test_sigterm_ends_as_ctrl_c_does():
 
 
 def test_size_and_crop():
-    """The image's size and its proportions are those asked for; a crop window is that part of the whole
-    image, by other points: of all parts of that size it is nearest to the one that was asked for, by far
-    (measured: 0.03 there, 0.88 one pixel beside it)."""
-    arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "64"]
-    assert main([*arguments, "-o", "whole.exr"]) == 0
-    whole = rendered.image("whole.exr", "RGB")[0]
-    assert whole.shape == (16, 24, 3)
-    assert (
-        main(["render", str(SCENE), "--size", "24x16", "--crop", "4,2,10,8", "--spp", "64", "-o", "part.exr"])
-        == 0
-    )
-    part = rendered.image("part.exr", "RGB")[0]
-    assert part.shape == (8, 10, 3)
+    """The window is that part of the image: measured 0.03 apart, 0.88 one pixel beside it."""
+    arguments = ["render", str(SCENE), "--size", "24x16", "--spp", "64", "-o"]
+    assert main([*arguments, "whole.exr"]) == main([*arguments, "part.exr", "--crop", "4,2,10,8"]) == 0
+    whole, part = (rendered.image(f"{name}.exr", "RGB")[0] for name in ("whole", "part"))
+    assert whole.shape == (16, 24, 3) and part.shape == (8, 10, 3)
     off = {
         (x, y): np.sqrt(np.mean((part - whole[y : y + 8, x : x + 10]) ** 2))
         for x in range(15)
@@ -90,16 +80,13 @@ LAMP = (
 
 
 def test_size_leaves_meters_alone(capsys):
+    pixel = PIXEL.replace('type="hdrfilm"', 'type="hdrfilm" id="pixel"')
     Path("meters.xml").write_text(
-        f'<scene version="3.0.0">{LAMP}<film type="hdrfilm" id="pixel"><integer name="width" value="1"/>'
-        '<integer name="height" value="1"/><rfilter type="box"/></film>'
-        '<sensor type="perspective"><film type="hdrfilm"/></sensor>'
+        f'<scene version="3.0.0">{LAMP}{pixel}<sensor type="perspective"><film type="hdrfilm"/></sensor>'
         '<sensor type="radiancemeter"><ref id="pixel"/></sensor>'
         f'<shape type="rectangle"><sensor type="irradiancemeter">{PIXEL}</sensor></shape></scene>'
     )
-    with open("meters.xml") as file:
-        scene = mi.load_string(file.read())
-    kinds = [sensor.class_name() for sensor in scene.sensors()]
+    kinds = [sensor.class_name() for sensor in mi.load_file("meters.xml").sensors()]
     for index, kind in enumerate(kinds):
         command = ["render", "meters.xml", "--sensor", str(index), "--spp", "1", "-o", f"{kind}.exr"]
         camera = kind == "PerspectiveCamera"
@@ -150,28 +137,20 @@ def test_sizes_that_are_refused(capsys):
         '<integer name="crop_width" value="8"/><integer name="crop_height" value="8"/>'
         '<rfilter type="box"/></film></sensor></scene>'
     )
+    size = "--size", "16x16"
     for arguments, words in (
-        (
-            [str(SCENE), "--size", "16x16", "--crop", "8,8,9,8"],
-            "crop=8,8,9,8 is not within the image of 16x16",
-        ),
-        (["cropped.xml", "--size", "16x16"], "has a film with a crop window"[6:]),
+        ([str(SCENE), *size, "--crop", "8,8,9,8"], "crop=8,8,9,8 is not within the image of 16x16"),
+        (["cropped.xml", *size], "film with a crop window"),
     ):
         assert main(["render", *arguments]) == 2
         assert words in capsys.readouterr().err
-    assert (
-        main(["render", "cropped.xml", "--size", "16x16", "--crop", "0,0,4,4", "--spp", "1", "-o", "a.exr"])
-        == 0
-    )
+    assert main(["render", "cropped.xml", *size, "--crop", "0,0,4,4", "--spp", "1", "-o", "a.exr"]) == 0
     assert rendered.image("a.exr", "RGB")[0].shape == (4, 4, 3)
 
 
-def test_ranges_of_frames():
+def test_frames_have_numbers_and_seeds_of_their_own():
     assert values.frames("3") == [3] and values.frames("0-3") == [0, 1, 2, 3]
     assert values.frames("0-10:5,7") == [0, 5, 10, 7]
-
-
-def test_frames_have_seeds_of_their_own():
     command = ["render", "a.xml", "--frames", "0-3", "--seed", str(2**32 - 2)]
     jobs = render.jobs_of(build_parser().parse_args(command))
     assert [job.seed for job in jobs] == [2**32 - 2, 2**32 - 1, 0, 1]
@@ -196,11 +175,9 @@ def test_frames_are_sensors(capsys):
     sensors(3)
     assert main(["render", "frames.xml", "--frames", "0-2:2", "--spp", "2", "-o", "out/shot.exr"]) == 0
     assert sorted(p.name for p in Path("out").glob("*.exr")) == ["shot.0000.exr", "shot.0002.exr"]
-    for number in (0, 2):
-        # Of few samples: a pixel may have a splat of its own.
-        assert (
-            abs(np.median(rendered.image(f"out/shot.{number:04d}.exr", "RGB")[0]) / (number + 1) - 1) < 0.02
-        )
+    for number in (0, 2):  # the median, for of few samples a pixel may have a splat of its own
+        pixels = rendered.image(f"out/shot.{number:04d}.exr", "RGB")[0]
+        assert np.median(pixels) == pytest.approx(number + 1, rel=0.02)
     assert capsys.readouterr().out.count("\n") == 2
     assert main(["render", "frames.xml", "-s", "2", "--seed", "2", "--spp", "2", "-o", "one.exr"]) == 0
     alone, frame = rendered.image("one.exr", "RGB")[0], rendered.image("out/shot.0002.exr", "RGB")[0]
@@ -320,21 +297,10 @@ def test_threads_and_log(capfd):
     assert re.search(logged, capfd.readouterr().err, re.MULTILINE)
 
 
-WARNED = """<scene version="3.0.0">
-    <emitter type="point"><point name="position" x="0" y="0" z="1"/></emitter>
-    <shape type="rectangle">
-        <sensor type="irradiancemeter"><film type="hdrfilm">
-            <integer name="width" value="1"/><integer name="height" value="1"/><rfilter type="box"/>
-        </film></sensor>
-    </shape>
-</scene>"""
-
-
-def test_a_warning_is_one_line_on_standard_error(tmp_path, capfd):
-    scene = tmp_path / "scene.xml"
-    scene.write_text(WARNED)
-    output = str(tmp_path / "a.exr")
-    assert main(["render", str(scene), "--spp", "1", "-P", "light_paths=0", "-o", output]) == 0
+def test_a_warning_is_one_line_on_standard_error(capfd):
+    meter = f'<shape type="rectangle"><sensor type="irradiancemeter">{PIXEL}</sensor></shape>'
+    Path("scene.xml").write_text(f'<scene version="3.0.0">{LAMP}{meter}</scene>')
+    assert main(["render", "scene.xml", "--spp", "1", "-P", "light_paths=0", "-o", "a.exr"]) == 0
     shown = capfd.readouterr()
     warnings = [line for line in shown.err.splitlines() if "bdpt: " in line]
     assert warnings and all(line.startswith("warning: bdpt: ") for line in warnings)

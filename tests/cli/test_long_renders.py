@@ -44,9 +44,7 @@ main(sys.argv[1:])"""
 
 
 def test_a_killed_render_is_resumed():
-    """A render that got SIGKILL between its checkpoints goes on with --resume and ends with the image and the
-    counts of the uninterrupted one; the checkpoint is removed. Tolerance: the rounding of atomic sums, and
-    half precision in the file."""
+    """To the rounding of atomic sums, and half precision in the file."""
     spp = ["--spp", "256"]
     assert main([*ARGUMENTS, *spp, "-o", "whole.exr"]) == 0
     expected, whole = rendered.image("whole.exr")
@@ -267,16 +265,6 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
     assert "Traceback" not in error
 
 
-def test_until_an_error(capsys):
-    """The render ends at 2^n * 32 spp with an estimate below what is asked for, and the image has the layers
-    of the variance."""
-    assert main([*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr"]) == 0
-    channels = OpenEXR.File("a.exr", separate_channels=True).channels()
-    assert "variance.R" in channels
-    statistics = rendered.image("a.exr")[1]
-    assert statistics["error"] <= 0.02 and statistics["spp"] in (32, 64, 128, 256, 512)
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -300,7 +288,11 @@ def test_contradictions_are_refused(arguments, words, capsys):
     assert words in capsys.readouterr().err and not Path("a.exr").exists()
 
 
-def test_an_error_that_a_parameter_asks_for_ends_a_render_too(capsys):
+def test_an_error_that_is_asked_for_ends_a_render(capsys):
+    assert main([*ARGUMENTS, "--target-error", "0.02", "-o", "a.exr"]) == 0
+    assert "variance.R" in OpenEXR.File("a.exr", separate_channels=True).channels()
+    statistics = rendered.image("a.exr")[1]
+    assert statistics["error"] <= 0.02 and statistics["spp"] in (32, 64, 128, 256, 512)
     asked = [*ARGUMENTS, "--checkpoint", "60", "-P", "layers=variance", "-o", "a.exr"]
     assert main([*asked, "--spp", "1024", "-P", "target_error=0.5"]) == 0
     assert not Path("a.checkpoint.npz").exists() and "asked for" not in capsys.readouterr().out

@@ -441,7 +441,7 @@ class Clock(sweep.Bench):
 
 
 def test_equal_time_by_a_clock(folder, monkeypatch, known, swept):
-    """Stratified samplers get the nearest power of two: of 8, 12 and 28 8, 16, and 32, made as 5 x 7."""
+    """Stratified samplers get the nearest power of two: of 28 it is 32, of which multijitter makes 5 x 7."""
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
     text += 'sampler = "multijitter"\nmatch = "seconds"\n'
     path, output = preset_file(folder, text), folder / "out"
@@ -479,7 +479,6 @@ def test_a_full_disk_leaves_the_old_image(folder):
 
 
 def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
-    """Status 1 if one is not good enough or fails, the others are made; bad numbers are refused."""
 
     def run(*arguments):
         return making.run(build_parser().parse_args(["reference", "--project", str(folder), *arguments]))
@@ -516,10 +515,8 @@ def test_a_failing_cell_does_not_cost_the_others(folder, capsys, known, monkeypa
     words = path, "-o", folder / "out"
     assert swept(*words) == 1
     out = capsys.readouterr().out
-    assert (
-        len(re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: layers=variance", out)) == 4
-        and ": 4 rows" in out
-    )
+    failed = re.findall(r"failed: cornell_box, \d spp, seed \d, bad: bdpt: layers=variance", out)
+    assert len(failed) == 4 and ": 4 rows" in out
 
     def interrupted(bench, cell):
         raise KeyboardInterrupt
