@@ -201,11 +201,11 @@ def test_windows_of_halves_have_more_samples():
     for value in (1.0, 3.0):
         halves.add([np.full((4, 4, 3), value)] * 2)
     halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
-    image, difference = halves.mean()
+    made = halves.reference({})
     expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
     expected[1:3, 0:1], half[1:3, 0:1] = (2 * 2 + 4 * 7) / 6, (4 * 5 - 4 * 9) / 6 / 2
-    np.testing.assert_allclose(image, expected)
-    np.testing.assert_allclose(difference, half)
+    np.testing.assert_allclose(made.image, expected)
+    np.testing.assert_allclose(made.difference, half)
     assert halves.rounds == 3 and len(halves.columns) == 4
     assert halves.counts.min() == 2 and halves.counts.max() == 6
 

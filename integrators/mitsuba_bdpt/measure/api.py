@@ -46,13 +46,11 @@ def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Ref
 
     ``options``: those of `options.MakeReference`. Returns the reference with its ``image`` and own ``error``.
     """
-    from .making import Job, fitted, make
+    from .making import make, requested
 
     asked = _options(available.MakeReference, options)
-    limits = asked.max_depth, asked.spp, asked.seconds, asked.by
     with _measured([scene], project) as (found, (name,)):
-        measured = found.scene(name)
-        return make(Job(found, measured, fitted(measured, asked.resolution), *limits))[0]
+        return make(requested(found, name, asked))[0]
 
 
 def compare_integrators(

@@ -296,16 +296,17 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
     return crops.Block(scene, tuple(columns), kept.image)
 
 
+def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> None:
+    if unknown := [name for name in given if name not in known]:
+        raise CommandError(f"--{option} {unknown[0]}: not in the sweep, which has {', '.join(known)}")
+
+
 def _among(results: Results, names: Sequence[str] | None) -> Results:
     """Return the results of the first integrator and of these others; None: all that are compared."""
     methods = results.rows["method"]
     if names is None:
         return replace(results, rows=results.rows[~methods.isin(results.aside)])
-    for name in names:
-        if name not in results.methods:
-            raise CommandError(
-                f"--integrators {name}: not in the sweep, which has {', '.join(results.methods)}"
-            )
+    _check_names("integrators", names, results.methods)
     return replace(results, rows=results.rows[methods.isin([results.methods[0], *names])], aside=())
 
 
@@ -321,16 +322,12 @@ def run(options: Namespace) -> int:
     results, made, _ = load(project, folder)
     results = replace(_among(results, options.integrators), compared=options.spp)
     _ = results.deciding  # raises for a budget that is not there
-    for scene in options.scenes or ():
-        if scene not in results.scenes:
-            raise CommandError(f"--scenes {scene}: not in the sweep, which has {', '.join(results.scenes)}")
-    if options.plot == "efficiency" and not results.rivals:
-        raise CommandError(f"{folder} has no other integrator than {results.methods[0]} to compare with")
+    _check_names("scenes", options.scenes or (), results.scenes)
     scenes = options.scenes or results.scenes
     if options.plot == "efficiency" and not results.has_efficiency(scenes):
         raise CommandError(
-            f"{folder}: no efficiency can be computed, which takes two renders of each integrator; set "
-            "seeds = 2 or more in the preset and sweep again, which renders the others"
+            f"{folder}: no efficiency can be computed, which takes a rival of {results.methods[0]} and two "
+            "renders of each integrator; set seeds = 2 or more in the preset, and sweep again"
         )
     if options.plot == "crops":
         blocks = [cropped(folder, results, made[scene], scene) for scene in scenes]

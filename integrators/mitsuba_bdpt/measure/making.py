@@ -34,7 +34,7 @@ from ..run.rendering import raise_interrupt
 from .agreement import FEWEST_RUNS, TILES, Means, tile_columns
 from .metrics import TRIM, rel_mse
 from .models import Radiance, Recipe, checked
-from .options import REFERENCE_SECONDS, VARIANT
+from .options import REFERENCE_SECONDS, VARIANT, MakeReference
 from .project import Project
 from .reference import (
     Reference,
@@ -145,6 +145,13 @@ class Job:
             return load_reference(self.project, self.scene, self.resolution, self.depth)
         except ValueError:
             return None
+
+
+def requested(project: Project, name: str, options: MakeReference | Namespace) -> Job:
+    """Return the job of a scene, a file or a name, by the ``options``."""
+    scene = project.scene(name)
+    limits = options.max_depth, options.spp, options.seconds, options.by
+    return Job(project, scene, fitted(scene, options.resolution), *limits)
 
 
 def obtained(job: Job) -> Reference:
@@ -285,14 +292,9 @@ class Halves:
             self.columns += [tile_columns(image) for image in images]
         self.rounds += 1
 
-    def mean(self):
-        """Return the image, and half the difference of the halves (a sample of its error)."""
-        a, b = self.sums / self.counts
-        return (a + b) / 2, (a - b) / 2
-
     def reference(self, provenance: dict) -> Reference:
-        image, difference = self.mean()
-        return Reference(image, difference, self.means(), provenance)
+        a, b = self.sums / self.counts
+        return Reference((a + b) / 2, (a - b) / 2, self.means(), provenance)
 
 
 class AccuracyTarget:
@@ -538,16 +540,7 @@ def run(options: Namespace) -> int:
     mi.set_variant(VARIANT)
     for name in names:
         try:
-            scene = project.scene(name)
-            job = Job(
-                project,
-                scene,
-                fitted(scene, options.resolution),
-                options.max_depth,
-                options.spp,
-                options.seconds,
-                options.by,
-            )
+            job = requested(project, name, options)
             made, reached = make(job)
         except (ValueError, RuntimeError, NotImplementedError) as error:  # continue with the other scenes
             raise_interrupt(error)
