@@ -126,7 +126,6 @@ def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch)
 
 
 def test_parts_are_added_in_their_order():
-
     class Text:
         def __init__(self, text):
             self.text = text

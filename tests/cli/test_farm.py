@@ -371,7 +371,6 @@ def test_a_signal_ends_a_load_at_once(number):
 
 @pytest.mark.parametrize("command", ["render", "explain"])
 def test_a_signal_while_an_import_loads_is_answered_after_it(monkeypatch, capsys, command):
-
     def load(options):
         try:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -398,7 +397,6 @@ def test_a_signal_while_the_image_is_written_changes_nothing(monkeypatch):
 
 
 def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, capsys):
-
     def full(*arguments):
         raise OSError(28, "No space left on device", "a.exr")
 

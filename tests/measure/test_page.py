@@ -158,7 +158,6 @@ def test_images_are_half_precision():
 
 
 def test_the_page_holds_the_report():
-
     def draw(folder):
         (folder / "seconds.png").write_bytes(b"a plot")
 

@@ -403,29 +403,26 @@ def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, known, swept):
 
 def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, known, swept):
     monkeypatch.setattr("mitsuba_bdpt.measure.preset.software", lambda: {"mitsuba-bdpt": "other"})
-    there = ["-o", folder / "out", "--scheduler", workers.scheduler_address]
     with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
-        swept(preset_file(folder), *there)
+        swept(preset_file(folder), "-o", folder / "out", "--scheduler", workers.scheduler_address)
 
 
 def test_one_scene_of_a_preset_anew(folder, job, swept, known):
     making.make(job(3, "furnace_emission"))
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
-    path, output = preset_file(folder, text), folder / "out"
-    words = path, "-o", output
+    output = folder / "out"
+    words = preset_file(folder, text), "-o", output
     assert swept(*words) == 0
     before = rows_of(output)
     for file in (output / "cells").iterdir():
         file.unlink()
-    words = *words[:3], "--scenes", "furnace_emission"
-    assert swept(*words) == 0
+    assert swept(*words, "--scenes", "furnace_emission") == 0
     after = rows_of(output)
     assert [row["key"] for row in after] == [row["key"] for row in before]
     kept = [row["scene"] == "cornell_box" for row in before]
     assert [a == b for a, b in zip(after, before, strict=True)] == kept and not all(kept) and any(kept)
-    words = *words[:3], "--scenes", "pool"
     with pytest.raises(ValueError, match="--scenes pool: not in the preset, which has cornell_box, furn"):
-        swept(*words)
+        swept(*words, "--scenes", "pool")
 
 
 class Clock(sweep.Bench):
@@ -444,11 +441,10 @@ def test_equal_time_by_a_clock(folder, monkeypatch, known, swept):
     """Stratified samplers get the nearest power of two: of 28 it is 32, of which multijitter makes 5 x 7."""
     text = PRESET.replace("[2, 4]", "[2, 3, 7]") + '[[integrator]]\nname = "strata"\ntype = "path"\n'
     text += 'sampler = "multijitter"\nmatch = "seconds"\n'
-    path, output = preset_file(folder, text), folder / "out"
+    output = folder / "out"
     monkeypatch.setattr(Clock, "calls", [])
     monkeypatch.setattr(sweep, "Bench", Clock)
-    words = path, "-o", output
-    assert swept(*words) == 0
+    assert swept(preset_file(folder, text), "-o", output) == 0
     table = rows_of(output)
     spp = {(r["method"], r["budget"]): r["spp"] for r in table}
     assert [spp["ours", b] for b in (2, 3, 7)] == [2, 3, 7]
@@ -479,7 +475,6 @@ def test_a_full_disk_leaves_the_old_image(folder):
 
 
 def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
-
     def run(*arguments):
         return making.run(build_parser().parse_args(["reference", "--project", str(folder), *arguments]))
 
@@ -984,7 +979,7 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
     assert swept(*words, "--seconds", "1e-9") == 0
     assert "cut for lack of time: cornell_box, 4 of 8 renders: 4 at 4 spp" in capsys.readouterr().out
     text = report.Report.of(Project(folder), output).text()
-    assert "**Renders are missing**, cut for lack of time: `cornell_box`, 4 of 8 renders: 4 at 4 spp." in text
+    assert "`cornell_box`, 4 of 8 renders: 4 at 4 spp." in text
     assert f"mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds " in text
     missing = missing_of(output)
     keep_missing(output, ["another"], {}, "")
@@ -993,10 +988,7 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
     assert "warning" not in capsys.readouterr().out
     path = preset_file(folder, PRESET.replace('type = "path"', 'type = "ptracer"'))
     assert swept(path, "-o", output) == 0
-    assert (
-        "4 rows are not of this preset, and no longer in the tables: cornell_box by path. Their renders "
-        in (capsys.readouterr().out)
-    )
+    assert "4 rows are not of this preset, and no longer in the tables" in capsys.readouterr().out
 
 
 def keys(folder, text=PRESET):
