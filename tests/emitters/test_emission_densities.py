@@ -42,10 +42,7 @@ def emission(name, **others):
 
 
 def sampled(emitters, time=0.0):
-    u = [mi.Float(v) for v in numbers(4)]
-    like = dr.zeros(mi.Interaction3f)  # time and wavelengths
-    like.time = mi.Float(time)
-    return emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    return parts.sampled_emission(emitters, COUNT, time=time)[0]
 
 
 def test_no_emitter_is_left_out():

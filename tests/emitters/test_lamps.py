@@ -14,7 +14,7 @@ import pytest
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import mitsubas_choices, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
-from scene_parts import T, grey, perspective
+from scene_parts import T, grey, perspective, sampled_emission
 from scipy import stats
 from test_endpoints import egg_with_coordinates, own_area_class
 
@@ -159,9 +159,7 @@ def test_a_sheared_disk_is_found_where_it_is_sampled():
     lamp = {"type": "disk", "emitter": {"type": "area", "radiance": 5.0}}
     scene = gap(lamp=lamp | {"to_world": T().translate([0, 1.5, 0]) @ T(matrix)})
     emitters = Emitters(scene)
-    u = [mi.Float(v) for v in np.random.default_rng(11).random((4, 1000), dtype=np.float32)]
-    like = dr.zeros(mi.Interaction3f)
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    e, _ = sampled_emission(emitters, 1000)
     si = scene.ray_intersect(mi.Ray3f(e.si.p + 0.01 * e.anchor.n, mi.Vector3f(-e.anchor.n)))
     np.testing.assert_allclose(np.array(si.p), np.array(e.si.p), atol=1e-5)
     area = np.pi * np.linalg.norm(np.cross(matrix[:3, 0], matrix[:3, 1]))
@@ -204,12 +202,10 @@ def test_normals_of_fine_meshes(rows):
     scene = gap(lamp=ball_of_triangles((0, 1.5, 0), 0.5, rows, rows))
     assert rows < 128 or scene.emitters()[0].get_shape().face_count() > 30_000
     emitters = Emitters(scene)
-    u = [mi.Float(v) for v in np.random.default_rng(11).random((4, count), dtype=np.float32)]
-    like = dr.zeros(mi.Interaction3f)
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    e, u = sampled_emission(emitters, count)
     at = dr.zeros(mi.SurfaceInteraction3f, count)
     at.p = mi.Point3f(0.3, 0, 0.2)
-    direct = emitters.sample_direct(at, mi.Point2f(u[0], u[1]), mi.Bool(True))
+    direct = emitters.sample_direct(at, mi.Point2f(u[:2]), mi.Bool(True))
     limit = 1.1 * np.hypot(np.pi / rows, 2 * np.pi / rows) / 2 + 1e-3
     for anchor in (e.anchor, direct.anchor):
         away = dr.normalize(anchor.p - mi.Point3f(0, 1.5, 0))
@@ -237,12 +233,10 @@ def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
     lamp |= {"to_world": PLACED[placed], "emitter": {"type": "area", "radiance": 1.0}}
     scene = mi.load_dict({"type": "scene", "lamp": lamp})
     emitters = Emitters(scene)
-    u = [mi.Float(v) for v in np.random.default_rng(3).random((4, count), dtype=np.float32)]
-    like = dr.zeros(mi.Interaction3f)
-    e = emitters.sample_emission(mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]), like, mi.Bool(True))
+    e, u = sampled_emission(emitters, count, seed=3)
     at = dr.zeros(mi.SurfaceInteraction3f, count)
     at.p = mi.Point3f(3, 4, -5)
-    direct = emitters.sample_direct(at, mi.Point2f(u[0], u[1]), mi.Bool(True))
+    direct = emitters.sample_direct(at, mi.Point2f(u[:2]), mi.Bool(True))
     for anchor in (e.anchor, direct.anchor):
         si = scene.ray_intersect(mi.Ray3f(anchor.p + 1e-3 * anchor.n, -mi.Vector3f(anchor.n), 2e-3, 0, []))
         same = np.array(si.is_valid() & (dr.squared_norm(si.n - anchor.n) < 1e-3))

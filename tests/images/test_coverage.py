@@ -17,6 +17,7 @@ import pytest
 import scene_parts as parts
 import welch as st
 from mitsuba_bdpt.host.jit import evaluated_mode
+from test_known_answers import LAMPS_ABOVE, UPWARDS_METER, irradiance_above
 
 import scenes
 
@@ -235,42 +236,6 @@ def beam(at, size):
     return scenes.square(at, scenes.DOWNWARDS, size, parts.grey(0.0), emitter=DIRECTIONAL_AREA)
 
 
-RADIANCE = np.array([2.0, 3.0, 4.0]) @ CHANNELS
-
-
-def beam_scene(sensor, half=0.5, height=1.5):
-    """A lamp that shines straight down on a floor of reflectance 0.6."""
-    floor = scenes.floor(0, 2, parts.grey(0.6))
-    return scenes.load(sensor=sensor, floor=floor, lamp=beam((0, height, 0), half))
-
-
-@pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
-def test_directionalarea_lights_what_is_below(kind):
-    """`path` sees nothing of it, which only light subpaths find. Of radiance L it has the power L A
-    (Mitsuba's convention), so that the floor's radiance is 0.6 L / pi in every pixel of a view of the lit
-    square."""
-    look = T().look_at([1.5, 1, 0], [0, 0, 0], [0, 1, 0])
-    sensor = {
-        "perspective": lambda: parts.perspective((1.5, 1, 0), (0, 0, 0), fov=12, size=8),
-        "thinlens": lambda: parts.thinlens(0.05, 1.8, origin=(1.5, 1, 0), target=(0, 0, 0), fov=12, size=8),
-        "orthographic": lambda: parts.sensor("orthographic", {"to_world": look.scale([0.2, 0.2, 1])}, size=8),
-    }[kind]()
-    images = renders(beam_scene(sensor), bdpt(max_depth=2), 4 * SAMPLES, 0)
-    precise(tiles(images), 0.01, kind)
-    assert_agree([st.compare_known(tiles(images), 0.6 / np.pi * RADIANCE, kind)])
-
-
-def test_directionalarea_seen_from_afar():
-    """The mean radiance over the disk that covers the scene's bounding sphere of radius R: the lit square's
-    radiance times its share of the disk, A cos / (pi R^2)."""
-    direction = np.array([-1.0, -1.0, 0.0]) / np.sqrt(2)
-    scene = beam_scene(parts.distant(direction=direction.tolist()))
-    images = renders(scene, bdpt(max_depth=2), SAMPLES, 0)
-    radius = scene.bbox().bounding_sphere().radius * (1 + 1500 * 2.0**-24)  # Mitsuba's RayEpsilon
-    known = 0.6 / np.pi * RADIANCE * abs(direction[1]) / (np.pi * radius**2)
-    assert_agree([st.compare_known(tiles(images), known, "distant")])
-
-
 def test_directionalarea_by_inner_connections():
     """(2,2) and (3,1) make the same paths, and nothing else checks them with such a lamp."""
     method = bdpt(layers="strategies")
@@ -278,68 +243,6 @@ def test_directionalarea_by_inner_connections():
     inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
     precise(inner, 0.02, "inner")
     assert_agree([paired(inner, splat, "(2,2) against (3,1)")])
-
-
-# A meter of half-width 0.4 that faces up, and lamps above it.
-UPWARDS = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(0.4)}
-DOWN = T().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1])
-
-
-def above(emitter):
-    return scenes.square((0.2, 1, 0), scenes.DOWNWARDS, 0.7, parts.grey(0.0), emitter=emitter)
-
-
-SPOT = {"type": "spot", "intensity": 3.0, "cutoff_angle": 40, "beam_width": 39.9, "to_world": DOWN}
-LAMPS_ABOVE = {
-    "rectangle": lambda: above(scenes.area(2.0)),
-    "point": lambda: {"type": "point", "position": [0.2, 1, 0], "intensity": 3.0},
-    "spot": lambda: SPOT,
-    "projector": lambda: {"type": "projector", "irradiance": 1.0, "fov": 60, "to_world": DOWN},
-    "directional": lambda: {"type": "directional", "direction": [0.6, -0.8, 0], "irradiance": 3.0},
-    "constant": lambda: {"type": "constant", "radiance": 0.7},
-    "directionalarea": lambda: above({"type": "directionalarea", "radiance": 2.0}),
-}
-
-
-def irradiance_above(lamp):
-    """Mean irradiance of the meter under a lamp of `LAMPS_ABOVE`: integrals over grids of midpoints."""
-    middle = (np.arange(40) + 0.5) / 20 - 1
-    x, z = (0.4 * v for v in np.meshgrid(middle, middle))
-    if lamp == "constant":
-        return 0.7 * np.pi
-    if lamp == "directional":
-        return 3.0 * 0.8
-    if lamp == "directionalarea":
-        return 2.0  # all of the meter is below the lamp
-    if lamp == "rectangle":
-        u, v = (0.7 * v for v in np.meshgrid(middle, middle))
-        to = [a[..., None, None] - b for a, b in ((x, 0.2 + u), (z, v))]
-        dist2 = to[0] ** 2 + to[1] ** 2 + 1
-        return 2.0 * np.mean(1 / dist2**2) * 1.4**2
-    dist2 = (x - 0.2) ** 2 + z**2 + 1
-    intensity = 3.0
-    if lamp == "projector":
-        axis = np.array([-0.2, -1, 0]) / np.hypot(0.2, 1)
-        cos = ((x - 0.2) * axis[0] - axis[1]) / np.sqrt(dist2)
-        intensity = np.pi / cos**3
-    return np.mean(intensity / dist2**1.5)
-
-
-@pytest.mark.parametrize("lamp", LAMPS_ABOVE)
-def test_meter_reads_the_known_irradiance(lamp):
-    """What a sensor with area sees of a lamp directly has strategies of its own, (0,2), (1,1) and (2,0), and
-    `path` misses all light of delta emitters here."""
-    scene = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS), "lamp": LAMPS_ABOVE[lamp]()})
-    method = bdpt(max_depth=1, layers="strategies")
-    images = renders(scene, method, SAMPLES, 0)
-    known = irradiance_above(lamp) * CHANNELS.sum()
-    found = [st.compare_known(tiles(images), known, lamp)]
-    for s in range(3):
-        if parts.takes_part(lamp, "irradiancemeter", s, 2 - s):
-            estimate = layer(images, method, "unweighted", s, 2 - s)
-            precise(estimate, 0.02, f"({s},{2 - s})")
-            found.append(st.compare_known(estimate, known, f"{lamp} ({s},{2 - s})"))
-    assert_agree(found)
 
 
 def meters_under_a_point(width, **others):
@@ -351,7 +254,7 @@ def meters_under_a_point(width, **others):
 
     film = parts.film(size=1) | {"width": width, "height": 1}
     batch = {"type": "batch", "left": plate(-0.5, 0.2), "right": plate(0.3, 0.4), "film": film}
-    scene = {"type": "scene", "sensor": batch, "lamp": LAMPS_ABOVE["point"]()} | others
+    scene = {"type": "scene", "sensor": batch, "lamp": LAMPS_ABOVE["point"][0]()} | others
     return mi.load_dict(scene, optimize=False)  # else Mitsuba makes one meter of equal ones
 
 
@@ -373,7 +276,7 @@ def test_batch_of_meters_reads_the_known_irradiance(width):
 
 def test_strategies_of_a_batch_of_meters_agree():
     """Meters side by side share the densities of one; a wrong one would show in the weights."""
-    lamp = LAMPS_ABOVE["rectangle"]()
+    lamp = LAMPS_ABOVE["rectangle"][0]()
     mirror = {"type": "rectangle", "to_world": T().translate([0, 0, -1]), "bsdf": {"type": "conductor"}}
     floor = scenes.floor(-0.2, 3)
     scene = meters_under_a_point(2, lamp=lamp, mirror=mirror, floor=floor)
@@ -385,38 +288,13 @@ def test_strategies_of_a_batch_of_meters_agree():
 def test_meter_of_another_scene():
     """No light subpath arrives at the shape of a meter from elsewhere; weights that count with t = 0 lose its
     part."""
-    scene = mi.load_dict({"type": "scene", "lamp": LAMPS_ABOVE["rectangle"]()})
-    elsewhere = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS)})
+    scene = mi.load_dict({"type": "scene", "lamp": LAMPS_ABOVE["rectangle"][0]()})
+    elsewhere = mi.load_dict({"type": "scene", "sensor": parts.meter(UPWARDS_METER)})
     method, sensor = bdpt(max_depth=1), elsewhere.sensors()[0]
     images = [np.array(method.render(scene, sensor, seed=i, spp=SAMPLES_OF_A_PIXEL)) for i in range(SEEDS)]
     values = tiles(np.stack(images).astype(np.float64))
     precise(values, 0.01, "meter")
     assert_agree([st.compare_known(values, irradiance_above("rectangle") * CHANNELS.sum(), "meter")])
-
-
-def test_lens_sees_a_point():
-    """A point light in front of an open lens is a disk on the film, which only (1,1) and (2,0) make; `path`
-    misses it. The mean over the lens of I / d^2 times the density of directions, 1 / (A cos^3), A being the
-    film's area at distance 1."""
-    sensor = parts.thinlens(0.4, 3.0, origin=(0, 0, 0), target=(0, 0, 1), fov=50, size=8)
-    lamp = {"type": "point", "position": [0.1, 0.05, 1.5], "intensity": 2.0}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "lamp": lamp})
-    method = bdpt(max_depth=1, layers="strategies")
-    images = renders(scene, method, 16 * SAMPLES, 0)
-    r, phi = np.meshgrid(0.4 * np.sqrt((np.arange(200) + 0.5) / 200), 2 * np.pi * np.arange(200) / 200)
-    dist2 = (0.1 - r * np.cos(phi)) ** 2 + (0.05 - r * np.sin(phi)) ** 2 + 1.5**2
-    cos = 1.5 / np.sqrt(dist2)
-    known = np.mean(2.0 / dist2 / (4 * np.tan(np.deg2rad(25)) ** 2 * cos**3)) * CHANNELS.sum()
-    found = []
-    for name, estimate in (
-        ("image", tiles(images)),
-        ("(1,1)", layer(images, method, "unweighted", 1, 1)),
-        ("(2,0)", layer(images, method, "unweighted", 2, 0)),
-    ):
-        whole = estimate.mean(1, keepdims=True)
-        precise(whole, 0.02, name)
-        found.append(st.compare_known(whole, known, name))
-    assert_agree(found)
 
 
 # -- the page ---------------------------------------------------------------------------------

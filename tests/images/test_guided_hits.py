@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import internals
 import mitsuba as mi
 import numpy as np
 import pytest
-import welch as st
 from mitsuba_bdpt.planning import choice, pilot, unsampled_light
 from mitsuba_bdpt.planning.configuration import CANDIDATES
 from mitsuba_bdpt.planning.moments import FINE, GROUPS, GuidableLight, Moments
@@ -21,10 +19,8 @@ from mitsuba_bdpt.transport.photons.photon_guide import Guide
 from mitsuba_bdpt.transport.plan import GUIDED_SAMPLES
 from sds_scenes import (
     ASIDE,
-    assert_no_difference,
     ball,
     glass,
-    guided,
     images,
     matte,
     point,
@@ -104,26 +100,6 @@ def test_the_guide_finds_a_weak_caustic_beside_a_strong_one():
 
 
 # -- unbiased -------------------------------------------------------------------------------------------
-
-
-@cache
-def unchanged():
-    return images(under_glass(ball()), 128, 8, guiding="emission")
-
-
-@pytest.mark.parametrize("change", ["crop window", "border", "features", "instance"])
-def test_what_makes_no_difference(change):
-    """The same tiles as without guiding and the change (in the pixels that both have)."""
-    assert_no_difference(change, ball(), unchanged(), spp=128, decisions=guided(4))
-
-
-def test_small_lamps_without_fireflies():
-    """A camera ray that leaves the floor meets a lamp of a tenth of the size a hundredth as often."""
-    scene = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}))
-    a = images(scene, 64, 12, decisions=guided(4))
-    b = images(scene, 64, 12, first=100, guiding="emission")
-    st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
-    assert a.var(axis=0).mean() < 0.1 * b.var(axis=0).mean()
 
 
 def test_without_photons():

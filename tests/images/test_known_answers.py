@@ -20,6 +20,8 @@ from scipy import integrate
 from tables import Table
 
 from scenes import (
+    DOWNWARDS,
+    UPWARDS,
     area,
     both_sides,
     camera,
@@ -30,6 +32,7 @@ from scenes import (
     matte,
     meter,
     renders,
+    rgb,
     square,
     thinlens,
     transform,
@@ -694,6 +697,113 @@ def half_space(mu):
     """A slab of optical thickness 50 and albedo .8; its far side is e^-50 away."""
     scene = {"sensor": view(mu, size=4), "slab": slab(fogs.fog(50, 0.8, 0.0), wide=100.0), "sky": sky()}
     return Row(scene, chandrasekhar(0.8, mu), 0.015, 1024, {"max_depth": 200}, seeds=12)
+
+
+# -- lamps and sensors to which `path` is blind ---------------------------------------------------
+
+
+def below_a_beam(sensor):
+    """A directionalarea of radiance 2, 3, 4 that shines straight down on a floor of reflectance 0.6, which
+    has the power L A (Mitsuba's convention)."""
+    lamp = square((0, 1.5, 0), DOWNWARDS, 0.5, matte(0), emitter=BEAM)
+    return {"sensor": sensor, "floor": floor(0, 2, both_sides(0.6)), "lamp": lamp}
+
+
+BEAM = {"type": "directionalarea", "radiance": rgb(2, 3, 4)}
+LIT = 0.6 / np.pi * np.array([2.0, 3.0, 4.0])
+ABOVE = {"origin": (1.5, 1, 0), "target": (0, 0, 0), "size": 8}
+ONTO = transform().look_at([1.5, 1, 0], [0, 0, 0], [0, 1, 0]).scale([0.2, 0.2, 1])
+VIEWS = {
+    "perspective": lambda: camera(fov=12, **ABOVE),
+    "thinlens": lambda: thinlens(aperture_radius=0.05, focus_distance=1.8, fov=12, **ABOVE),
+    "orthographic": lambda: {"type": "orthographic", "to_world": ONTO, "film": camera(size=8)["film"]},
+}
+
+
+@known("all", of=VIEWS)
+def floor_below_a_directionalarea(kind):
+    """All of the view is lit."""
+    more = {"max_depth": 2}
+    return Row(below_a_beam(VIEWS[kind]()), LIT, 0.03, 2048, more, ((partial(blocks, 4), 0.06),), seeds=12)
+
+
+@known("all")
+def directionalarea_seen_from_afar():
+    """The mean over the disk that covers the scene's bounding sphere: the lit square's radiance times A cos /
+    (pi R^2)."""
+    parallel = {"type": "distant", "direction": [-1, -1, 0], "film": camera(size=1)["film"]}
+    scene = below_a_beam(parallel)
+    radius = load(**scene).bbox().bounding_sphere().radius * (1 + 1500 * 2.0**-24)  # Mitsuba's RayEpsilon
+    return Row(scene, LIT / np.sqrt(2) / (np.pi * radius**2), 0.03, 1 << 14, {"max_depth": 2}, seeds=12)
+
+
+# A meter of half-width 0.4 that faces up, and lamps above it.
+UPWARDS_METER = {"type": "rectangle", "to_world": transform().rotate(*UPWARDS).scale(0.4)}
+DOWN = transform().look_at([0.2, 1, 0], [0, 0, 0], [0, 0, 1])
+
+
+def above(emitter):
+    return square((0.2, 1, 0), DOWNWARDS, 0.7, matte(0), emitter=emitter)
+
+
+SPOT = {"type": "spot", "intensity": 3.0, "cutoff_angle": 40, "beam_width": 39.9, "to_world": DOWN}
+# And the strategies that see each directly.
+LAMPS_ABOVE = {
+    "rectangle": (lambda: above(area(2.0)), (0, 1, 2)),
+    "point": (lambda: {"type": "point", "position": [0.2, 1, 0], "intensity": 3.0}, (1, 2)),
+    "spot": (lambda: SPOT, (1, 2)),
+    "projector": (lambda: {"type": "projector", "irradiance": 1.0, "fov": 60, "to_world": DOWN}, (1, 2)),
+    "directional": (lambda: {"type": "directional", "direction": [0.6, -0.8, 0], "irradiance": 3.0}, (1, 2)),
+    "constant": (lambda: sky(0.7), (0, 1, 2)),
+    "directionalarea": (lambda: above({"type": "directionalarea", "radiance": 2.0}), (2,)),
+}
+
+
+def irradiance_above(lamp):
+    """Mean irradiance of the meter under a lamp of `LAMPS_ABOVE`: integrals over grids of midpoints."""
+    middle = (np.arange(40) + 0.5) / 20 - 1
+    x, z = (0.4 * v for v in np.meshgrid(middle, middle))
+    if lamp in ("constant", "directional", "directionalarea"):  # below which is all of the meter
+        return {"constant": 0.7 * np.pi, "directional": 3.0 * 0.8, "directionalarea": 2.0}[lamp]
+    if lamp == "rectangle":
+        u, v = (0.7 * v for v in np.meshgrid(middle, middle))
+        to = [a[..., None, None] - b for a, b in ((x, 0.2 + u), (z, v))]
+        dist2 = to[0] ** 2 + to[1] ** 2 + 1
+        return 2.0 * np.mean(1 / dist2**2) * 1.4**2
+    dist2 = (x - 0.2) ** 2 + z**2 + 1
+    intensity = 3.0
+    if lamp == "projector":
+        axis = np.array([-0.2, -1, 0]) / np.hypot(0.2, 1)
+        cos = ((x - 0.2) * axis[0] - axis[1]) / np.sqrt(dist2)
+        intensity = np.pi / cos**3
+    return np.mean(intensity / dist2**1.5)
+
+
+@known("all", of=LAMPS_ABOVE)
+def meter_below(lamp):
+    """What a sensor with area sees of a lamp directly has strategies of its own."""
+    make, strategies = LAMPS_ABOVE[lamp]
+    answer = irradiance_above(lamp)
+    scene = {"plate": UPWARDS_METER | {"sensor": meter()}, "lamp": make()}
+    layers = {f"s{s}t{2 - s}": (answer, 0.1) for s in strategies}
+    return Row(scene, answer, 0.05, 1 << 14, {"max_depth": 1}, layers=layers, seeds=12)
+
+
+@known("all")
+def point_before_a_lens():
+    """A disk on the film: the mean over the lens of I / d^2 times the density of directions, 1 / (A cos^3), A
+    being the film's area at distance 1."""
+    view = {"origin": (0, 0, 0), "target": (0, 0, 1), "fov": 50, "size": 8}
+    lens = thinlens(aperture_radius=0.4, focus_distance=3.0, **view)
+    lamp = {"type": "point", "position": [0.1, 0.05, 1.5], "intensity": 2.0}
+    r, phi = np.meshgrid(0.4 * np.sqrt((np.arange(200) + 0.5) / 200), 2 * np.pi * np.arange(200) / 200)
+    dist2 = (0.1 - r * np.cos(phi)) ** 2 + (0.05 - r * np.sin(phi)) ** 2 + 1.5**2
+    cos = 1.5 / np.sqrt(dist2)
+    answer = np.mean(2.0 / dist2 / (4 * np.tan(np.deg2rad(25)) ** 2 * cos**3))
+    layers = {"s1t1": (answer, 0.1), "s2t0": (answer, 0.1)}
+    return Row(
+        {"sensor": lens, "lamp": lamp}, answer, 0.05, 1 << 13, {"max_depth": 1}, layers=layers, seeds=12
+    )
 
 
 @known.test

@@ -189,22 +189,6 @@ def test_narrow_spot_on_a_matte_floor(fov):
     assert total < 1.1 * bound
 
 
-def test_lights_of_two_kinds_add_up():
-    """LuxCore #68: a point light beside a uniform environment; both together were not right."""
-    lights = {
-        "lamp": {"type": "point", "position": [0, 1, 1], "intensity": 2.0},
-        "sky": {"type": "constant", "radiance": 0.5},
-    }
-    scene = {
-        "sensor": camera(origin=(0, 2, 3), target=(0, 0.3, 0), fov=45, size=8),
-        "floor": floor(0, 2, both_sides(0.7)),
-        "ball": {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.4, "bsdf": both_sides(0.5)},
-    }
-    method = integrator(max_depth=4, skip="none")
-    alone = [renders(load(**scene, **{name: light}), method, 256, 8) for name, light in lights.items()]
-    agree(tiles(renders(load(**scene, **lights), method, 256, 8, 20)), tiles(sum(alone)), relative=0.02)
-
-
 def test_a_crop_window_set_later_with_a_shifted_principal_point():
     """Mitsuba 3 #236: such a window showed another part of the scene."""
     window = {"crop_offset_x": 4, "crop_offset_y": 2, "crop_width": 8, "crop_height": 8}

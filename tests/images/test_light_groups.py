@@ -13,6 +13,7 @@ from mitsuba_bdpt.emitters.light_groups import LightGroups
 from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.accumulator import reduce_mode
+from mitsuba_bdpt.transport import path_layers
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 from warned import Warned
@@ -56,8 +57,9 @@ def test_connections_to_several_light_subpaths_know_their_emitter():
 
 @pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
 def test_a_merge_knows_its_emitter(plate):
-    """Merges alone sample a point light seen through a plate; through one that is nearly smooth they are
-    those of merged paths. Each layer has its light's colour alone."""
+    """Merges alone sample a point light seen through a plate, smooth or nearly so: each light's layer has its
+    colour alone, and the path layer is ``caustic``. The rough plate also shows the lamps themselves
+    (``emission``), and its lobes have tails: less than a tenth is elsewhere."""
     glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
     glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
     red, blue = (
@@ -65,10 +67,18 @@ def test_a_merge_knows_its_emitter(plate):
         for value, x in (([9.0, 0, 0], 0.5), ([0, 0, 9.0], -0.5))
     )
     target = mi.load_dict(under_glass(red, plate=glass, other=blue))
-    image, groups = layers(bdpt(max_depth=6, merging=True, light_groups="auto"), target)
+    method = bdpt(max_depth=6, merging=True, light_groups="auto", path_layers=True)
+    image, groups = layers(method, target, spp=16)
     check_sum(image, groups)
     assert groups["light"][..., 2].max() == 0 < groups["light"][..., 0].max()
     assert groups["other"][..., 0].max() == 0 < groups["other"][..., 2].max()
+    image, found = layers(method, target, spp=16, kind="path")
+    np.testing.assert_allclose(sum(found.values()), image, rtol=1e-4, atol=2e-5 * image.max())
+    share = {name: layer.mean() / image.mean() for name, layer in found.items()}
+    if plate == "dielectric":
+        assert share["caustic"] == pytest.approx(1, abs=1e-5)
+    else:
+        assert share["caustic"] > 0.6 and share["caustic"] + share["emission"] > 0.9
 
 
 def test_mixed_light_is_that_of_other_lamps():
@@ -81,19 +91,27 @@ def test_mixed_light_is_that_of_other_lamps():
     np.testing.assert_allclose(mixed, expected, rtol=1e-4, atol=2e-5 * expected.max())
 
 
-def test_without_light_groups_nothing_is_recorded_for_them(monkeypatch):
-    """A render without them is to record the same kernels; samples of next-event estimation carry no
-    index."""
+def test_without_layers_nothing_is_recorded_for_them(monkeypatch):
+    """Such a render records the same kernels; samples of next-event estimation carry no index."""
 
-    def refuse(*_):
+    def refuse(*_, **__):
         raise AssertionError("recorded for light groups")
+
+    def no_layer(layer=0, *_, **__):
+        assert layer is None, "recorded for path layers"
 
     monkeypatch.setattr(LightGroups, "at", refuse)
     monkeypatch.setattr(Emitters, "index_of_hit", refuse)
     monkeypatch.setattr(sink._Total, "begin", refuse)
-    target = scene()
-    image, groups = layers(bdpt(max_depth=4, skip="none"), target, spp=1)
-    assert image.max() > 0 and not groups
+    for name in ("sampled", "evaluated"):
+        monkeypatch.setattr(path_layers, name, no_layer)
+    rough = {
+        "ball": {"type": "roughdielectric", "alpha": 0.1},
+        "wall": {"type": "roughconductor", "alpha": 0.05},
+    }
+    for target, parameters in ((scene(), {}), (scene(**rough), {"merging": True})):
+        image, groups = layers(bdpt(max_depth=4, skip="none", **parameters), target, spp=1)
+        assert image.max() > 0 and not groups
     direct = Emitters(target).sample_direct(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.3), mi.Bool(True))
     assert direct.index is None
 

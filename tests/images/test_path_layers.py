@@ -13,11 +13,8 @@ import welch
 from internals import bdpt
 from layered import JOINED, LAMPS, check_sum, layers, scene
 from media_parts import fog
-from mitsuba_bdpt.image import sink
-from mitsuba_bdpt.transport import path_layers
 from mitsuba_bdpt.transport.near_specular import NARROW
 from mitsuba_bdpt.transport.path_layers import NAMES
-from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 
 from scenes import camera, load, square, transform
@@ -252,23 +249,6 @@ def test_layers_in_fog():
     assert (np.abs(found.mean(0) / expected.mean(0) - 1)[6:9] < 0.05).all()
 
 
-@pytest.mark.parametrize("plate", ["dielectric", "roughdielectric"])
-def test_merged_light_is_caustic(plate):
-    """Light of a point lamp that the camera sees on a floor under a plate has passed the plate twice, which
-    six edges allow once; smooth or nearly so, merges alone sample it. With the rough plate, which also shows
-    the lamp itself (``emission``) and whose lobes have tails, less than a tenth is elsewhere."""
-    glass = {"type": plate, "int_ior": 1.5, "ext_ior": 1.0}
-    glass |= {"alpha": 0.005} if plate == "roughdielectric" else {}
-    target = mi.load_dict(under_glass(point(), plate=glass))
-    image, found = divided(integrator(max_depth=6, merging=True), target, spp=16)
-    np.testing.assert_allclose(sum(found.values()), image, rtol=1e-4, atol=2e-5 * image.max())
-    share = {name: layer.mean() / image.mean() for name, layer in found.items()}
-    if plate == "dielectric":
-        assert share["caustic"] == pytest.approx(1, abs=1e-5)
-    else:
-        assert share["caustic"] > 0.6 and share["caustic"] + share["emission"] > 0.9
-
-
 def test_a_resumed_and_a_joined_render_keep_the_layers():
     """And those of light groups. Tolerance: rounding."""
     target = scene(rfilter="box")
@@ -283,17 +263,3 @@ def test_a_resumed_and_a_joined_render_keep_the_layers():
     joined = np.array(method.assemble(parts[0].joined(parts[1]), target), dtype=np.float64)
     other = np.array(method.render(target, spp=8, seed=4))
     np.testing.assert_allclose(joined, (resumed + other) / 2, **ROUNDING)
-
-
-def test_without_path_layers_nothing_is_recorded_for_them(monkeypatch):
-    """A render without them is to record the same kernels."""
-
-    def refuse(layer=0, *_, **__):
-        assert layer is None, "recorded for path layers"
-
-    for name in ("sampled", "evaluated"):
-        monkeypatch.setattr(path_layers, name, refuse)
-    monkeypatch.setattr(sink._Total, "begin", refuse)
-    target = scene(**SURFACES["near-specular"])
-    image, found = divided(bdpt(max_depth=4, skip="none", merging=True), target, spp=1)
-    assert image.max() > 0 and not found

@@ -93,13 +93,6 @@ def reference(path: Path, colour: str):
     return xyz(mi.Bitmap(f"{stem}.exr")), xyz(mi.Bitmap(f"{stem}_var.exr"))
 
 
-@needs(DATA)
-def test_depths_are_found():
-    """The depths of paths, read through an included fragment and from the name."""
-    depths = {name: max_depth(DATA / "tests" / "scenes" / f"{name}.xml") for name in SCENES}
-    assert set(depths.values()) == {2}
-
-
 def cases(scenes, colours=COLOURS):
     """Every scene, colour mode and choice of skipping; by default one of the two choices for each image."""
     product = itertools.product(enumerate(scenes), enumerate(colours), enumerate(("none", "auto")))

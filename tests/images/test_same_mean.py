@@ -986,6 +986,7 @@ def surface_in_a_room(name):
 
 @same("all")
 def unequal_lamps():
+    """LuxCore #68: a point light and an environment were each right alone, and not together."""
     lamps = {}
     for i, name in enumerate(("rectangle", "sphere", "point", "spot", "directional", "envmap")):
         lamps[name] = lamp = parts.EMITTERS[name]()

@@ -122,14 +122,6 @@ def test_cornell_box_is_the_one_of_mitsuba():
     assert np.abs(images[0] - images[1]).mean() < 2e-3 * images[1].mean()
 
 
-@pytest.mark.parametrize(
-    "name", ["lamp_behind_glass", "projector_through_glass", "lamp_in_glass_seen", "pool_floor"]
-)
-def test_delta_lamps_behind_glass_are_black_under_path(name):
-    image = np.array(mi.render(load(name, resolution=32), spp=16))
-    assert (image == 0).all()
-
-
 @pytest.mark.parametrize("name, share", [("pool_floor", 0.942), ("lamp_in_glass_seen", 0.0585)])
 def test_what_only_merging_finds(name, share):
     """Means of sixteen renders as here. Tolerance: 0.01 and 0.003; the shares of single renders have standard

@@ -320,6 +320,14 @@ EMITTERS = {
 }
 
 
+def sampled_emission(emitters, count, seed=11, time=0.0):
+    """``count`` emissions by an `Emitters`, and the random numbers, (4, count)."""
+    u = np.random.default_rng(seed).random((4, count), dtype=np.float32)
+    like = dr.zeros(mi.Interaction3f)  # time and wavelengths
+    like.time = mi.Float(time)
+    return emitters.sample_emission(mi.Point2f(u[:2]), mi.Point2f(u[2:]), like, mi.Bool(True)), u
+
+
 def plugin_of(part) -> str:
     """Mitsuba's name of the emitter or sensor in an entry of a scene."""
     return next((part[key]["type"] for key in ("emitter", "sensor") if key in part), part["type"])

@@ -5,7 +5,6 @@ import json
 import internals
 import mitsuba as mi
 import numpy as np
-import welch as st
 
 from scenes import camera, transform
 
@@ -111,30 +110,6 @@ CASES = {
     "mirror": {"mirror": mirror()},
     "lens": {"kind": "thinlens"},
 }
-
-
-CHANGES = {
-    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
-    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
-    "hidden lamp": {"bdpt": {"hide_emitters": True}},
-    "features": {"bdpt": {"aovs": "dd:depth"}},
-    "instance": {},
-}
-
-
-def assert_no_difference(change, light, expected, spp, **parameters):
-    """Expects the tiles of ``expected`` images with one of `CHANGES`; the instance is of the plate."""
-    more, scene = CHANGES[change], under_glass(light)
-    scene["sensor"]["film"] |= more.get("film", {})
-    if change == "instance":
-        plate = scene.pop("plate") | {"to_world": transform().scale([4, 4, 0.1])}
-        again = {"type": "instance", "to_world": transform().translate([0, 0, 0.5])}
-        scene["group"] = {"type": "shapegroup", "plate": plate}
-        scene["again"] = again | {"group": {"type": "ref", "id": "group"}}
-    found = images(scene, spp, first=100, **parameters, **more.get("bdpt", {}))
-    if change == "crop window":
-        expected = expected[:, 6:10, 4:12]
-    st.assert_agree(st.compare_images(st.tiles(found), st.tiles(expected)), at_least=2)
 
 
 def strategy_images(scene, spp, seeds, first=0, **more):
