@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 6148,
-    "transport merging guided_emission": 5730,
+    "transport merging guided_emission": 5731,
     "planning": 1731,
     "emitters": 2231,
     "cli": 1695,
@@ -24,8 +24,13 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2969, "tests": 33177}
-MOST_WORDS = 29014
+<<<<<<< HEAD
+OUTSIDE = {"scripts": 2969, "tests": 33182}
+MOST_WORDS = 28968
+=======
+OUTSIDE = {"scripts": 2969, "tests": 33351}
+MOST_WORDS = 28968
+>>>>>>> c09c2fca (One name for kappa eta; A of s = 0 on the method's page; two constants named NARROW)
 
 
 def _lines(files):

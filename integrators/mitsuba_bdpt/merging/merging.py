@@ -72,7 +72,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
         return self.count * dr.pi * dr.square(self.radius.at(p))
 
-    def ratio(self, p):
+    def kappa_eta(self, p):
         return dr.minimum(self.kappa * self.eta(p), mis.SATURATION)
 
     def begin_light(self, kernel, walk):
@@ -87,7 +87,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def survival(self, state, partial, p):
         # Whichever is larger, since it may go on to where pixels are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
-        survived = dr.minimum(state.survived, _probability(partial.d_vc, dr.maximum(self.ratio(p), median)))
+        most = dr.maximum(self.kappa_eta(p), median)
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, most))
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
@@ -96,12 +97,12 @@ class Merging(PhotonStrategy, PhotonPolicy):
         ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
         """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
-        return possible & mis.exceeds(self.ratio(vertex.si.p), connection)
+        return possible & mis.exceeds(self.kappa_eta(vertex.si.p), connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
-        return dr.minimum(_probability(d_vc, self.ratio(vertex.si.p)) / survived, 1)
+        return dr.minimum(_probability(d_vc, self.kappa_eta(vertex.si.p)) / survived, 1)
 
     def stored(self, kernel, y, stream):
         keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
@@ -121,7 +122,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         camera = z.partial, _rival(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
-        weight = mis.weigh_merge(h, self.ratio(z.si.p), light, camera, connections)
+        weight = mis.weigh_merge(h, self.kappa_eta(z.si.p), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
         of_camera = path_layers.evaluated(z.layer, f, adjoint=False)

@@ -45,7 +45,7 @@ WARN_SHARE = 0.01
 
 # Least density of a lobe (solid angle) that may leave light undersampled; the estimate is dear beside a short
 # render (see experiments, "Near-specular lobes").
-NARROW = 100.0
+VERY_NARROW = 100.0
 
 # Samples per pixel that are assumed of a shorter render, a preview: all of its light is undersampled.
 PREVIEW = 64
@@ -159,7 +159,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
 
 def is_undersampling_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether near-specular lobes, or a sensor that light subpaths must hit, may leave light undersampled."""
-    sharp = prepared.narrowest >= NARROW or (prepared.delta and plan.hit and not plan.guided)
+    sharp = prepared.narrowest >= VERY_NARROW or (prepared.delta and plan.hit and not plan.guided)
     by_arrival = plan.arrival and _has_sds_paths(prepared)
     return settings.max_depth >= FEWEST_EDGES and ((sharp and prepared.has_small_emitter) or by_arrival)
 

@@ -70,8 +70,8 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: 
     if not kernel.sds.merges:
         return found, 0
     rival = newest_coefficient(kernel, vertex, adjoint, beside_merges=True)
-    ratio = kernel.sds.ratio(vertex.si.p)
-    return found, mis.merges(h, partial, rival, pdf_rev_w, pdf_a, own, ratio)
+    kappa_eta = kernel.sds.kappa_eta(vertex.si.p)
+    return found, mis.merges(h, partial, rival, pdf_rev_w, pdf_a, own, kappa_eta)
 
 
 def merges_before_end(

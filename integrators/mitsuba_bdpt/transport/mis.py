@@ -234,15 +234,15 @@ def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev
     return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
 
 
-def scattered_merges(h: Heuristic, partial: Partial, step: Step, ratio: mi.Float, rival: Coefficient):
+def scattered_merges(h: Heuristic, partial: Partial, step: Step, kappa_eta: mi.Float, rival: Coefficient):
     """``d_vm`` and ``d_vm_newest`` after an event (eqs. 36, 55).
 
-    ``ratio``: kappa eta, with eta the number of photon subpaths times the area of the disc; ``rival``: kappa'
+    ``kappa_eta``: eta is the number of photon subpaths times the area of the disc; ``rival``: kappa'
     of the edge to the vertex. Next to a delta event no edge is connected: the newest merge counts.
     """
     connection, before = h.scale(partial.d_vcm, rival), h.combine(partial.d_vm, partial.d_vm_newest)
     older = older_merges(h, partial, connection, step.pdf_rev_w)
-    newest = dr.select(exceeds(ratio, connection), ratio, 0)
+    newest = dr.select(exceeds(kappa_eta, connection), kappa_eta, 0)
     return _folded(h, step, before, older), _folded(h, step, 0, newest)
 
 
@@ -253,16 +253,16 @@ def merges(
     pdf_rev_w: mi.Float,
     pdf_a: mi.Float,
     own: Coefficient,
-    ratio: mi.Float,
+    kappa_eta: mi.Float,
 ) -> PartialSum:
     """Part of V of a connection: merges at the vertices of one subpath, whose last vertex is connected.
 
     ``coefficient`` and ``own``: kappa' of the edges to and from that vertex; ``pdf_rev_w``, ``pdf_a``: as in
-    `alternatives`; ``ratio``: kappa eta there.
+    `alternatives`; ``kappa_eta``: there.
     """
     connection = h.scale(partial.d_vcm, coefficient)
-    there = h.scale(ratio, pdf_a)
-    there = dr.select(exceeds(ratio, connection) & exceeds(there, own), there, 0)
+    there = h.scale(kappa_eta, pdf_a)
+    there = dr.select(exceeds(kappa_eta, connection) & exceeds(there, own), there, 0)
     return h.combine(there, h.scale(older_merges(h, partial, connection, pdf_rev_w), pdf_a))
 
 
@@ -280,20 +280,20 @@ def alternatives(
 
 
 def weigh_merge(
-    h: Heuristic, ratio: mi.Float, light: tuple, camera: tuple, connections: PartialSum
+    h: Heuristic, kappa_eta: mi.Float, light: tuple, camera: tuple, connections: PartialSum
 ) -> mi.Float:
-    """Weight of a merge with this ``ratio``, kappa eta (eqs. 37-39); 0 where merges do not dominate.
+    """Weight of a merge with this ``kappa_eta`` (eqs. 37-39); 0 where merges do not dominate.
 
     ``light`` and ``camera`` subpath: `Partial`, c and ``pdf_rev_w`` of its last edge; ``connections``: sum of
     ``d_vcm`` times kappa of both last edges.
     """
-    older, v = 0, ratio
+    older, v = 0, kappa_eta
     for partial, connection, pdf_rev_w in (light, camera):
         older = h.combine(older, h.scale(partial.d_vc, pdf_rev_w))
         v = h.combine(v, older_merges(h, partial, connection, pdf_rev_w))
-    possible = exceeds(ratio, light[1]) & exceeds(ratio, camera[1])
+    possible = exceeds(kappa_eta, light[1]) & exceeds(kappa_eta, camera[1])
     others = h.present(h.combine(connections, older))
     possible &= exceeds(v, others)
     # v contains the merge itself.
-    weight = ratio / h.combine(v, others)
+    weight = kappa_eta / h.combine(v, others)
     return dr.select(possible, dr.square(weight) if h.name == "power" else weight, 0)

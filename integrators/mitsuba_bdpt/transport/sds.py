@@ -120,7 +120,7 @@ class PhotonStrategy:
     """A further strategy for SDS paths: hooks of the kernel, which add nothing here.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``merges``: it merges vertices, and `ratio` and `survival` are defined;
+    subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined;
     ``near_specular``: near-specular events count as specular.
     """
 
@@ -129,7 +129,7 @@ class PhotonStrategy:
     merges = False
     near_specular = False
 
-    def ratio(self, p: mi.Point3f) -> mi.Float:
+    def kappa_eta(self, p: mi.Point3f) -> mi.Float:
         """Partial sum of a merge at ``p``, see `mis.scattered_merges`."""
         raise NotImplementedError
 

@@ -353,8 +353,8 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
     state, h = vertex.sds, kernel.heuristic
     if side.sds.merges:
         rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
-        ratio = side.sds.ratio(vertex.si.p)
-        return state, *mis.scattered_merges(h, vertex.partial, step, ratio, rival)
+        kappa_eta = side.sds.kappa_eta(vertex.si.p)
+        return state, *mis.scattered_merges(h, vertex.partial, step, kappa_eta, rival)
     if state is None:
         return None, 0, 0
     state = state.after(h, vertex, coefficient, step)
