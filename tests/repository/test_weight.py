@@ -24,13 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-<<<<<<< HEAD
-OUTSIDE = {"scripts": 2969, "tests": 33182}
+OUTSIDE = {"scripts": 2969, "tests": 33177}
 MOST_WORDS = 28968
-=======
-OUTSIDE = {"scripts": 2969, "tests": 33351}
-MOST_WORDS = 28968
->>>>>>> c09c2fca (One name for kappa eta; A of s = 0 on the method's page; two constants named NARROW)
 
 
 def _lines(files):
