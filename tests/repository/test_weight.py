@@ -25,7 +25,7 @@ MOST = {
     "": 1413,  # top files
 }
 OUTSIDE = {"scripts": 2969, "tests": 33177}
-MOST_WORDS = 28968
+MOST_WORDS = 28975
 
 
 def _lines(files):
