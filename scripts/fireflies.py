@@ -11,7 +11,7 @@ from pathlib import Path
 import command_line
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.options import REFERENCE_SECONDS, RESOLUTION, SECONDS, VARIANT, WIDTH, Number
+from mitsuba_bdpt.measure.options import REFERENCE_SECONDS, RESOLUTION, SECONDS, VARIANT, WHOLE, WIDTH, Number
 from mitsuba_bdpt.measure.project import Project
 
 import mitsuba as mi  # isort: skip
@@ -22,7 +22,7 @@ from instruments import fireflies
 def main(arguments=None) -> int:
     """Print the table."""
     parser = command_line.parser(__doc__)
-    add, one = parser.add_argument, Number(int, 1)
+    add, one = parser.add_argument, WHOLE
     add("scenes", nargs="+", help="scene files, or names in PROJECT/scenes")
     add("--project", type=Path, default=repository.ROOT, metavar="DIR", help="default: this repository")
     add("--seeds", type=one, default=5, help="renders of each scene (default: %(default)s)")

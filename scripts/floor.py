@@ -16,7 +16,7 @@ import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import read_json, write_json
 from mitsuba_bdpt.measure import probes
-from mitsuba_bdpt.measure.options import Number
+from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.preset import machine, software
 from repository import PROJECT, ROOT
 
@@ -94,7 +94,7 @@ def main(arguments=None) -> int:
     """Print the ratio per scene."""
     parser = command_line.parser(__doc__)
     parser.add_argument("scene", nargs="*")
-    parser.add_argument("--rounds", type=Number(int, 1), default=5)
+    parser.add_argument("--rounds", type=WHOLE, default=5)
     parser.add_argument("--path", action="store_true", help="of Mitsuba's path, over the same floor")
     parser.add_argument("--record", type=Path, metavar="FILE", help="write the floor of some scenes there")
     options = parser.parse_args(arguments)

@@ -15,7 +15,7 @@ import mitsuba as mi  # isort: skip
 import numpy as np
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
-from mitsuba_bdpt.measure.options import Number
+from mitsuba_bdpt.measure.options import WHOLE
 
 TABLE = """<scene version="3.0.0">
 <sensor type="perspective"><float name="fov" value="32"/>
@@ -80,7 +80,7 @@ def main(arguments=None) -> int:
     """Write the picture."""
     parser = command_line.parser(__doc__)
     parser.add_argument("folder", nargs="?", type=Path, default=repository.ROOT / "docs" / "images")
-    parser.add_argument("--spp", type=Number(int, 1), default=512)
+    parser.add_argument("--spp", type=WHOLE, default=512)
     options = parser.parse_args(arguments)
     pictures(options.folder, options.spp)
     return 0

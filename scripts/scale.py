@@ -40,7 +40,7 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
-from mitsuba_bdpt.measure.options import Number
+from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.tables import met_text, ratio, table
 
 import drjit as dr  # isort: skip
@@ -547,7 +547,7 @@ def parsed(kind: Kind, size: int | str) -> int | str:
             raise CommandError(f"size={size!r} is not known; use some of {', '.join(map(str, kind.sizes))}")
         return size
     try:
-        return int(Number(int, 1)(str(size)))
+        return int(WHOLE(str(size)))
     except argparse.ArgumentTypeError as error:
         raise CommandError(f"size={size!r}: {error}") from None
 

@@ -33,7 +33,7 @@ from mitsuba_bdpt.cli.values import property_
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.loading import in_proportion
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
-from mitsuba_bdpt.measure.options import Number
+from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.tables import table
 from mitsuba_bdpt.measure.timing import Timed, alternating
 
@@ -148,8 +148,8 @@ def main(arguments=None) -> int:
     parser.add_argument("checkout", type=Path, help="the folder of the other one")
     parser.add_argument("--scenes", nargs="+", help="names in scenes/ that have references")
     parser.add_argument("--parameters", nargs="+", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--spp", type=Number(int, 1), default=64)
-    parser.add_argument("--pairs", type=Number(int, 1), default=8)
+    parser.add_argument("--spp", type=WHOLE, default=64)
+    parser.add_argument("--pairs", type=WHOLE, default=8)
     parser.add_argument("--same", action="store_true", help="fail unless images and decisions are the same")
     options = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")

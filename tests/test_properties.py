@@ -5,10 +5,7 @@ exact pixel values for light that is seen directly. Where noise decides, the sta
 """
 
 import json
-import os
 import re
-import subprocess
-import sys
 from contextlib import nullcontext
 from fractions import Fraction
 from pathlib import Path
@@ -26,6 +23,7 @@ from mitsuba_bdpt.run import schedule
 from mitsuba_bdpt.run import statistics as statistics_module
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import techniques
+from processes import run
 from rendered import same
 
 import scenes
@@ -57,14 +55,6 @@ def lamp_in_a_sphere(bsdf=None, intensity=float(np.pi), **keys):
     """Radiance 1 everywhere, 2^-m after m reflections."""
     wall = {"type": "sphere", "bsdf": bsdf or diffuse()}
     return scenes.load(sensor=sensor(**keys), wall=wall, lamp={"type": "point", "intensity": intensity})
-
-
-def run(script, *arguments, **environment):
-    """Output of a process of its own."""
-    command = [sys.executable, "-c", script, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout
 
 
 def image(bdpt, scene, **keywords):

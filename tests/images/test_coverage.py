@@ -34,7 +34,7 @@ T = parts.T
 
 
 def renders(scene, method, samples, first_seed, seeds=SEEDS):
-    """Images of renders of so many samples in all (of a single pixel in proportion)."""
+    """Images of renders with ``samples`` camera samples in all; of one pixel, in proportion."""
     width, height = scene.sensors()[0].film().crop_size()
     pixels = width * height
     spp = samples // pixels if pixels > 1 else samples * SAMPLES_OF_A_PIXEL // SAMPLES

@@ -2,13 +2,15 @@
 
 import os
 import re
-import subprocess
 import sys
+from contextlib import contextmanager
+from unittest import mock
 
 import drjit as dr
 import internals
 import mitsuba as mi
 import numpy as np
+import processes
 import pytest
 import short_pilots
 from mitsuba_bdpt.planning import budget
@@ -21,9 +23,9 @@ ALL = [{"light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, 
 ALL[0]["coefficients"] = {"t<=1": 1.0, "s=1": 1.0}
 
 
-@pytest.fixture
-def kernels(monkeypatch):
-    """IR of the kernels that renders have run so far."""
+@contextmanager
+def watched_kernels():
+    """IR of the kernels that renders run."""
     found, history = [], dr.kernel_history
 
     def watched(*args):
@@ -31,8 +33,14 @@ def kernels(monkeypatch):
         found.extend(e["ir"].getvalue() for e in entries if e["type"] == dr.KernelType.JIT)
         return entries
 
-    monkeypatch.setattr(dr, "kernel_history", watched)
-    return found
+    with mock.patch.object(dr, "kernel_history", watched):
+        yield found
+
+
+@pytest.fixture
+def kernels():
+    with watched_kernels() as found:
+        yield found
 
 
 def render(scene, **parameters):
@@ -207,29 +215,25 @@ def test_kinds_of_bsdfs_share_functions(kernels):
     assert kinds == same and few <= many <= 1.1 * few
 
 
-def test_bitmaps_do_not_cut_kernels(request):
-    """Expected: of a scene that was just loaded all passes run the same kernel.
+def check_that_passes_share_a_kernel():
+    """Expected: of a scene that was just loaded all passes run the same kernel."""
+    integrator = internals.bdpt(max_depth=3, decisions=[], spp_per_pass=2)
+    with watched_kernels() as kernels:
+        integrator.render(mi.load_dict(room(2, 16)), spp=4)
+    assert len(integrator.statistics["passes"]) == 2
+    large = [kernel for kernel in kernels if "Symbolic loop" in kernel]
+    assert len(large) == 2 and large[0] == large[1]
 
-    In a process of its own: after other tests the two kernels differed once.
-    """
+
+def test_bitmaps_do_not_cut_kernels(request):
+    """In a process of its own: after other tests the two kernels differed once."""
     script = """if True:
-        import mitsuba_bdpt, mitsuba as mi, drjit as dr
-        mi.set_variant("llvm_ad_rgb")
-        import test_first_image, internals
-        found, history = [], dr.kernel_history
-        def watched(*args):
-            entries = history(*args)
-            found.extend(e["ir"].getvalue() for e in entries if e["type"] == dr.KernelType.JIT)
-            return entries
-        dr.kernel_history = watched
-        integrator = internals.bdpt(max_depth=3, decisions=[], spp_per_pass=2)
-        integrator.render(mi.load_dict(test_first_image.room(2, 16)), spp=4)
-        assert len(integrator.statistics["passes"]) == 2
-        large = [kernel for kernel in found if "Symbolic loop" in kernel]
-        assert len(large) == 2 and large[0] == large[1]
+        import mitsuba_bdpt, mitsuba
+        mitsuba.set_variant("llvm_ad_rgb")
+        import test_first_image
+        test_first_image.check_that_passes_share_a_kernel()
     """
-    paths = os.pathsep.join([str(request.path.parent), *sys.path])
-    subprocess.run([sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": paths}, check=True)
+    processes.run(script, PYTHONPATH=os.pathsep.join([str(request.path.parent), *sys.path]))
 
 
 def test_an_edited_bitmap_is_evaluated_once():

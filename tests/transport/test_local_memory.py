@@ -1,8 +1,6 @@
 """A lane's light vertices: local memory of different sizes, and lanes that skip vertices."""
 
-import subprocess
-import sys
-
+import processes
 import pytest
 
 CODE = """
@@ -22,9 +20,7 @@ for parameters, stored in %s:
 def means(edit, parameters):
     """Of images of these parameters, each with its ``stored_vertices``."""
     code = CODE % (edit, repr(parameters))
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr[-2000:]
-    return [float(x) for x in result.stdout.split()]
+    return [float(x) for x in processes.run(code).split()]
 
 
 def test_sizes_of_local_memory_are_kernels_of_their_own():
@@ -50,10 +46,7 @@ d["sensor"]["film"]["width"], d["sensor"]["film"]["height"] = 1920, 1080
 mi.render(mi.load_dict(d), integrator=mi.load_dict({"type": "bdpt", "max_depth": 8}), spp=int(sys.argv[1]))
 print(memory.peak())
 """
-    few, more = (
-        int(subprocess.run([sys.executable, "-c", code, spp], capture_output=True, text=True).stdout)
-        for spp in ("3", "9")
-    )
+    few, more = (int(processes.run(code, spp)) for spp in ("3", "9"))
     assert few < 1.5 * 2**30 and more < 1.05 * few
 
 

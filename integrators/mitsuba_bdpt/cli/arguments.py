@@ -22,7 +22,7 @@ import mitsuba_bdpt
 from .. import removed
 from ..errors import did_you_mean
 from ..host import signals
-from ..measure.options import SEED, STOPS, Number
+from ..measure.options import SECONDS, SEED, STOPS, WHOLE, Number
 from ..progress import KINDS
 from ..settings import PARAMETERS
 from . import measuring, mistakes
@@ -62,15 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
 class Parser(argparse.ArgumentParser):
     """A parser without abbreviations, which suggests commands and options."""
 
-    known: ClassVar[list[str]] = []
-    """Names of commands and options of all parsers."""
+    known: ClassVar[dict[str, None]] = {}
+    """Names of commands and options of all parsers, each once."""
 
     def __init__(self, **settings):
         # An abbreviation may become ambiguous in the next version.
         super().__init__(allow_abbrev=False, **settings)
 
     def add_argument(self, *names, **settings):
-        self.known.extend(name for name in names if name.startswith("-"))
+        self.known.update(dict.fromkeys(name for name in names if name.startswith("-")))
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
@@ -107,7 +107,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add_command(name: str, text: str) -> Parser:
-        parser.known.append(name)
+        parser.known[name] = None
         return commands.add_parser(name, help=text, description=text)
 
     doctor = add_command("doctor", "print versions, variants and the LLVM library, and render a tiny image")
@@ -129,8 +129,8 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add("image", type=Path, help="EXR file that was rendered with light_groups or path_layers")
     text = (
         "factor of a group or path layer, or three for red, green and blue; 1 for others; * and ? in a name "
+        "stand for any characters; without any, the layers are listed"
     )
-    text += "stand for any characters; without any, the layers are listed"
     add("weights", type=weight, nargs="*", metavar="LAYER=X[,Y,Z]", help=text)
     text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
     add("-o", "--output", type=Path, help=text)
@@ -151,7 +151,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
-    add("--spp", type=Number(int, 1), help="samples per pixel; default: the scene's")
+    add("--spp", type=WHOLE, help="samples per pixel; default: the scene's")
     text = "value of a parameter $KEY of the scene; may be repeated"
     add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
     text = "property of the integrator, such as skip=none; may be repeated"
@@ -165,7 +165,7 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     text = "render this part of the image alone, in pixels from the upper left corner"
     add("--crop", type=crop, metavar="X,Y,W,H", help=text)
     text = "number of threads; default: one for each core"
-    add("--threads", type=Number(int, 1), metavar="N", help=text)
+    add("--threads", type=WHOLE, metavar="N", help=text)
     text = "memory that the process may take; default: limits of the machine, its control groups and ulimit"
     add("--memory", type=Number(float, 1e-3), metavar="GIB", help=text)
     text = "log more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
@@ -178,15 +178,15 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "EXR file to write, a PNG comes beside it, folders are made; default: renders/SCENE.exr"
     add("-o", "--output", type=Path, help=text)
     text = "stop after the first pass that ends later than SECONDS; without --spp, at 65536 spp at the latest"
-    add("--time", type=Number(float, 0), metavar="SECONDS", help=text)
+    add("--time", type=SECONDS, metavar="SECONDS", help=text)
     text = "stop at this estimated relMSE, at 65536 spp or --spp at the latest; adds layers of the variance"
     add("--target-error", type=Number(float, 1e-12), metavar="X", help=text)
     text = "write a checkpoint beside the image every MINUTES; deleted when the render is finished"
     add("--checkpoint", type=Number(float, 0), metavar="MINUTES", help=text)
     text = (
         "continue from the checkpoint of an interrupted render: auto (default) if there is one, must (also "
+        "--resume without a value) or end with an error, never (begin anew)"
     )
-    text += "--resume without a value) or end with an error, never (begin anew)"
     add("--resume", nargs="?", choices=("auto", "must", "never"), const="must", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
     add("--statistics", type=Path, metavar="FILE", help=text)
@@ -195,17 +195,17 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     text = "bar, lines (for logs, from ten seconds on) or none; default: a bar on a terminal, lines elsewhere"
     add("--progress", choices=KINDS, default="auto", help=text)
     text = "rewrite the PNG with the image so far every SECONDS"
-    add("--preview", type=Number(float, 0), metavar="SECONDS", help=text)
+    add("--preview", type=SECONDS, metavar="SECONDS", help=text)
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)
     text = "number of parts of a render on a cluster; default: 4 for each worker"
-    add("--parts", type=Number(int, 1), metavar="N", help=text)
+    add("--parts", type=WHOLE, metavar="N", help=text)
     text = "add a denoised image as a layer, which the PNG then shows (extra [denoise]); the raw one stays"
     add("--denoise", action="store_true", help=text)
     text = (
         "integrator to render with, or scene for the scene file's own; it takes over the file's max_depth, "
+        "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     )
-    text += "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
     text = "of the random numbers; each of the --frames adds its number; default: %(default)s"
     add("--seed", type=SEED, default=0, help=text)

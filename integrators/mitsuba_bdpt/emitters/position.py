@@ -170,9 +170,9 @@ class _Projector:
         self._from_uv = [dr.opaque(mi.Float, float(x)) for x in np.linalg.inv(to_uv).ravel()]
         self._area = dr.opaque(mi.Float, abs(np.linalg.det(np.linalg.inv(to_uv))))
         texture = children(emitter)["irradiance"]
-        to_uv = own_parameters(texture).get("to_uv")
-        as_it_was = to_uv is None or np.allclose(np.array(to_uv.matrix).reshape(3, 3), np.eye(3), atol=1e-7)
-        self._texture = texture if texture.is_spatially_varying() and as_it_was else None
+        turned = own_parameters(texture).get("to_uv")
+        as_it_is = turned is None or np.allclose(np.array(turned.matrix).reshape(3, 3), np.eye(3), atol=1e-7)
+        self._texture = texture if texture.is_spatially_varying() and as_it_is else None
 
     def sample(self, u, active):
         """Sample a direction (world) and its density (solid angle)."""

@@ -47,16 +47,16 @@ def warn_of_scene(prepared, sensor, settings):
     texts, media = list(spoilt(prepared, settings)), prepared.light_media
     if media is not None:
         texts += [p.strange for p in prepared.space.media.properties]
-    if media is not None and media.contradiction:
-        texts.append(
-            f"{media.contradiction}; light subpaths would see another scene than the camera, so there are "
-            "none: the image is that of `volpath`"
-        )
-    if media is not None and media.hides_infinity and prepared.emitters.at_infinity:
-        texts.append(
-            "the medium that the sensor declares has no end, and no light from infinity (sky, sun) arrives "
-            "through it; put a shape with a null BSDF around it"
-        )
+        if media.contradiction:
+            texts.append(
+                f"{media.contradiction}; light subpaths would see another scene than the camera, so there "
+                "are none: the image is that of `volpath`"
+            )
+        if media.hides_infinity and prepared.emitters.at_infinity:
+            texts.append(
+                "the medium that the sensor declares has no end, and no light from infinity (sky, sun) "
+                "arrives through it; put a shape with a null BSDF around it"
+            )
     for text in filter(None, texts):
         warn_once(prepared.scene, sensor, f"bdpt: {text}")
 
