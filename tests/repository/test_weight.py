@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2969, "tests": 33175}
+OUTSIDE = {"scripts": 2969, "tests": 32733}
 MOST_WORDS = 28975
 
 
