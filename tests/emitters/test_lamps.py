@@ -272,7 +272,7 @@ def test_another_table_of_faces_is_noticed(monkeypatch):
     key = next(k for k in params.keys() if k.endswith(".faces"))
     params[key] = np.roll(np.array(params[key]).reshape(-1, 3), 100, axis=0).ravel().tolist()
     params.update()
-    with pytest.raises(ValueError, match="update vertex_positions or positions with them, or load"):
+    with pytest.raises(ValueError, match="update vertex_positions with them, or load"):
         Emitters(scene)
     positions = key.replace("faces", "vertex_positions")
     params[positions] = np.array(params[positions]).tolist()

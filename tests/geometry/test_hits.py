@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from mitsuba_bdpt.geometry import hits
 from mitsuba_bdpt.geometry.hits import Hits, HitTables
-from mitsuba_bdpt.host import renamed
 from rendered import same
 
 FIELDS = "t time p n uv dp_du dp_dv dn_du dn_dv duv_dx duv_dy wi prim_index".split()
@@ -70,7 +69,7 @@ def check(scene, ray):
     dr.eval(pi)
     count = dr.width(pi)
     found = Hits(scene, HitTables.of(scene)).at(pi, ray, mi.Bool(True))
-    true = pi.compute_surface_interaction(ray, renamed.hit_flags())
+    true = pi.compute_surface_interaction(ray, mi.RayFlags.All)
     for owner, names in (("", FIELDS), ("sh_frame", ("s", "t", "n"))):
         for name in names:
             both = (getattr(getattr(si, owner) if owner else si, name) for si in (found, true))

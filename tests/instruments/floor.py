@@ -11,7 +11,6 @@ from unittest import mock
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba_bdpt.host import renamed
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.measure.options import RESOLUTION
@@ -90,7 +89,7 @@ class Pass:
                 dr.eval(self._scene.ray_test(ray, active=active))
                 continue
             pi = self._scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
-            si = pi.compute_surface_interaction(ray, renamed.hit_flags(), active)
+            si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
             # A sum of what a path needs, so that nothing is left out and little is written.
             dr.eval(si.p.x + si.p.y + si.p.z + si.n.x + si.sh_frame.n.x + si.uv.x + si.wi.x + si.t)
 

@@ -13,7 +13,6 @@ from ..geometry.boxes import scene_box
 from ..geometry.mitsubas_choices import TEXTURE_SAMPLED, is_sampled_by_texture, is_textured
 from ..geometry.quadrics import Sphere, cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
-from ..host import renamed
 from ..host.introspection import LEAVES, children, named, number, own_parameters
 from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
 from .records import Chosen, Direct, Emission, Factor, Place
@@ -354,7 +353,7 @@ def _samples_points(emitter) -> bool:
         return False
     # By parameters: a shape that Python first met as an emitter's has no mesh methods.
     on_mesh = shape.shape_type() == mi.ShapeType.Mesh.value
-    if is_textured(emitter) and on_mesh and not renamed.has_coordinates(own_parameters(shape)):
+    if is_textured(emitter) and on_mesh and not len(own_parameters(shape)["vertex_texcoords"]):
         raise UsageError(
             f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
             f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 import mitsuba as mi
 import numpy as np
 
-from ..host import renamed
 from ..host.introspection import own_parameters
 
 Found = TypeVar("Found")
@@ -29,8 +28,8 @@ def box_of(shape: mi.Shape) -> mi.ScalarBoundingBox3f | None:
     """Bounding box of a shape, of a mesh's finite vertices; or None."""
     box = mi.ScalarBoundingBox3f(shape.bbox())
     params = own_parameters(shape) if shape.is_mesh() else {}
-    if renamed.holds_a_mesh(params):
-        vertices = np.array(renamed.positions(params)).reshape(-1, 3)
+    if "vertex_positions" in params:
+        vertices = np.array(params["vertex_positions"]).reshape(-1, 3)
         vertices = vertices[np.isfinite(vertices).all(axis=1)]
         box = mi.ScalarBoundingBox3f()
         for corner in (vertices.min(axis=0), vertices.max(axis=0)) if len(vertices) else ():

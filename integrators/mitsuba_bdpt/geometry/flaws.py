@@ -8,7 +8,6 @@ from enum import Enum
 import mitsuba as mi
 import numpy as np
 
-from ..host import renamed
 from ..host.introspection import is_instance, own_parameters
 from .boxes import box_of
 from .quadrics import ROUND
@@ -71,7 +70,7 @@ def _extent(box) -> tuple[list[float], float]:
 
 def _has_finite_vertices(shape: mi.Shape) -> bool:
     params = own_parameters(shape) if shape.is_mesh() else {}
-    return renamed.holds_a_mesh(params) and bool(np.isfinite(np.array(renamed.positions(params))).all())
+    return "vertex_positions" in params and bool(np.isfinite(np.array(params["vertex_positions"])).all())
 
 
 def _lets_through(shape: mi.Shape) -> bool:
@@ -83,8 +82,8 @@ def _lets_through(shape: mi.Shape) -> bool:
 def _is_thin_mesh(shape: mi.Shape) -> bool:
     """Whether many triangles are slender with an edge within the ray offset, as the rims of panes."""
     params = own_parameters(shape)
-    p = np.array(renamed.positions(params)).reshape(-1, 3)
-    faces = np.array(renamed.faces(params)).reshape(-1, 3)
+    p = np.array(params["vertex_positions"]).reshape(-1, 3)
+    faces = np.array(params["faces"]).reshape(-1, 3)
     faces = faces[:: len(faces) // _INSPECTED + 1]
     corners = p[faces[(faces < len(p)).all(axis=1)]].astype(np.float64)
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)

@@ -16,7 +16,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..host import renamed
 from ..host.introspection import (
     grouped_shapes,
     inverse_of,
@@ -115,7 +114,7 @@ class Hits:
         """Return the surface at the hit ``pi`` of ``ray``, as ``pi.compute_surface_interaction`` does."""
         tables = self._tables
         if tables is None:
-            return pi.compute_surface_interaction(ray, renamed.hit_flags(), active)
+            return pi.compute_surface_interaction(ray, mi.RayFlags.All, active)
         active, index = active & pi.is_valid(), met(pi.shape, pi.instance)
         inside = active & (pi.instance != dr.zeros(mi.ShapePtr)) if tables.instances else mi.Bool(False)
         side = dr.gather(mi.Float, tables.side, index, active) if tables.spheres else mi.Float(0)
@@ -143,7 +142,7 @@ class Hits:
 
 
 def _call(shape: mi.Shape, pi, ray, active) -> mi.SurfaceInteraction3f:
-    return shape.compute_surface_interaction(ray, pi, renamed.hit_flags(), active)
+    return shape.compute_surface_interaction(ray, pi, mi.RayFlags.All, active)
 
 
 def _placed(si: mi.SurfaceInteraction3f, inside: mi.Bool, to_world: mi.Transform4f):

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..host import renamed
 from ..host.introspection import grouped_shapes, is_instance, matrix_of, own_parameters
 from .boxes import asked_anew, scene_box
 from .quadrics import ROUND, outward_sign
@@ -161,9 +160,9 @@ def reaches(shape: mi.Shape) -> np.ndarray:
     if kind in _WHOLE:
         return np.array([_finite(np.abs([shape.bbox().min, shape.bbox().max]).max())])
     params = own_parameters(shape) if shape.is_mesh() else {}
-    if not renamed.holds_a_mesh(params) or not len(renamed.faces(params)):
+    if "vertex_positions" not in params or not len(params["faces"]):
         return np.zeros(1)
-    found = _reaches_of_triangles(renamed.positions(params), renamed.faces(params))
+    found = _reaches_of_triangles(params["vertex_positions"], params["faces"])
     # Hits on ellipsoids report the index of the ellipsoid, not of the triangle.
     return found.max(keepdims=True) if kind == mi.ShapeType.EllipsoidsMesh.value else found
 

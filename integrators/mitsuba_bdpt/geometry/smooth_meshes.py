@@ -13,7 +13,6 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from ..host import renamed
 from ..host.introspection import named, own_parameters
 from .mitsubas_choices import spread_points
 
@@ -68,7 +67,7 @@ class SmoothMeshes:
             raise UsageError(
                 f"{off:.1%} of the points that Mitsuba samples on the mesh {named(shape)}, which emits "
                 "or measures, are not on the faces of its table of areas, which Mitsuba keeps after an edit "
-                f"of faces; update {' or '.join(renamed.POSITIONS)} with them, or load the scene "
+                "of faces; update vertex_positions with them, or load the scene "
                 "anew"
             )
 
@@ -111,7 +110,7 @@ class _Faces:
             return None
         length = np.linalg.norm(cross, axis=1)
         params = own_parameters(shape)
-        faces, positions = renamed.faces(params), renamed.positions(params)
+        faces, positions = params["faces"], params["vertex_positions"]
         index = dr.gather(mi.Vector3u, faces, dr.arange(mi.UInt32, len(cross)))
         a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in index)
         # As in Mitsuba's Mesh::build_pmf, rounding included.
@@ -130,7 +129,7 @@ class _Faces:
 
 def _arrays(params) -> list[np.ndarray]:
     """Faces, vertex positions and normals, (n, 3); a shape first met as an emitter's has no mesh methods."""
-    parts = renamed.faces(params), renamed.positions(params), renamed.normals(params)
+    parts = params["faces"], params["vertex_positions"], params["vertex_normals"]
     return [
         np.array(part, dtype=kind).reshape(-1, 3)
         for part, kind in zip(parts, (int, float, float), strict=True)
@@ -143,7 +142,7 @@ def _curved_faces(shape):
         return None
     params = own_parameters(shape)
     # Rectangles have no vertices; other meshes may have no vertex normals.
-    if not renamed.holds_a_mesh(params) or not len(renamed.normals(params)):
+    if "vertex_positions" not in params or not len(params["vertex_normals"]):
         return None
     faces, p, n = _arrays(params)
     if faces.max(initial=0) >= len(p):

@@ -11,7 +11,6 @@ import mitsuba as mi
 import numpy as np
 
 from .._version import __version__
-from . import renamed
 
 # Classes of textures, one or more for each BSDF, that hold no other object: not asked for `children`.
 LEAVES = frozenset({"SRGBReflectanceSpectrum", "UniformSpectrum"})
@@ -76,14 +75,12 @@ def own_parameters(owner) -> dict:
     return {
         name: _value(value, collector.types[name], owner)
         for name, value in found.items()
-        if value is not None and (not isinstance(value, mi.Object) or renamed.is_transform(value))
+        if value is not None and not isinstance(value, mi.Object)
     }
 
 
 def _value(value, cpptype, owner):
     """Return the value that a plugin puts: of C++ plugins a pointer to a value of type ``cpptype``."""
-    if renamed.is_transform(value):
-        return renamed.transform(value, _called(owner))
     return value if cpptype is None else mi.get_property(value, cpptype, owner)
 
 
@@ -109,24 +106,9 @@ def matrix_of(owner) -> np.ndarray:
     return _entries(own_parameters(owner)["to_world"].matrix)
 
 
-def world_transform(endpoint: mi.Emitter | mi.Sensor):
-    """Return an endpoint's ``to_world``; raises ``UnsupportedError`` if animated."""
-    return renamed.transform(endpoint.world_transform(), _called(endpoint))
-
-
 def world_matrix(endpoint: mi.Emitter | mi.Sensor) -> np.ndarray:
-    """The matrix of `world_transform`: (4, 4), double precision."""
-    return _entries(world_transform(endpoint).matrix)
-
-
-def check_not_animated(owners: Iterable):
-    """Raise ``UnsupportedError`` if one of ``owners`` has an animated transformation."""
-    for owner in owners if renamed.may_be_animated() else ():
-        own_parameters(owner)
-
-
-def _called(owner) -> str:
-    return f"{owner.class_name()} {named(owner)}"
+    """An endpoint's ``to_world`` matrix: (4, 4), double precision."""
+    return _entries(endpoint.world_transform().matrix)
 
 
 def inverse_of(owner) -> np.ndarray:

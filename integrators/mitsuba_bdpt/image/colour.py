@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from ..errors import UnsupportedError
 from ..geometry.polarization import basis
-from ..host.introspection import children, named, world_transform
+from ..host.introspection import children, named
 
 # Wavelengths at which a film's response to a spectrum of 1 is evaluated.
 RESPONSE_SAMPLES = 4096
@@ -107,7 +107,7 @@ class Stokes:
     """
 
     def __init__(self, sensor: mi.Sensor, rgb):
-        self._vertical = world_transform(sensor) @ mi.Vector3f(0, 1, 0)
+        self._vertical = sensor.world_transform() @ mi.Vector3f(0, 1, 0)
         dr.make_opaque(self._vertical)
         self._rgb = rgb
 

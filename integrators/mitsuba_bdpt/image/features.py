@@ -22,7 +22,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError, did_you_mean
-from ..host import renamed
 from ..sampling.points import Purpose
 from ..scene.prepared import bsdfs
 from ..sensors.records import Region
@@ -142,7 +141,7 @@ class FeatureLayers:
         if mi.is_spectral:
             u = points.draw_1d("camera", stream, Purpose.WAVELENGTH)
             ray.wavelengths, _ = mi.sample_rgb_spectrum(mi.sample_shifted(u))
-        si = self._scene.ray_intersect(ray, renamed.hit_flags(), coherent=True, active=active)
+        si = self._scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=active)
         met = active & si.is_valid()
         hit = _Hit(si, ray, si.bsdf(ray), met, self._normals)
         layers, finite = [], mi.Bool(True)

@@ -17,7 +17,6 @@ from ..emitters.emitters import Emitters
 from ..geometry import rays
 from ..geometry.boxes import known_box, points_in, scene_box
 from ..geometry.directions import random_directions
-from ..host import renamed
 from ..host.introspection import is_instance, named
 from ..transport.inputs import Shared
 from .phase import asymmetry
@@ -144,7 +143,7 @@ def near_side(space: Space, ray: mi.Ray3f, active: mi.Bool) -> tuple[mi.UInt32, 
     going = mi.Bool(active)
     while dr.hint(going, label="the first boundary", exclude=[space, ray, active]):
         segment = mi.Ray3f(o, d, ray.time, ray.wavelengths)
-        si = space.scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
+        si = space.scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
         hit = going & si.is_valid()
         bounds = hit & si.is_medium_transition() & _may_leave(si, -d)
         number = dr.select(bounds, space.media.number(si.target_medium(-d)), number)

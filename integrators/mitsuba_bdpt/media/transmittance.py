@@ -10,7 +10,6 @@ import mitsuba as mi
 
 from ..geometry import rays
 from ..geometry.rounding import met
-from ..host import renamed
 from ..transport.contribution import Counters, one
 from . import tracking
 from .media import Media, depth_of
@@ -93,7 +92,7 @@ def through_surfaces(space: Space, ray, medium, active, own=None, word=0, hidden
         going, label="segments of a connection", exclude=[space, media, scene, ray, active, own, hidden]
     ):
         segment = mi.Ray3f(o, ray.d, left, ray.time, ray.wavelengths)
-        si = scene.ray_intersect(segment, renamed.hit_flags(), coherent=False, active=going)
+        si = scene.ray_intersect(segment, mi.RayFlags.All, coherent=False, active=going)
         hit = going & si.is_valid() & ~_is_end(si, own, ray.maxt - left + si.t)
         length = dr.select(hit, si.t, left)
         passed, of_segment, word, collisions = _along(media, medium, segment, length, word, going)

@@ -17,14 +17,13 @@ from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
 from ..host.introspection import (
     all_shapes,
-    check_not_animated,
     is_instance,
     media_of,
     own_parameters,
     registry_id,
 )
 from ..host.notices import State, cached
-from ..sensors.checks import check_sensor, views
+from ..sensors.checks import check_sensor
 from ..sensors.kinds import prepare
 from ..settings import DEFAULT_STORED, MAX_STORED, Settings
 from ..transport import bsdf, draws
@@ -51,7 +50,6 @@ class PreparedScene:
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor):
-        check_not_animated([*all_shapes(scene), *scene.emitters(), sensor, *views(sensor)])
         self.scene, self.sensor = scene, sensor
         self.surfaces = bool(scene.shapes())
         self.facts = facts = ShapeFacts.of(scene, sensor)
