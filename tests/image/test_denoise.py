@@ -24,8 +24,8 @@ def layers(scene, sensor=0):
 
 def guides(scene) -> tuple[np.ndarray, np.ndarray]:
     """Albedo and normals by Mitsuba's plugin ``aov``, which has no normals of maps in world space."""
-    aovs = denoising.GUIDES.replace(denoising.WORLD_NORMAL, "sh_normal")
-    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "aov", "aovs": aovs}), spp=64, seed=7))
+    aov = mi.load_dict({"type": "aov", "aovs": denoising.GUIDES})
+    image = np.array(mi.render(scene, integrator=aov, spp=64, seed=7))
     return image[..., -6:-3], image[..., -3:]
 
 

@@ -12,10 +12,8 @@ import numpy as np
 
 from ..errors import UsageError
 
-# Features for the denoiser, as pairs like those of Mitsuba's ``aov``. Unlike in ``aov``, normals of bump maps
-# are in world space.
-WORLD_NORMAL = "world_normal"
-GUIDES = f"bdpt_albedo:albedo,bdpt_normal:{WORLD_NORMAL}"
+# Features for the denoiser, as pairs of Mitsuba's ``aov``; `FeatureLayers` has the normals in world space.
+GUIDES = "bdpt_albedo:albedo,bdpt_normal:sh_normal"
 
 # Their channels.
 ALBEDO, NORMAL = slice(0, 3), slice(3, 6)

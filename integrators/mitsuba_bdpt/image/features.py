@@ -1,9 +1,8 @@
-"""Feature layers (AOVs) of the first surface, as in Mitsuba's plugin ``aov``.
+"""Feature layers (AOVs) of the first surface, by Mitsuba's plugin ``aov``.
 
 Features are evaluated at each camera sample, with the sensor's ray, and are thus filtered and normalised like
-the image. They agree with ``aov`` of Mitsuba 3.9.1: emitters are shown under ``hide_emitters``, uv
-derivatives scale with 1 / sqrt(spp), and shading normals of bump maps are in the shading frame. Two
-differences:
+the image. As those of ``aov``: emitters are shown under ``hide_emitters``, uv derivatives scale with
+1 / sqrt(spp), and shading normals of bump maps are in the shading frame. Two differences:
 
 * Albedo is RGB on every film: its wavelengths are sampled by `mi.sample_rgb_spectrum`. ``aov`` uses the
   sensor's, which is wrong if these follow a response.
@@ -14,9 +13,6 @@ differences:
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,58 +21,23 @@ from ..errors import UsageError, did_you_mean
 from ..sampling.points import Purpose
 from ..scene.prepared import bsdfs
 from ..sensors.records import Region
-from .denoising import GUIDES, WORLD_NORMAL
-from .mapped_normals import MappedNormals
+from .denoising import GUIDES
 
-
-@dataclass
-class _Hit:
-    """First hit of a camera ray: ``si`` and its ``bsdf``, valid where ``active``."""
-
-    si: mi.SurfaceInteraction3f
-    ray: mi.RayDifferential3f
-    bsdf: mi.BSDFPtr
-    active: mi.Bool
-    normals: MappedNormals
-
-
-def _albedo(hit: _Hit) -> mi.Color3f:
-    """Diffuse reflectance; spectral variants use `mi.sample_rgb_spectrum`."""
-    value = mi.unpolarized_spectrum(hit.bsdf.eval_diffuse_reflectance(hit.si, hit.active))
-    if mi.is_monochromatic:
-        return mi.Color3f(value.x)
-    if not mi.is_spectral:
-        return mi.Color3f(value)
-    pdf = mi.pdf_rgb_spectrum(hit.ray.wavelengths)
-    value *= dr.select(pdf != 0, dr.rcp(pdf), 0)
-    return mi.spectrum_to_srgb(value, hit.ray.wavelengths, hit.active)
-
-
-def _uv_partials(hit: _Hit) -> mi.SurfaceInteraction3f:
-    hit.si.compute_uv_partials(hit.ray)
-    return hit.si
-
-
-# Suffixes of a kind's layers, and its values.
-_KINDS: dict[str, tuple[str, Callable[[_Hit], Any]]] = {
-    "albedo": ("RGB", _albedo),
-    "depth": ("T", lambda hit: [hit.si.t]),
-    "position": ("XYZ", lambda hit: hit.si.p),
-    "uv": ("UV", lambda hit: hit.si.uv),
-    "geo_normal": ("XYZ", lambda hit: hit.si.n),
-    "sh_normal": ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=True)),
-    "dp_du": ("XYZ", lambda hit: hit.si.dp_du),
-    "dp_dv": ("XYZ", lambda hit: hit.si.dp_dv),
-    "duv_dx": ("UV", lambda hit: _uv_partials(hit).duv_dx),
-    "duv_dy": ("UV", lambda hit: _uv_partials(hit).duv_dy),
-    "prim_index": ("I", lambda hit: [mi.Float(hit.si.prim_index)]),
-    "shape_index": ("I", lambda hit: [mi.Float(dr.reinterpret_array(mi.UInt32, hit.si.shape))]),
+# Suffixes of the layers of each kind.
+KINDS = {
+    "albedo": "RGB",
+    "depth": "T",
+    "position": "XYZ",
+    "uv": "UV",
+    "geo_normal": "XYZ",
+    "sh_normal": "XYZ",
+    "dp_du": "XYZ",
+    "dp_dv": "XYZ",
+    "duv_dx": "UV",
+    "duv_dy": "UV",
+    "prim_index": "I",
+    "shape_index": "I",
 }
-
-KINDS = tuple(_KINDS)
-
-# For the denoiser, in world space.
-_KINDS[WORLD_NORMAL] = ("XYZ", lambda hit: hit.normals.at(hit.si, hit.bsdf, hit.active, of_aov=False))
 
 
 def checked(aovs: str) -> str:
@@ -98,7 +59,7 @@ def checked(aovs: str) -> str:
 
 def feature_names(aovs: str) -> list[str]:
     """Return the names of the layers of the parameter ``aovs``."""
-    return [f"{name}.{part}" for name, kind in _named_kinds(aovs) for part in _KINDS[kind][0]]
+    return [f"{name}.{part}" for name, kind in _named_kinds(aovs) for part in KINDS[kind]]
 
 
 def _named_kinds(aovs: str) -> list[tuple[str, str]]:
@@ -119,13 +80,16 @@ class FeatureLayers:
     """
 
     def __init__(self, scene, sensor, aovs: str, spp: int, guides: bool = False):
-        features = f"{aovs},{GUIDES}" if guides else aovs
+        features = pairs(f"{aovs},{GUIDES}" if guides else aovs)
         self._scene, self._sensor = scene, sensor
-        self._kinds = [kind for _, kind in _named_kinds(features)]
+        self._aov = mi.load_dict({"type": "aov", "aovs": ",".join(features)})
+        self._unused = mi.load_dict({"type": "independent"})
         self.names, self.guides = feature_names(aovs), guides
-        self.count = len(feature_names(features))
-        has_normals = {"sh_normal", WORLD_NORMAL}.intersection(self._kinds)
-        self._normals = MappedNormals(bsdfs(scene) if has_normals else [])
+        self.count = len(self._aov.aov_names())
+        found = {id(bsdf): bsdf for bsdf in bsdfs(scene) if bsdf.class_name() == "BumpMap"}
+        self._bump_maps = list(found.values()) if guides else []
+        kinds = [kind for _, kind in _named_kinds(",".join(features)) for _ in KINDS[kind]]
+        self._may_be_nan = [kind.startswith("duv_") for kind in kinds]
         self._region = Region(sensor.film())
         self._spread = dr.opaque(mi.Float, spp**-0.5)  # scale of ray differentials, as in Mitsuba
 
@@ -141,13 +105,18 @@ class FeatureLayers:
         if mi.is_spectral:
             u = points.draw_1d("camera", stream, Purpose.WAVELENGTH)
             ray.wavelengths, _ = mi.sample_rgb_spectrum(mi.sample_shifted(u))
+        _, _, layers = self._aov.sample(self._scene, self._unused, ray, None, active)
+        if self._bump_maps:
+            layers[-3:] = self._in_world(ray, mi.Normal3f(layers[-3:]), active)
+        finite = mi.Bool(True)
+        for value, may_be_nan in zip(layers, self._may_be_nan, strict=True):
+            finite &= may_be_nan | dr.isfinite(value)
+        return [dr.select(dr.isfinite(value), value, 0) for value in layers], finite
+
+    def _in_world(self, ray, normal: mi.Normal3f, active) -> mi.Normal3f:
+        """Return the shading ``normal``, which is in the shading frame on bump maps, in world space."""
         si = self._scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=active)
-        met = active & si.is_valid()
-        hit = _Hit(si, ray, si.bsdf(ray), met, self._normals)
-        layers, finite = [], mi.Bool(True)
-        for kind in self._kinds:
-            for value in _KINDS[kind][1](hit):
-                value = dr.select(met, value, 0)
-                finite &= kind.startswith("duv_") | dr.isfinite(value)
-                layers.append(dr.select(dr.isfinite(value), value, 0))
-        return layers, finite
+        bsdf, mapped = si.bsdf(), mi.Bool(False)
+        for bump_map in self._bump_maps:
+            mapped |= bsdf == mi.BSDFPtr(bump_map)
+        return dr.select(mapped & si.is_valid(), mi.Normal3f(si.to_world(normal)), normal)
