@@ -28,7 +28,7 @@ REMOVED = {
     "and combine both (mitsuba_bdpt.Snapshot.joined)",
     "--progress deadline": "use --progress lines, whose lines on standard error have the percentage",
     "--tev": "use --preview SECONDS, which rewrites the PNG, and a viewer that watches files",
-    "fireflies": "run scripts/fireflies.py of the repository",
+    "fireflies": "render with layers=strategies, whose images show the strategies that they are of",
     "completion": "generate completions from --help with a tool such as shtab or your shell's own",
 }
 

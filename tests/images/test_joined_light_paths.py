@@ -14,8 +14,6 @@ from sds_scenes import images as rendered_images
 from snapshots import ROUNDING, stopped
 from test_same_mean import MATERIALS
 
-from instruments import recording
-
 import drjit as dr  # isort: skip
 
 T = mi.ScalarTransform4f
@@ -167,17 +165,3 @@ def test_the_same_seed_gives_the_same_image():
     assert snapshot.progress.decided.decisions[0].joined == 4
     rest = np.array(other.render(scene, seed=3, spp=64, start=snapshot))
     np.testing.assert_allclose(rest, whole, **ROUNDING)
-
-
-def test_single_samples_are_looked_at_one_light_subpath_at_a_time():
-    """What replays a lane knows of one light subpath, and of no tables of emission."""
-    scene = cornell()
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6})
-    with pytest.raises(Exception, match="set guiding=photons"):
-        recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
-    method = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "photons"})
-    recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)
-    assert method.statistics["decisions"][0]["joined"] == 1
-    method = internals.bdpt(max_depth=6, decisions=decided())
-    with pytest.raises(Exception, match="several light subpaths"):
-        recording.render(scene, method, np.full((64, 64, 3), np.inf), 64, 0)

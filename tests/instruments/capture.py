@@ -4,6 +4,7 @@ unchanged, its loops step by step. Densities of each path from both sides are ev
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field, fields
 
 import drjit as dr
@@ -15,6 +16,7 @@ from mitsuba_bdpt.emitters.order import in_order
 from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.geometry.smooth_meshes import is_flat
+from mitsuba_bdpt.host.jit import evaluated_mode, gc_paused
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points, Purpose
 from mitsuba_bdpt.transport import bsdf, kernel, techniques
@@ -29,7 +31,6 @@ from mitsuba_bdpt.transport.inputs import Observer
 from .chains import recursion
 from .endpoints import Camera, disks_of, dot, lamps_of, length2
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, Coefficients, Explicit, Paths
-from .recording import float64, stepwise
 
 # Angle over cosine between the ray along an edge, which starts beside its surface, and the line between the
 # edge's vertices. Both serve as its direction.
@@ -72,6 +73,24 @@ class Made:
     weights: np.ndarray
     paths: Paths
     unsure: int
+
+
+def float64(x) -> np.ndarray:
+    """Without NumPy warnings for NaN in masked lanes."""
+    with np.errstate(invalid="ignore"):
+        return np.array(x, dtype=np.float64)
+
+
+@contextlib.contextmanager
+def stepwise(kernel_):
+    """Dr.Jit runs loops and branches of a kernel step by step, so that their state can be read. As for a
+    render the cycle collector is paused, and calls go step by step where an emitter needs it."""
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(gc_paused())
+        stack.enter_context(evaluated_mode(kernel_.emitters.evaluated))
+        for flag in (dr.JitFlag.SymbolicLoops, dr.JitFlag.SymbolicConditionals):
+            stack.enter_context(dr.scoped_set_flag(flag, False))
+        yield
 
 
 def rows(v) -> np.ndarray:

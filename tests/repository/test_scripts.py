@@ -67,7 +67,7 @@ def by_user(monkeypatch, command, *arguments):
         *(
             (f"{command} nowhere", "scene='nowhere' is neither a scene file nor the name of one")
             for command in (
-                *("choices.py", "fireflies.py", "floor.py", "overhead.py", "pyramid", "equal-time"),
+                *("choices.py", "floor.py", "overhead.py", "pyramid", "equal-time"),
                 *("compare bdpt path --scenes", f"versus.py {SCRIPTS.parent} --scenes"),
             )
         ),
@@ -107,13 +107,6 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
 @pytest.mark.parametrize(
     "command",
     [
-        "fireflies.py x --seeds 0",
-        "fireflies.py x --spp 0.5",
-        "fireflies.py x --resolution 0",
-        "fireflies.py x --max-depth 0",
-        "fireflies.py x --level nan",
-        "fireflies.py x --top 0",
-        "fireflies.py x --lines -1",
         "floor.py x --rounds 0",
         "reference x --seconds nan",
         "reference x --spp 0",
@@ -197,7 +190,7 @@ def test_help_does_nothing_else(here, monkeypatch, capsys, script, words):
 def test_every_script_of_the_documents_exists():
     pages = SCRIPTS.parent / "README.md", *(SCRIPTS.parent / "docs").rglob("*.md")
     named = {name for page in pages for name in re.findall(r"python scripts/(\w+\.py)", page.read_text())}
-    assert len(named) > 8 and named <= set(COMMANDS)
+    assert len(named) > 7 and named <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda mutant: mutant.name)

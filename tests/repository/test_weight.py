@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 6148,
-    "transport merging guided_emission": 5731,
+    "transport merging guided_emission": 5726,
     "planning": 1731,
     "emitters": 2230,
     "cli": 1695,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1413,  # top files
 }
-OUTSIDE = {"scripts": 2969, "tests": 32583}
-MOST_WORDS = 28974
+OUTSIDE = {"scripts": 2924, "tests": 31468}
+MOST_WORDS = 28951
 
 
 def _lines(files):

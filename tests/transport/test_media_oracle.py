@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from dataclasses import replace
+from dataclasses import dataclass
 
 import drjit as dr
 import media_parts as parts
@@ -15,10 +15,13 @@ import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import kernel
+from mitsuba_bdpt.transport import connections, kernel, techniques
 from mitsuba_bdpt.transport.batch import Batch
+from mitsuba_bdpt.transport.contribution import Counters
+from mitsuba_bdpt.transport.inputs import Observer
 
-from instruments import endpoints, oracle, recording
+from instruments import endpoints, oracle
+from instruments.capture import rows, stepwise
 from instruments.chains import COEFFICIENTS, random_paths, recursion
 from instruments.oracle import AREA, POSITION
 
@@ -67,76 +70,132 @@ def cloud():
     return parts.grid(values, [-1.2] * 3, 2.4, SIGMA, 0.9, phase={"type": "hg", "g": G})
 
 
-class SensorPoints:
-    """Stands before a kernel's sensor: its points, of which a `recording.Recorder` has none for t = 0 and
-    (1,1)."""
+@dataclass
+class Path:
+    """A contribution's ``weight``, and its path from the emitter on: positions, and which lie in a volume."""
 
-    def __init__(self, sensor):
-        self._sensor, self._joined, self._hit = sensor, [], []
+    s: int
+    t: int
+    weight: float
+    p: np.ndarray
+    volume: np.ndarray
 
-    def __getattr__(self, name):
-        return getattr(self._sensor, name)
 
-    def connect(self, p, *u):
-        found = self._sensor.connect(p, *u)
-        self._joined.append((self._numbers(p), self._numbers(found.p)))
-        return found
+def wide(v):
+    return np.broadcast_to(rows(v), (LANES, 3))
 
-    def hit(self, walk, *others):
-        found = self._sensor.hit(walk, *others)
-        at = walk.previous + walk.d * dr.sqrt(found.dist2)
-        self._hit.append((self._numbers(mi.Point3f(mi.Float(walk.edges)))[0], self._numbers(at)))
-        return found
 
-    @staticmethod
-    def _numbers(p):
-        return recording.float64(p + dr.zeros(mi.Point3f, LANES))
+def each(x):
+    """A value of each lane."""
+    return np.broadcast_to(np.array(x), LANES)
 
-    def completed(self, path, lane: int):
-        if (path.s, path.t) == (1, 1):
-            found = [to[:, lane] for p, to in self._joined if (p[:, lane] == path.p[1]).all()]
-        elif path.t == 0:
-            found = [at[:, lane] for edges, at in self._hit if edges[lane] == path.s - 1]
-        else:
-            return path
-        return replace(path, p=np.array([found[0], *path.p[1:]]))
+
+class Recorder(Observer):
+    """Sink and observer of a run: by side, lane and number of a vertex its position (a null event's is
+    overwritten), that of the endpoint connected to, and whether it lies in a volume; ``lens``: where a light
+    subpath meets it on the edge to a vertex."""
+
+    alpha = False
+
+    def __init__(self):
+        shape = (LANES, DEPTH + 2)
+        self.p, self.ends = ({name: np.zeros((*shape, 3)) for name in ("light", "camera")} for _ in range(2))
+        self.volume = {name: np.zeros(shape, dtype=bool) for name in self.p}
+        self.lens, self.paths = np.zeros((*shape, 3)), []
+
+    def emitted(self, emission):
+        self.origin = emission.si.p
+        self.p["light"][:, 0] = wide(emission.si.p)
+
+    def started(self, kernel, side, walk):
+        self.kernel = kernel
+        if not side.adjoint:
+            self.p["camera"][:, 0] = wide(walk.previous)
+
+    def vertex(self, side, walk, vertex, step):
+        lanes = np.flatnonzero(each(vertex.active))
+        at = lanes, each(vertex.edges)[lanes]
+        self.p[side.name][at] = wide(vertex.si.p)[lanes]
+        self.volume[side.name][at] = each(vertex.volume)[lanes]
+        if vertex.endpoint is not None:
+            end = vertex.endpoint.p if side.adjoint else vertex.endpoint.anchor.p
+            self.ends[side.name][at] = wide(end)[lanes]
+        if side.adjoint and self.kernel.plan.arrival:
+            dist2 = self.kernel.camera.hit(walk, vertex, mi.Bool(False)).dist2
+            self.lens[at] = wide(walk.previous + walk.d * dr.sqrt(dist2))[lanes]
+
+    def begin(self):
+        return dr.zeros(mi.Spectrum)
+
+    def add(self, kernel_, c, total, start, shared):
+        self._note(c)
+        return total
+
+    def splat(self, kernel_, c, shared, stream):
+        if kernel_.plan.endpoints:  # (1,1) is made before the walk begins
+            u = techniques._sensor_points(kernel_, stream)
+            self.ends["light"][:, 0] = wide(kernel_.camera.connect(self.origin, *u).p)
+        self._note(c)
+        return Counters()
+
+    def connect(self, kernel_, z, lane, stream, total, start):
+        """All are weighed, whichever is then drawn."""
+        found = []
+        connections.connect_all(
+            kernel_, z, lane.path, stream, total, lambda _, c, total: found.append(c) or total
+        )
+        for c in found:
+            self._note(c)
+        return total, Counters()
+
+    def end(self, *_):
+        return Counters()
+
+    def _note(self, c):
+        s, t, weight = (each(x) for x in (c.s, c.t, c.weight))
+        for i in np.flatnonzero(each(c.active) & wide(c.value).any(1)):
+            self.paths.append(self._path(i, int(s[i]), int(t[i]), float(weight[i])))
+
+    def _path(self, i, s, t, weight):
+        y, z = self.p["light"][i, :s], self.p["camera"][i, :t]
+        if s == 1 and t > 1:  # next-event estimation, light tracing and (1,1) sample an endpoint of their own
+            y = self.ends["camera"][i, [t - 1]]
+        elif t == 1:
+            z = self.ends["light"][i, [s - 1]]
+        elif t == 0:
+            y = np.concatenate([y[:-1], self.lens[i, [s - 1]]])
+        volume = self.volume["light"][i, :s], self.volume["camera"][i, :t][::-1]
+        return Path(s, t, weight, np.concatenate([y, z[::-1]]), np.concatenate(volume))
 
 
 def recorded(scene, integrator):
     """All paths of one run of the kernel, and the extinction (1 / scene unit) of T~."""
-    render = rendering.Render(scene, scene.sensors()[0], integrator.settings, 5, 1)
+    render, recorder = rendering.Render(scene, scene.sensors()[0], integrator.settings, 5, 1), Recorder()
     pixels = int(np.prod(render.kernel.camera.region.size))
     samples = -(-LANES * render.plan.camera_paths_per_light_path // pixels)
     batch, points = Batch(0, pixels, 0, samples), Points("independent", dr.opaque(mi.UInt32, 5))
-    recorder, points_of = recording.Recorder(LANES), SensorPoints(render.kernel.camera)
-    render.kernel.camera = points_of
     slots = dr.arange(mi.UInt32, LANES)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), recording.stepwise(render.kernel):
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), stepwise(render.kernel):
         dr.eval(kernel.trace(render.kernel, recorder, batch, points, samples, slots, recorder))
     (sigma,) = render.kernel.space.media.mean(render.kernel.sensor_medium).numpy()
-    made = [points_of.completed(path, lane) for lane in range(LANES) for path in recorder.paths(lane)]
-    return made, float(sigma)
+    return recorder.paths, float(sigma)
 
 
-def normals(p, shape, light):
-    """Of wall and lamp (balls both), and where a vertex lies in the fog."""
-    volume = shape == 0
-    on_lamp = (
-        np.abs(np.linalg.norm(p - light.center, axis=-1) - light.radius) < 1e-3 if light.radius else volume
-    )
-    n = np.where(on_lamp[..., None], (p - light.center) / light.radius if light.radius else p, p)
-    return n / np.linalg.norm(n, axis=-1, keepdims=True), volume
+def normals(p, light):
+    """Of wall and lamp, both balls."""
+    if light.radius:
+        from_lamp = p - light.center
+        on_lamp = np.abs(np.linalg.norm(from_lamp, axis=-1) - light.radius) < 1e-3
+        p = np.where(on_lamp[..., None], from_lamp, p)
+    return p / np.linalg.norm(p, axis=-1, keepdims=True)
 
 
 def explicit_paths(made, scene, sigma):
     """Densities of paths of one length, vertices from the emitter on."""
     light, camera = endpoints.lamps_of(scene)[0], endpoints.Camera.of(scene.sensors()[0])
-    if light.kind == POSITION:
-        light.center = np.zeros(3)
-    p = np.array([path.p[::-1] for path in made])
+    p, volume = (np.array([getattr(path, name) for path in made]) for name in ("p", "volume"))
     n, k = len(p), p.shape[1] - 1
-    shape = np.array([path.shapes[::-1] for path in made])
-    normal, volume = normals(p, shape, light)
+    normal = normals(p, light)
     volume[:, [0, k]] = False
     step = p[:, 1:] - p[:, :-1]
     dist2 = (step**2).sum(2)

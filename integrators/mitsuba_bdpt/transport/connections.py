@@ -100,13 +100,11 @@ def connect_one(kernel: TraceContext, z: Vertex, path: LightPath, stream: Stream
     if kernel.plan.joined > 1:  # each light subpath is a separate estimate
         value = value / kernel.plan.joined
     active, survival, rouletted = roulette(kernel, value, drawn.u, drawn.total > 0)
-    end, own, sides, estimate = drawn.end, None, None, value / survival
+    own, sides, estimate = None, None, value / survival
     if kernel.shape_errors.small:
-        y = read_light_vertex(kernel, path, drawn.end)
-        (ray, own), end = _shadow_ray(kernel, z, y), y.si.p
+        ray, own = _shadow_ray(kernel, z, read_light_vertex(kernel, path, drawn.end))
     else:
-        ray = rays.segment_to(z.anchor, end, z.si)
-    kernel.observer.drawn(end)
+        ray = rays.segment_to(z.anchor, drawn.end, z.si)
     if drawn.unweighted is not None:
         unweighted, light_side, camera_side, size = drawn.unweighted
         estimate = unweighted * (drawn.total / size / survival)

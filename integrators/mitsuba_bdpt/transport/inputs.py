@@ -76,9 +76,6 @@ class Observer:
     def vertex(self, side, walk, vertex, step):
         """A ``walk``, as before its arrival, has reached a `walk.Vertex`; ``step`` from there, or None."""
 
-    def drawn(self, end):
-        """An inner connection was drawn; ``end``: light vertex or end of the shadow ray."""
-
 
 class TraceContext:
     """Inputs of a pass besides its batch. Holds the scene for one render only.
