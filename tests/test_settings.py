@@ -4,8 +4,7 @@ import mitsuba as mi
 import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.cli.arguments import main
-from mitsuba_bdpt.removed import REMOVED
-from mitsuba_bdpt.settings import LAYERS, PARAMETERS, Settings
+from mitsuba_bdpt.settings import LAYERS, PARAMETERS, REPLACED, Settings
 
 
 def test_a_plugin_without_parameters_has_the_defaults():
@@ -23,7 +22,8 @@ def test_the_manual_lists_all():
     assert manual in mi.load_dict({"type": "bdpt"}).__doc__
     for name, parameter in PARAMETERS.items():
         assert manual.count(f" * - {name}\n") == table.count(f"| `{name}` |") == 1
-        assert all(f"``{choice}``" in parameter.meaning for choice in parameter.choices)
+        if name not in ("light_paths", "merging"):  # their values are no strings alone
+            assert all(f"``{choice}``" in parameter.meaning for choice in parameter.choices)
     assert all(f"``{layer}``" in PARAMETERS["layers"].meaning for layer in LAYERS)
 
 
@@ -62,19 +62,13 @@ def test_a_target_error_estimates_the_variance():
     assert mi.load_dict({"type": "bdpt"}).aov_names() == []
 
 
-@pytest.mark.parametrize("entry", REMOVED)
-def test_what_was_removed_is_an_error_with_the_remedy(entry, capsys):
-    parameter = not entry.startswith("--") and entry != "completion"
-    if parameter:
-        name, _, value = entry.partition("=")
-        with pytest.raises((ValueError, RuntimeError)) as error:
-            mi.load_dict({"type": "bdpt", name: value or 1.0})
-        said = str(error.value)
-        assert name in said and (not value or repr(value) in said)
-    else:
-        command = [] if entry == "completion" else ["render", "scene.xml"]
+@pytest.mark.parametrize("name", REPLACED)
+def test_what_was_replaced_is_an_error_with_the_remedy(name, capsys):
+    if name.startswith("--"):
         with pytest.raises(SystemExit) as ended:
-            main([*command, *entry.split()])
-        said = capsys.readouterr().err
-        assert ended.value.code == 2 and all(word in said for word in entry.split())
-    assert f"was removed; {REMOVED[entry]}" in said
+            main(["render", "scene.xml", name])
+        assert ended.value.code == 2 and REPLACED[name] in capsys.readouterr().err
+        return
+    with pytest.raises((ValueError, RuntimeError), match=f"{name}=1.0 is not a parameter") as error:
+        mi.load_dict({"type": "bdpt", name: 1.0})
+    assert REPLACED[name] in str(error.value)

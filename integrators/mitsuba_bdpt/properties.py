@@ -11,7 +11,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import removed
 from .emitters import light_groups
 from .errors import UnsupportedError, UsageError, UsageTypeError, did_you_mean
 from .host.introspection import named
@@ -19,29 +18,13 @@ from .image import denoising, features, film_limits
 from .image.accumulator import Channels
 from .image.colour import POLARIZED, Bands, film_colours
 from .image.layers import GROUP, PATH, film_layers, partitions
-from .settings import LAYERS, LIGHT_PATHS, NONE, PARAMETERS, UNLIMITED, Settings
+from .settings import LAYERS, LIGHT_PATHS, NONE, PARAMETERS, REPLACED, UNLIMITED, Settings
 
 # Valid values of a render's arguments, for messages; for parameters see `settings.PARAMETERS`.
 ARGUMENTS = {
     "spp": f"an integer from 1 to {UNLIMITED}, or 0 for the sampler's sample_count",
     "seed": f"an integer from 0 to {UNLIMITED}",
     "part": f"an integer from 0 to {UNLIMITED}",
-}
-
-# Remedies for parameters that are mistaken for ours. Mitsuba's upgrade of scene files of version 0.6 writes
-# those of its old integrators with underscores.
-_LIGHT_IMAGE = (
-    "it is of Mitsuba 0.6's bdpt; here light subpaths always reach the camera, weighted with all other "
-    "strategies; leave it out, or set light_paths=0 to leave out light tracing"
-)
-_SAMPLE_DIRECT = (
-    "it is of Mitsuba 0.6's bdpt; here emitters and sensors are always sampled directly too, weighted with "
-    "all other strategies; leave it out"
-)
-REMEDIES = {
-    "samplesperpass": "it is deprecated in Mitsuba; use spp_per_pass",
-    "lightimage": _LIGHT_IMAGE,
-    "sampledirect": _SAMPLE_DIRECT,
 }
 
 
@@ -96,39 +79,29 @@ def _choice(value, name: str) -> str:
     choices = PARAMETERS[name].choices
     if not isinstance(value, str):
         raise UsageTypeError(f"{name}={_shown(value)} must be a string, one of {', '.join(choices)}")
-    if remedy := removed.remedy(f"{name}={value}"):
-        raise UsageError(f"{name}={value!r} {remedy}")
     if value not in choices:
         raise UsageError(f"{name}={value!r} is not known; use one of {', '.join(choices)}")
     return value
 
 
 def _light_paths(value, name: str) -> float | str:
-    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
-        raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
-    if value == "auto":
-        return value
     from fractions import Fraction  # takes 3 ms, and the default does not need it
 
+    if isinstance(value, str) and value == "auto":
+        return value
     try:
-        number = float(Fraction(value))
+        number = None if isinstance(value, bool) else float(Fraction(value))
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         number = None
     if number not in LIGHT_PATHS:
-        choices = ", ".join(str(Fraction(n)) for n in LIGHT_PATHS)
-        raise UsageError(f"{name}={value!r} is not possible; use auto, {choices}")
+        choices = ", ".join(PARAMETERS[name].choices)
+        raise UsageError(f"{name}={_shown(value)} is not possible; use one of {choices}")
     return number
 
 
 def _merging(value, name: str) -> bool | str:
-    choices = {"auto": "auto", "true": True, "false": False}
-    if isinstance(value, bool):
-        return value
-    if not isinstance(value, str):
-        raise UsageTypeError(f"{name}={_shown(value)} must be {PARAMETERS[name].what}")
-    if value not in choices:
-        raise UsageError(f"{name}={value!r} is not known; use one of {', '.join(choices)}")
-    return choices[value]
+    word = _choice(str(value).lower() if isinstance(value, bool) else value, name)
+    return {"true": True, "false": False}.get(word, word)
 
 
 def _layers(value, name: str) -> tuple[str, ...]:
@@ -176,11 +149,7 @@ def _not_a_parameter(name: str, value) -> str:
         return (
             f"{name} ({value.class_name()}) cannot be nested in it: bdpt holds no other object; take it out"
         )
-    if remedy := removed.remedy(name):
-        return f"{name}={_shown(value)}: the parameter {remedy}"
-    remedy = REMEDIES.get(name.replace("_", "").lower())
-    if remedy is None:
-        remedy = f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
+    remedy = REPLACED.get(name) or f"{did_you_mean(name, PARAMETERS)}Parameters: {', '.join(PARAMETERS)}"
     return f"{name}={_shown(value)} is not a parameter; {remedy}"
 
 

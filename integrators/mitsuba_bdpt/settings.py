@@ -21,10 +21,7 @@ MAX_STORED = 1024
 DEFAULT_STORED = 64
 
 HEURISTICS = ("balance", "power")
-SKIP = ("auto", "impossible", "none")
 LIGHT_PATHS = (0, 1, 1 / 2, 1 / 4, 1 / 8, 1 / 16)
-GUIDING = ("auto", "always", "photons", "emission", "never")
-CONNECTIONS = ("auto", "all", "one", "none")
 POINTS = ("sobol", "independent")
 LAYERS = ("variance", "denoised", "stokes", "strategies")
 
@@ -32,19 +29,35 @@ LAYERS = ("variance", "denoised", "stokes", "strategies")
 # Text that a parameter may have in place of an empty one.
 NONE = "none"
 
+# What is no parameter or option, but was in an earlier version or is elsewhere, and what to use instead.
+_OF_06 = "it is of Mitsuba 0.6's bdpt; here all strategies are weighted with one another; leave it out"
+REPLACED = {
+    "decisions": "set light_paths and connections; checkpoints and clusters hand over what was decided",
+    "photon_guiding": "use guiding",
+    "emission_guiding": "use guiding",
+    "strategy_images": "use layers=strategies",
+    "variance": "use layers=variance",
+    "denoise": "use layers=denoised",
+    "stokes": "use layers=stokes",
+    "samples_per_pass": "it is deprecated in Mitsuba; use spp_per_pass",
+    "light_image": f"{_OF_06}, or set light_paths=0 for no light tracing",
+    "sample_direct": _OF_06,
+    "--frames": "render each frame by a command of its own, with --sensor and --seed",
+}
+
 
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of the plugin.
 
-    ``default`` as in a scene file; ``what``: its value, in a few words for error messages; ``meaning``: its
-    entry in the manual, in reStructuredText; ``low`` and ``high`` bound numbers, both included (of a
-    ``float`` infinity is not); ``choices`` of a string, the default first.
+    ``default`` as in a scene file; ``meaning``: its entry in the manual, in reStructuredText; ``what``: its
+    value, in a few words for error messages; ``low`` and ``high`` bound numbers, both included (of a
+    ``float`` infinity is not); ``choices``: all values, the default first.
     """
 
     default: bool | int | float | str
-    what: str
     meaning: str
+    what: str = ""
     low: float = -inf
     high: float = inf
     choices: tuple[str, ...] = ()
@@ -58,9 +71,9 @@ class Parameter:
 Value = bool | int | float | str
 
 
-def _parameter(default: Value, what: str, meaning: str, value: Any = None, **bounds: Any) -> Any:
+def _parameter(default: Value, meaning: str, what: str = "", value: Any = None, **bounds: Any) -> Any:
     """A field of `Settings` that holds ``value`` (None: the same) for the parameter's ``default``."""
-    parameter = Parameter(default, what, " ".join(meaning.split()), **bounds)
+    parameter = Parameter(default, " ".join(meaning.split()), what, **bounds)
     return field(default=default if value is None else value, metadata={"parameter": parameter})
 
 
@@ -82,116 +95,109 @@ class Settings:
 
     max_depth: int = _parameter(
         -1,
-        "the longest path in edges, -1 for unlimited",
         """Longest path in edges, as in ``path`` (with media as in ``volpath``): 1 is directly visible
         emitters, -1 unlimited.""",
+        "the longest path in edges, -1 for unlimited",
         UNLIMITED,
         low=-1,
         high=UNLIMITED,
     )
     rr_depth: int = _parameter(
         5,
-        "the depth at which Russian roulette starts, 1 or more",
         "Russian roulette starts at this depth, as in ``path``.",
+        "the depth at which Russian roulette starts, 1 or more",
         low=1,
         high=UNLIMITED,
     )
     hide_emitters: bool = _parameter(
         False,
-        "true or false",
         "Hides directly visible emitters, as in ``path``.",
     )
     heuristic: str = _parameter(
         "balance",
-        "a heuristic",
         "Heuristic of multiple importance sampling: ``balance`` or ``power`` (exponent 2).",
         choices=HEURISTICS,
     )
     skip: str = _parameter(
         "auto",
-        "what may be left out",
         """Leaves out nothing (``none``), what the scene cannot use (``impossible``), or also what a short
         pilot render predicts not to pay (``auto``).""",
-        choices=SKIP,
+        choices=("auto", "impossible", "none"),
     )
     light_paths: float | str = _parameter(
         "auto",
-        "a number or 'auto'",
         """Light subpaths per camera subpath: 0 (path tracing), 1/16, 1/8, 1/4, 1/2 or 1; with ``auto`` the
         pilot chooses, a number switches the pilot off.""",
+        choices=("auto", "0", "1", "1/2", "1/4", "1/8", "1/16"),
     )
     connections: str = _parameter(
         "auto",
-        "a kind of inner connections",
         """Connections per camera vertex to vertices of light subpaths: ``all``, ``one`` or ``none``; with
         ``auto`` the pilot chooses, the others switch the pilot off.""",
-        choices=CONNECTIONS,
+        choices=("auto", "all", "one", "none"),
     )
     points: str = _parameter(
         "sobol",
-        "a kind of sample points",
         "Random numbers: ``sobol`` (Owen-scrambled Sobol' points) or ``independent``.",
         choices=POINTS,
     )
     merging: bool | str = _parameter(
         "auto",
-        "true, false or 'auto'",
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
         as the floor of a pool), also of nearly specular surfaces, by vertex merging with photons: consistent,
         not unbiased. With ``auto`` where the other strategies lack 1 % of the image's light or more.""",
+        choices=("auto", "true", "false"),
     )
     guiding: str = _parameter(
         "auto",
-        "what is guided",
         """Learned sampling where the pilot predicts a gain (``auto``): photons guide BSDF sampling of SDS
         paths, and tables guide emission; ``photons`` or ``emission`` allows one of them, ``never`` neither;
         ``always`` uses photons wherever it is possible.""",
-        choices=GUIDING,
+        choices=("auto", "always", "photons", "emission", "never"),
     )
     aovs: str = _parameter(
         "",
-        "a string, for example 'albedo:albedo,nn:sh_normal'",
         """Adds feature layers by pairs ``name:kind`` as Mitsuba's ``aov``, for example
         ``albedo:albedo,nn:sh_normal``.""",
+        "a string, for example 'albedo:albedo,nn:sh_normal'",
     )
     layers: tuple[str, ...] = _parameter(
         "",
-        "a text with commas between, such as 'variance,denoised'",
         """Adds layers to the image, separated by commas: ``variance`` (of each pixel), ``denoised`` (by
         Intel's Open Image Denoise), ``stokes`` (Stokes vectors), ``strategies`` (an image of each).""",
+        "a text with commas between, such as 'variance,denoised'",
         (),
     )
     light_groups: str = _parameter(
         "",
-        "a string such as 'key: lamp1, lamp2; sky: envmap', or 'auto'",
         """Adds a layer of the light of each group of emitters; their sum is the image. Groups are given by
         ids of emitters or their shapes, ``key: lamp1, lamp2; sky: envmap`` (``*`` for any characters), or
         ``auto``: one per emitter, from the ninth on together.""",
+        "a string such as 'key: lamp1, lamp2; sky: envmap', or 'auto'",
     )
     path_layers: bool = _parameter(
         False,
-        "true or false",
         """Adds four layers of the light by its path; their sum is the image: ``emission`` (visible emitters),
         ``direct``, ``indirect``, and ``caustic`` (direct light by way of specular surfaces).""",
     )
     target_error: float = _parameter(
         0.0,
-        "the relMSE to stop at, or 0 for none",
         """Stops the render when its estimated relMSE is at most this, 0 for never; adds the layer
         ``variance``.""",
+        "the relMSE to stop at, or 0 for none",
         low=0,
     )
     spp_per_pass: int = _parameter(
         0,
-        "samples per pixel in one pass, 0 to choose",
         "Samples per pixel of a pass, after which progress is shown and checkpoints are written; 0 chooses.",
+        "samples per pixel in one pass, 0 to choose",
         low=0,
         high=UNLIMITED,
     )
     timeout: float = _parameter(
         -1.0,
-        "a number of seconds, or -1 for none",
         "Seconds after which no further pass is started, -1 for no limit.",
+        "a number of seconds, or -1 for none",
     )
 
     internals: Internals = Internals()

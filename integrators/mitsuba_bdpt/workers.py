@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
-from collections import Counter
 from contextlib import contextmanager
 
 from .errors import CommandError, FailureError
@@ -37,35 +36,19 @@ def _check_answers(address: str) -> None:
 def results(client, function, arguments):
     """Yield index and result of ``function(*arguments[index])`` as workers of ``client`` finish.
 
-    Each index is yielded once. A worker runs one call at a time. Idle workers repeat unfinished calls, so
-    that a slow machine does not delay the end; results must not depend on the worker. Calls of a lost worker
-    move to another one.
+    Calls of a lost worker move to another one. Raises ``FailureError`` for a call that failed, and if the
+    scheduler is gone.
     """
     from distributed import as_completed
 
-    left, running, pending = dict(enumerate(arguments)), {}, as_completed()
-
-    def fill():
-        workers, times = max(1, worker_count(client)), Counter(running.values())  # may be 0 for a moment
-        for index in sorted(left, key=times.__getitem__):  # those that run nowhere first
-            if len(running) < workers and times[index] < 2:
-                future = client.submit(function, *left[index], pure=False)
-                running[future] = index
-                pending.add(future)
-
+    futures = {client.submit(function, *given, pure=False): i for i, given in enumerate(arguments)}
     try:
-        fill()
-        while left:
-            future = next(pending)
-            index = running.pop(future)
-            if index in left:
-                found = _result(future, index)
-                del left[index]
-                yield index, found
-            fill()
+        for future in as_completed(list(futures)):
+            index = futures.pop(future)
+            yield index, _result(future, index)
     finally:
         with contextlib.suppress(Exception):  # the scheduler may be gone
-            client.cancel(list(running), force=True)
+            client.cancel(list(futures), force=True)
 
 
 def _result(future, index: int):

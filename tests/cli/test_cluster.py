@@ -3,11 +3,10 @@
 import json
 import os
 import signal
-import threading
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 
-import distributed
 import numpy as np
 import pytest
 import rendered
@@ -16,6 +15,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.loading import load
 from mitsuba_bdpt.planning import pilot
+from mitsuba_bdpt.run.snapshot import Snapshot
 from mitsuba_bdpt.workers import results
 
 SKY = """<scene version="3.0.0"><integrator type="bdpt"/>
@@ -63,10 +63,9 @@ def test_a_render_on_a_cluster_is_the_sum_of_its_parts(workers, tmp_path, name, 
     scene, integrator, _ = load(options)
     job = cluster._job(scene, integrator, options, 256)
     assert json.loads(job)["decisions"] == [decided]
-    merged = cluster.Merged()
-    for index, part in enumerate(cluster.parts_of(256, 8, 0)):
-        merged.add(index, cluster.Snapshot.from_bytes(cluster.render_part(job, index, *part)))
-    expected = np.array(integrator.assemble(merged.snapshot, scene))[..., :3]
+    parts = (cluster.render_part(job, i, *part) for i, part in enumerate(cluster.parts_of(256, 8, 0)))
+    merged = reduce(Snapshot.joined, map(Snapshot.from_bytes, parts))
+    expected = np.array(integrator.assemble(merged, scene))[..., :3]
     np.testing.assert_allclose(pixels, expected, rtol=2e-3, atol=1e-6)
 
 
@@ -104,17 +103,15 @@ def test_what_the_pilot_left_is_kept(workers, tmp_path, monkeypatch):
 def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch):
     assert main(arguments(workers, tmp_path / "calm.exr")) == 0
     killed = []
-    original = cluster.Merged.add
 
-    def add(self, index, snapshot):
-        original(self, index, snapshot)
-        if self.count == 2 and not killed:
-            with distributed.Client(workers.scheduler_address) as client:
-                pids = client.run(os.getpid)
-            killed.append(next(iter(pids.values())))
-            os.kill(killed[0], signal.SIGKILL)
+    def lossy(client, *given):
+        for part in results(client, *given):
+            yield part
+            if not killed:
+                killed.extend(client.run(os.getpid).values())
+                os.kill(killed[0], signal.SIGKILL)
 
-    monkeypatch.setattr(cluster.Merged, "add", add)
+    monkeypatch.setattr(cluster, "results", lossy)
     assert main(arguments(workers, tmp_path / "lost.exr")) == 0
     assert killed
     (expected, calm), (found, lost) = (
@@ -123,68 +120,6 @@ def test_a_lost_worker_does_not_change_the_image(workers, tmp_path, monkeypatch)
     )
     np.testing.assert_allclose(found, expected, rtol=2e-3, atol=1e-6)
     assert lost["rays"] == calm["rays"] and lost["passes"] == calm["passes"]
-
-
-def test_parts_are_added_in_their_order():
-    class Text:
-        def __init__(self, text):
-            self.text = text
-
-        def joined(self, other):
-            return Text(self.text + other.text)
-
-    merged = cluster.Merged()
-    for index in (2, 0, 2, 0, 3, 1, 3):
-        merged.add(index, Text(str(index)))
-    assert merged.snapshot.text == "0123" and merged.count == 4
-
-
-def test_an_idle_worker_takes_over_what_a_slow_one_has(monkeypatch):
-    released = threading.Event()
-
-    class Future:
-        def __init__(self, value):
-            self.value = value
-
-        def result(self):
-            return self.value
-
-    class Client:
-        submitted = []
-
-        def submit(self, function, seed, pure):
-            self.submitted.append(seed)
-            return Future(seed)
-
-        def scheduler_info(self, n_workers):
-            return {"workers": {"fast": 0, "slow": 0}}
-
-        def cancel(self, futures, force):
-            released.set()
-
-    class Completed:
-        """The first future is never done; others are at once."""
-
-        def __init__(self):
-            self.futures = []
-
-        def add(self, future):
-            self.futures.append(future)
-
-        def __next__(self):
-            return self.futures.pop(1)
-
-    monkeypatch.setattr(distributed, "as_completed", Completed)
-    found = list(results(Client(), None, [(seed,) for seed in range(4)]))
-    assert sorted(found) == [(i, i) for i in range(4)] and released.is_set()
-    assert Client.submitted == [0, 1, 2, 3, 0]
-
-
-def test_a_scheduler_that_is_not_there(tmp_path, capsys, monkeypatch):
-    original = distributed.Client
-    monkeypatch.setattr(distributed, "Client", lambda address, timeout: original(address, timeout="1s"))
-    assert main(["render", str(SCENE), "--scheduler", "127.0.0.1:1", "-o", str(tmp_path / "a.exr")]) == 1
-    assert "127.0.0.1:1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("come", [0, 3])

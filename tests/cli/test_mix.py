@@ -93,23 +93,6 @@ def test_without_weights_the_layers_are_listed(tmp_path, capsys):
     assert len(lines) == len(lamps) + len(PATHS) and not (tmp_path / "a.mixed.png").exists()
 
 
-def test_a_pattern_may_match_no_layer(tmp_path, capsys):
-    layers = rendered(tmp_path / "a.exr", groups=("key", "rest"), paths=PATHS)
-    output = ["-o", str(tmp_path / "b.exr")]
-    assert main(["mix", str(tmp_path / "a.exr"), "torch*=2", "key=0", *output]) == 0
-    error = capsys.readouterr().err
-    assert error.startswith("warning: bdpt: ") and error.count("\n") == 1
-    assert "'torch*' changes nothing: the image has no layer 'torch*'; there are groups.key, groups" in error
-    assert np.array_equal(np.array(mi.Bitmap(str(tmp_path / "b.exr"))), layers["rest"])
-    assert json.loads(attribute(tmp_path / "b.exr", "bdptMix") or "") == {"groups.key": [0, 0, 0]}
-    for weights, words in (
-        ({"torch": 2, "key": 1}, "no layer 'torch'"),
-        ({"torch*": -1, "key": 1}, r"torch\*=-1 must be"),
-    ):
-        with pytest.raises(CommandError, match=words):
-            mix(tmp_path / "a.exr", weights)
-
-
 def test_a_mix_records_its_weights(tmp_path):
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "k*=0.5,1,2", "-o", str(tmp_path / "b.exr")]) == 0
@@ -152,7 +135,7 @@ def test_weights_may_be_colours(tmp_path):
         ({"sky": float("nan")}, "sky=nan must be"),
         ({"sky": 1e40}, r"sky=1e\+40 must be"),
         ({"sky": "2"}, "sky='2' must be"),
-        ({2: 2}, "has no layer '2'"),
+        ({"torch*": 2, "sky": 1}, r"no layer 'torch\*'"),
     ],
 )
 def test_what_cannot_be_mixed(tmp_path, weights, words):
@@ -172,17 +155,13 @@ def test_images_that_cannot_be_mixed(tmp_path, capsys):
     with pytest.raises(CommandError, match="is not an EXR"):
         mix(tmp_path / "b.exr", {})
     assert main(["mix", str(tmp_path / "c.exr"), "key=1"]) == 2
-    assert "c.exr': No such file or directory; give the path of one" in capsys.readouterr().err
+    assert "c.exr': No such file or directory" in capsys.readouterr().err
     rendered(tmp_path / "a.exr")
     assert main(["mix", str(tmp_path / "a.exr"), "-m", "none"]) == 2
     assert main(["mix", str(tmp_path / "a.exr"), "key=1", "key=2"]) == 2
     assert "a layer of key has two weights; give it one" in capsys.readouterr().err
     assert main(["mix", str(tmp_path / "a.exr"), "key=1", "-o", str(tmp_path / "b.jpg")]) == 2
-    assert "b.jpg' must end in .png or .exr" in capsys.readouterr().err
-    with pytest.raises(TypeError, match="image=ndarray must be an mi.Bitmap or the path of an EXR"):
-        mix(np.zeros((3, 4, 3)), {"key": 1})
-    with pytest.raises(TypeError, match="weights=list must be a dictionary"):
-        mix(tmp_path / "a.exr", [("key", 1)])
+    assert "b.jpg' must end in .png" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["mix", str(tmp_path / "a.exr"), "key"])
     assert "must have the form LAYER=X or LAYER=X,Y,Z" in capsys.readouterr().err
@@ -231,6 +210,6 @@ def test_a_mix_does_not_replace_its_image(tmp_path, output, capsys, monkeypatch)
     before = (tmp_path / "a.exr").read_bytes()
     assert main(["mix", "a.exr", "key=0.5", "-o", output]) == 2
     error = capsys.readouterr().err
-    assert f"output={output!r}: the mix would replace" in error and "name another with -o" in error
+    assert f"output={output!r}: the mix would replace" in error
     assert (tmp_path / "a.exr").read_bytes() == before
     assert (tmp_path / "a.png").read_bytes() == b"the PNG of the render"

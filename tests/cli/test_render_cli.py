@@ -65,7 +65,7 @@ class Passes(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props)
         self.given = {key: props[key] for key in props.keys()}
-        self.settings = SimpleNamespace(target_error=0)
+        self.settings = SimpleNamespace(target_error=0, timeout=-1)
         self.stop_after = props.get("stop_after", 2)
         self.on_pass = None
         self.statistics = {}
@@ -353,7 +353,7 @@ OWN = "--integrator", "scene", "-D", "integrator=bdpt"
         ([], ["-P", "layers=stokes"], "layers=stokes needs a .*'llvm_ad_spectral_polarized'"),
         ([], ["-P", "max_depth=0.5"], "max_depth=0.5 must be an integer: the longest path"),
         ([], ["-P", "max_dept=4"], r"max_dept=4 is not a parameter; did you mean max_depth\? Parameters:"),
-        ([], ["-P", "decisions=[]"], r"decisions='\[\]': the parameter was removed; set light_paths and"),
+        ([], ["-P", "decisions=[]"], r"decisions='\[\]' is not a parameter; set light_paths and"),
         ([], ["--spp", "9999999999"], "spp=9999999999 must be an integer from 1 to 4294967295, or 0"),
         ([('"width" value="6"', '"width" value="1000001"')], [], "for a PNG, whose sides have 1000000"),
         ([('count" value="4"', 'count" value="0"')], [], "sample_count=0: nothing is to"),
@@ -545,11 +545,9 @@ def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, caps
 @pytest.mark.parametrize(
     ("arguments", "question"),
     [
-        (["plain.xml"], "did you mean render plain.xml?"),
         (["rendr", "plain.xml"], "did you mean render?"),
         (["render", "plain.xml", "--integrater", "bdpt"], "did you mean --integrator?"),
         (["render", "plain.xml", "--traget-error=1"], "did you mean --target-error?"),
-        (["explain", "plain.xml", "--integrator", "path"], "that is an option of another command"),
         (
             ["render", "plain.xml", "--light-groups", "auto"],
             "that is a parameter of the integrator: -P light_groups=VALUE",
@@ -613,8 +611,8 @@ def test_an_output_that_cannot_be_written_is_refused_before_the_render(scene, ca
 @pytest.mark.parametrize(
     "arguments",
     ["--spp 0", "--spp 1.5", "--time nan", "--time -1", "--seed -1", f"--seed {2**32}", "-D x", "-P =1"]
-    + ["--sensor x", "--size 16", "--size 0x4", "--crop 1,2,3", "--crop 0,0,0,4", "--frames 3-1"]
-    + ["--frames x", "--frames 0-4:0", "--threads 0", "--resume plain.xml", "--resume yes"],
+    + ["--sensor x", "--size 16", "--size 0x4", "--crop 1,2,3", "--crop 0,0,0,4"]
+    + ["--threads 0", "--resume plain.xml", "--resume yes"],
 )
 def test_bad_values_are_usage_errors(arguments, capsys):
     with pytest.raises(SystemExit) as caught:

@@ -19,14 +19,13 @@ from typing import ClassVar, NoReturn
 
 import mitsuba_bdpt
 
-from .. import removed
 from ..errors import did_you_mean
 from ..host import signals
 from ..measure.options import SECONDS, SEED, STOPS, WHOLE, Number
 from ..progress import KINDS
-from ..settings import PARAMETERS
+from ..settings import PARAMETERS, REPLACED
 from . import measuring, mistakes
-from .values import crop, definition, frames, property_, size, weight
+from .values import crop, definition, property_, size, weight
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -55,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
         if options.command == "mix":
             from . import mix
 
-            return mix.run(options)
+            return mistakes.answered(lambda: mix.run(options))
         return render.explain(options) if options.command == "explain" else render.run(options)
 
 
@@ -75,26 +74,15 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End the process with a usage error, in one line."""
-        wrong = re.search(r"COMMAND: invalid choice: '(.*?)'|unrecognized arguments: (--[^\s=]*)", message)
-        value = re.search(r"argument (--\S+): invalid choice: '(.*?)'", message)
-        question = ""
-        if wrong:
-            question = self._question(wrong[1] or wrong[2])
-        elif value:
-            question = removed.remedy(f"{value[1]} {value[2]}")
+        wrong = re.search(r"(?:COMMAND: invalid choice: '|unrecognized arguments: )([^\s'=]*)", message)
+        name = wrong[1] if wrong else ""
+        parameter = name.lstrip("-").replace("-", "_")
+        if parameter in PARAMETERS:
+            question = f"that is a parameter of the integrator: -P {parameter}=VALUE"
+        else:
+            question = REPLACED.get(name) or (did_you_mean(name, self.known) if wrong else "")
         question = question.rstrip() or f"see {self.prog} --help"
         self.exit(mistakes.USAGE, f"{self.prog}: error: {message}; {question}\n")
-
-    def _question(self, name: str) -> str:
-        """Suggest a command or an option for an unknown ``name``."""
-        parameter = name.lstrip("-").replace("-", "_")
-        if name in self.known:
-            return "that is an option of another command"
-        if name.lower().endswith(".xml"):
-            return f"did you mean render {name}?"
-        if parameter in PARAMETERS:
-            return f"that is a parameter of the integrator: -P {parameter}=VALUE"
-        return removed.remedy(name) or did_you_mean(name, self.known)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -190,8 +178,6 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--resume", nargs="?", choices=("auto", "must", "never"), const="must", help=text)
     text = "JSON file to write with what was rendered: seconds, rays, passes, decisions, memory, versions"
     add("--statistics", type=Path, metavar="FILE", help=text)
-    text = "render these sensors in turn: 0-9, 0-99:10 or 1,3,8; their numbers go into the images' names"
-    add("--frames", type=frames, metavar="RANGE", help=text)
     text = "bar, lines (for logs, from ten seconds on) or none; default: a bar on a terminal, lines elsewhere"
     add("--progress", choices=KINDS, default="auto", help=text)
     text = "rewrite the PNG with the image so far every SECONDS"
@@ -207,7 +193,7 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     )
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
-    text = "of the random numbers; each of the --frames adds its number; default: %(default)s"
+    text = "of the random numbers; default: %(default)s"
     add("--seed", type=SEED, default=0, help=text)
     text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
     add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)

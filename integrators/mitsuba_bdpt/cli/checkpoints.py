@@ -12,17 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import CommandError
-from ..files.images import attribute
 from ..files.loading import named_files, parsed_anyway, searching, spectra
 from ..files.whole import replacing
-from ..host.introspection import versions
 from ..run.snapshot import Snapshot, read
 
 BEGIN_ANEW = "begin anew by --resume never"
 """What to do about a checkpoint that is of no use."""
-
-IDENTITY = "bdptIdentity"
-"""Attribute of finished images of renders with checkpoints: `identity`."""
 
 
 def path_of(output: Path) -> Path:
@@ -41,20 +36,6 @@ def digest(options: Namespace) -> str:
     for text in spectra(state):
         found.update(text.encode())
     return found.hexdigest()
-
-
-def identity(options: Namespace, spp: int) -> str:
-    """Hash what determines the image of a command line with ``spp`` samples per pixel."""
-    names = "variant", "integrator", "properties", "denoise", "exposure", "seed", "time", "target_error"
-    values = [digest(options), versions(), spp, *(getattr(options, name) for name in names)]
-    return hashlib.sha256(json.dumps(values).encode()).hexdigest()
-
-
-def is_done(options: Namespace, spp: int) -> bool:
-    """Return whether an earlier run of this command with checkpoints made the frame's image."""
-    if options.frames is None or options.checkpoint is None or options.resume == "never":
-        return False
-    return attribute(options.output, IDENTITY) == identity(options, spp)
 
 
 def start(options: Namespace) -> Snapshot | None:

@@ -57,34 +57,6 @@ def parts_of(spp: int, count: int, seed: int) -> list[tuple[int, int]]:
     return [((seed + i * STRIDE) % 2**32, spp // count + (i < spp % count)) for i in range(count)]
 
 
-class Merged:
-    """Sums snapshots in the order of the parts, in whatever order they arrive."""
-
-    def __init__(self):
-        self.snapshot, self._next, self._waiting = None, 0, {}
-
-    def add(self, index: int, snapshot: Snapshot) -> None:
-        """Add part ``index``; ignores a part that was added before."""
-        if index >= self._next:
-            self._waiting[index] = snapshot
-        while self._next in self._waiting:
-            self._add(self._next)
-            self._next += 1
-
-    def close(self) -> None:
-        """Add the parts after a missing one, in order."""
-        for index in sorted(self._waiting):
-            self._add(index)
-
-    def _add(self, index: int) -> None:
-        part = self._waiting.pop(index)
-        self.snapshot = part if self.snapshot is None else self.snapshot.joined(part)
-
-    @property
-    def count(self) -> int:
-        return self._next + len(self._waiting)
-
-
 def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[PassReport], None]):
     """Render on the cluster ``options.scheduler``, into the sensor's film.
 
@@ -92,9 +64,9 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
     and what ended the render early, else None: Ctrl-C, a lost scheduler, a failed part. The statistics then
     cover the parts that arrived. Raises errors of `connected`, and those before the first part.
     """
-    started, merged = time.perf_counter(), Merged()
+    started, arrived, ended = time.perf_counter(), {}, None
+    merged, following = None, 0
     integrator.statistics = {}  # not those of the previous render
-    ended: BaseException | None = None
     with connected(options.scheduler) as workers:
         job = _job(scene, integrator, options, spp)
         of_pilot = integrator.statistics  # before the parts replace them
@@ -102,22 +74,29 @@ def render(scene, integrator, options: Namespace, spp: int, on_part: Callable[[P
         parts = [(job, i, *part) for i, part in enumerate(parts_of(spp, count, options.seed))]
         try:
             for index, data in results(workers, render_part, parts):
-                merged.add(index, Snapshot.from_bytes(data))
-                done = merged.snapshot
-                if done is not None:
-                    rays = sum(done.progress.work.counts[name] for name in RAYS)
+                arrived[index] = Snapshot.from_bytes(data)
+                while following in arrived:
+                    merged = joined(merged, arrived.pop(following))
+                    following += 1
+                if merged is not None:
+                    rays = sum(merged.progress.work.counts[name] for name in RAYS)
                     seconds = time.perf_counter() - started
-                    image = partial(integrator.assemble, done, scene, options.sensor)
-                    on_part(PassReport(done.spp, spp, seconds, rays, None, lambda s=done: s, image))
+                    image = partial(integrator.assemble, merged, scene, options.sensor)
+                    on_part(PassReport(merged.spp, spp, seconds, rays, None, lambda s=merged: s, image))
         except (KeyboardInterrupt, Exception) as error:
             ended = behind(error, KeyboardInterrupt) or error
-    merged.close()
-    if merged.snapshot is None:
+    for index in sorted(arrived):  # after a missing one
+        merged = joined(merged, arrived[index])
+    if merged is None:
         if isinstance(ended, Exception):
             raise ended
         return {"passes": []}, ended
-    integrator.assemble(merged.snapshot, scene, options.sensor, develop=False)
+    integrator.assemble(merged, scene, options.sensor, develop=False)
     return _with_pilot(integrator.statistics, of_pilot), ended
+
+
+def joined(merged: Snapshot | None, part: Snapshot) -> Snapshot:
+    return part if merged is None else merged.joined(part)
 
 
 def _with_pilot(parts: dict, of_pilot: dict) -> dict:

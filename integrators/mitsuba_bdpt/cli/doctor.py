@@ -15,8 +15,8 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import mitsuba_bdpt
 
@@ -45,8 +45,7 @@ print(json.dumps({
 """
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One line of the report. `state` is ``ok``, ``note`` or ``FAIL``."""
 
     state: str
@@ -81,10 +80,10 @@ def versions() -> list[Finding]:
         try:
             findings.append(Finding("ok", package, importlib.metadata.version(package)))
         except importlib.metadata.PackageNotFoundError:
-            text = f"not installed; mend it with: python -m pip install {package}"
             # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
-            found = ("note", package, "not installed") if package == llvm.WHEEL else ("FAIL", package, text)
-            findings.append(Finding(*found))
+            state = "note" if package == llvm.WHEEL else "FAIL"
+            text = f"not installed; mend it with: python -m pip install {package}"
+            findings.append(Finding(state, package, text))
     return findings
 
 
@@ -123,62 +122,47 @@ def render_in_child(
     report: dict = {}
     for line in child.stdout.splitlines():
         report |= json.loads(line) if line.startswith("{") else {}
-    findings = [threads(report["threads"])] if "threads" in report else []
-    if "variants" in report:
-        findings.append(variants(report["variants"], report.get("backends", [])))
-    return [*findings, Finding(*judge(child, report, variant))]
-
-
-def threads(count: int) -> Finding:
-    """Report Dr.Jit's ``count`` of threads, and why there are two on one processor."""
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    why = ", two of which Mitsuba needs to read and write EXR files" if available == 1 < count else ""
-    return Finding("ok", "threads", f"{count}{why}; processors: {available}")
-
-
-def variants(installed: list[str], backends: list[str]) -> Finding:
-    """Report which ``installed`` variants bdpt can use, and why not the others.
-
-    ``backends``: ``LLVM`` or ``CUDA``, if its library or driver and device are found.
-    """
-    reasons: dict[str, list[str]] = {}
-    for name in installed:
-        reasons.setdefault(why_not(name, backends), []).append(name)
-    here = reasons.pop("", [])
-    others = [f"{', '.join(names)} ({why})" for why, names in reasons.items()]
-    text = f"here: {', '.join(here) or 'none'}" + (f"; not: {'; '.join(others)}" if others else "")
-    return Finding("ok" if here else "note", "variants", text)
+    findings = [judge(child, report, variant)]
+    if "threads" in report:
+        text = f"{report['threads']}; processors: {os.cpu_count()}"
+        here = [name for name in report["variants"] if not why_not(name, report["backends"])]
+        findings = [
+            Finding("ok", "threads", text),
+            Finding("ok" if here else "note", "variants", f"here: {', '.join(here) or 'none'}"),
+            *findings,
+        ]
+    return findings
 
 
 def why_not(variant: str, backends: list[str]) -> str:
-    """Return why bdpt cannot render with ``variant``; empty if it can."""
-    reasons = {
-        "scalar": "bdpt has no scalar variant",
-        "metal": "bdpt does not support Metal",
-        "cuda": "" if "CUDA" in backends else "no CUDA device or driver was found",
-        "llvm": "" if "LLVM" in backends else "no LLVM library was found",
-    }
-    return reasons[variant.partition("_")[0]]
+    """Return why bdpt cannot render with ``variant``; empty if it can.
+
+    ``backends``: ``LLVM`` or ``CUDA``, if its library or driver and device are found.
+    """
+    backend = variant.partition("_")[0].upper()
+    if backend not in ("LLVM", "CUDA"):
+        return f"bdpt does not support variants of {backend.lower()}"
+    return "" if backend in backends else f"no {backend} library, driver or device was found"
 
 
-def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> tuple[str, str, str]:
+def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Finding:
     """Return the finding about the `child`, which printed `report`."""
-    last = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
+    text = (child.stderr.strip().splitlines() or ["it printed no error"])[-1]
     mean = report.get("mean", float("nan"))
     if child.returncode < 0:
-        text = f"the process rendering it was killed by {signal.Signals(-child.returncode).name} ({last})."
+        text = f"the process rendering it was killed by {signal.Signals(-child.returncode).name} ({text})."
         if variant.startswith("llvm"):
             text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {crash_remedy()}"
     elif child.returncode > 0:
-        reason = why_not(variant, report["backends"]) if "backends" in report else ""
-        text = f"{variant} cannot render here: {reason}" if reason else last
+        if "backends" in report and (reason := why_not(variant, report["backends"])):
+            text = f"{variant} cannot render here: {reason}"
     # The box reflects less than its lamp emits, and no part of it is black.
     elif not 0.01 < mean < 10:
         text = f"rendered with {variant}, but its mean is {mean:g}"
     else:
         with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
-        return "ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}"
-    return "FAIL", "test image", text
+        return Finding("ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}")
+    return Finding("FAIL", "test image", text)
 
 
 def crash_remedy() -> str:

@@ -6,8 +6,8 @@ Usage errors, `USAGE`, concern the user's input; the same command would fail aga
   Mitsuba or Dr.Jit.
 * ``argparse.ArgumentTypeError``: words of the command line that are parsed later.
 * ``OSError`` about a path that is missing or cannot be written (`PATHS`).
-* ``RuntimeError`` of Mitsuba's parser: about a scene file, an unknown plugin, or its parameters; with the
-  traceback of a Python plugin, only if that ends in one of the first.
+* ``RuntimeError`` of Mitsuba's parser; with the traceback of a Python plugin, only if that ends in one of
+  the first.
 * ``RuntimeError`` of a plugin of the scene while rendering (`OF_PLUGIN`), such as a texture without spectra.
 
 Failures, `FAILURE`, may be transient: `errors.FailureError`, other ``OSError``, ``MemoryError`` and Dr.Jit's
@@ -76,72 +76,46 @@ def answered(main: Callable[[], int | None], interrupted: str = "interrupted") -
         return status
 
 
-REMEDIES = {
-    errno.ENOENT: "give the path of one that is there",
-    errno.EACCES: "give a path that may be read and written, or change its rights",
-    errno.EPERM: "give a path that may be read and written, or change its rights",
-    errno.EROFS: "give a path on a disk that can be written",
-    errno.EEXIST: "a file stands where a folder is needed: move it away, or give another path",
-    errno.ENOTDIR: "a file stands where a folder is needed: move it away, or give another path",
-    errno.EISDIR: "a folder stands where a file is needed: give another path",
-    errno.ENOSPC: "free some space and run the command again",
-    errno.EDQUOT: "free some space and run the command again",
-}
-"""What to do about errors of the system."""
-
-PATHS = (*REMEDIES.keys() - {errno.ENOSPC, errno.EDQUOT}, errno.ENAMETOOLONG, errno.ELOOP)
+PATHS = frozenset(
+    (errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.ENOTDIR, errno.EISDIR)
+    + (errno.ENAMETOOLONG, errno.ELOOP)
+)
 """Errors of the system about a path that the user gave."""
-
-
-def in_words(error: BaseException) -> str:
-    """Describe the error; for system errors, with the file and a remedy."""
-    if (lacking := of_memory(error)) is not None:
-        return f"not enough memory ({message(lacking) or 'no more was given'}); {MEMORY_REMEDY}"
-    if not isinstance(error, OSError) or error.strerror is None or error.filename is None:
-        return message(behind_plugin(error) or error)
-    remedy = REMEDIES.get(error.errno or 0)
-    return f"{str(error.filename)!r}: {error.strerror}" + (f"; {remedy}" if remedy else "")
-
-
-MEMORY_REMEDY = "render a smaller --size, or parts of the image by --crop"
-
 
 OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNORECASE)
 """What a ``RuntimeError`` of Dr.Jit says of memory that it cannot allocate."""
 
 
-def of_memory(error: BaseException) -> BaseException | None:
+def in_words(error: BaseException) -> str:
+    """Describe the error; for system errors, with the file."""
+    if (lacking := _behind(error, OUT_OF_MEMORY.search, MemoryError)) is not None:
+        why = message(lacking) or "no more was given"
+        return f"not enough memory ({why}); render a smaller --size, or parts of the image by --crop"
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{str(error.filename)!r}: {error.strerror}"
+    return message(_behind(error, OF_PLUGIN.match) or error)
 
-    def is_lack(found: BaseException) -> bool:
-        drjits = isinstance(found, RuntimeError) and OUT_OF_MEMORY.search(str(found))
-        return isinstance(found, MemoryError) or bool(drjits)
 
-    return next(filter(is_lack, chain(error)), None)
-
-
-def behind_plugin(error: BaseException) -> BaseException | None:
-    """Return the exception of a plugin that ``error`` is or wraps, see `OF_PLUGIN`."""
-    errors = (found for found in chain(error) if isinstance(found, RuntimeError))
-    return next((found for found in errors if OF_PLUGIN.match(str(found))), None)
+def _behind(
+    error: BaseException, matches: Callable[[str], object], *kinds: type[BaseException]
+) -> BaseException | None:
+    """Like `errors.behind`, also of a ``RuntimeError`` whose text ``matches``."""
+    texts = (found for found in chain(error) if isinstance(found, RuntimeError) and matches(str(found)))
+    return behind(error, *kinds) or next(texts, None)
 
 
 def status_of(error: BaseException) -> int | None:
     """Return the exit status after an ``error``, see above; None for a bug."""
-    if is_mistake(error):
+    if isinstance(error, OSError):
+        return USAGE if error.errno in PATHS else FAILURE
+    of_user = behind(error, UsageError, UnsupportedError, argparse.ArgumentTypeError)
+    if of_user or _behind(error, OF_PLUGIN.match) or _is_of_parser(error):
         return USAGE
-    failed = isinstance(error, FailureError | OSError) or of_memory(error) is not None
+    failed = isinstance(error, FailureError) or _behind(error, OUT_OF_MEMORY.search, MemoryError)
     return FAILURE if failed else None
 
 
-def is_mistake(error: BaseException) -> bool:
-    if isinstance(error, OSError):
-        return error.errno in PATHS
-    if isinstance(error, argparse.ArgumentTypeError):
-        return True
-    if behind(error, UsageError, UnsupportedError) is not None:
-        return True
-    if behind_plugin(error) is not None:
-        return True
+def _is_of_parser(error: BaseException) -> bool:
     if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
         return False
     _, traceback, rest = str(error).partition("Traceback (most recent call last):")

@@ -14,35 +14,20 @@ from ..files.images import check_output, developed, grey, header_of, write_whole
 from ..files.loading import set_variant
 from ..files.mixing import described, mix
 from ..image.layers import DENOISED
-from .mistakes import answered
 
 
-def run(options: Namespace) -> int | None:
-    return answered(lambda: _run(options))
-
-
-def _check_not_replaced(image: Path, output: Path) -> None:
-    """Raise ``CommandError`` if the mix would replace the rendered image, or the PNG beside it."""
-    for rendered in (image, image.with_suffix(".png")):
-        for written in (output, output.with_suffix(".png")):
-            is_same = written.exists() and rendered.exists() and written.samefile(rendered)
-            if is_same or written.resolve() == rendered.resolve():
-                raise CommandError(
-                    f"output={str(output)!r}: the mix would replace the render {str(rendered)!r}; name "
-                    "another with -o."
-                )
-
-
-def _run(options: Namespace) -> int:
+def run(options: Namespace) -> int:
     set_variant(options.variant)
     if not options.weights:
         print(described(options.image))
         return 0
     output: Path = options.output or options.image.with_suffix(".mixed.png")
     is_exr = output.suffix.lower() == ".exr"
-    if not is_exr and output.suffix.lower() != ".png":
-        raise CommandError(f"output={str(output)!r} must end in .png or .exr")
-    _check_not_replaced(options.image, output)
+    rendered = {path.resolve() for path in (options.image, options.image.with_suffix(".png"))}
+    if rendered & {path.resolve() for path in (output, output.with_suffix(".png"))}:
+        raise CommandError(
+            f"output={str(output)!r}: the mix would replace the render or its PNG; name another with -o."
+        )
     check_output(output, ".exr" if is_exr else ".png")
     weights = dict(options.weights)
     if len(weights) < len(options.weights):
@@ -54,8 +39,6 @@ def _run(options: Namespace) -> int:
     png = developed(grey(np.array(mixed)) if has_bands else mixed, options.exposure)
     write_whole(png, output.with_suffix(".png"), mi.Bitmap.FileFormat.PNG)
     if set(DENOISED) <= {channel.name for channel in header_of(options.image)["channels"]}:
-        print(
-            "note: the layers are not denoised, so that the mix has the noise of the render", file=sys.stderr
-        )
+        print("note: the layers are not denoised: the mix has the noise of the render", file=sys.stderr)
     print(output)
     return 0

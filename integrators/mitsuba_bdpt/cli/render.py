@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,7 +36,7 @@ from ..host.introspection import versions
 from ..progress import Report, display, readable
 from ..run.rendering import PassReport
 from . import checkpoints, cluster
-from .mistakes import INTERRUPTED, Ending, answered, in_words, is_mistake, terminable
+from .mistakes import INTERRUPTED, USAGE, Ending, answered, in_words, status_of, terminable
 
 UNLIMITED_SPP = 1 << 16
 """Samples per pixel where only the time limits them."""
@@ -73,50 +74,26 @@ def _ended(command: Callable[[Ending], int]) -> int | None:
 
 def _run(options: Namespace, ending: Ending) -> int:
     check_file(options.scene)  # before creating the image's folder
-    jobs = jobs_of(options)
-    for job in jobs:
-        check_output(job.output, ".exr")
-        if job.statistics is not None:
-            job.statistics.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(job.statistics)
-        check_options(job)
+    options.output = options.output or Path("renders") / f"{options.scene.stem}.exr"
+    check_output(options.output, ".exr")
+    if options.statistics is not None:
+        options.statistics.parent.mkdir(parents=True, exist_ok=True)
+        check_writable(options.statistics)
+    check_options(options)
     scene, integrator, used = loaded(options, ending)
     check_integrator(options, integrator)
-    for job in jobs:
-        film = choose_sensor(scene, job.sensor).film()
-        check_png(film)
-        check_channels(film, integrator.aov_names())
-        samples_per_pixel(scene, job)
+    film = choose_sensor(scene, options.sensor).film()
+    check_png(film)
+    check_channels(film, integrator.aov_names())
+    spp = samples_per_pixel(scene, options)
     print(f"integrator: {used}", file=sys.stderr)
-    for job in jobs:
-        try:
-            if not render_job(scene, integrator, job, ending):
-                return ending.status
-        except OSError as error:  # errors about paths were raised before
-            raise FailureError(in_words(error)) from error
-    return 0
-
-
-def jobs_of(options: Namespace) -> list[Namespace]:
-    """Return the options of each image, with ``sensor``, ``seed`` and ``output``.
-
-    One image, or one for each of the ``frames``, whose seeds follow one another.
-    """
-    output = options.output or Path("renders") / f"{options.scene.stem}.exr"
-    if options.frames is None:
-        return [Namespace(**vars(options) | {"output": output})]
-    if options.sensor != 0:
-        raise CommandError(
-            "frames together with sensor is not possible: each frame is a sensor; leave out one or the other."
-        )
-
-    def of_frame(number: int) -> Namespace:
-        named = {"output": output, "statistics": options.statistics}
-        numbered = {key: path and path.with_stem(f"{path.stem}.{number:04d}") for key, path in named.items()}
-        own = {"sensor": number, "seed": (options.seed + number) % 2**32}
-        return Namespace(**vars(options) | own | numbered)
-
-    return [of_frame(number) for number in dict.fromkeys(options.frames)]
+    try:
+        outcome = render(scene, integrator, options, spp)
+        ending.patient = True
+        is_whole = finish(film, integrator, options, outcome, spp)
+    except OSError as error:  # errors about paths were raised before
+        raise FailureError(in_words(error)) from error
+    return 0 if is_whole and not ending.signalled else ending.status
 
 
 def loaded(options: Namespace, ending: Ending) -> Loaded:
@@ -129,8 +106,7 @@ def loaded(options: Namespace, ending: Ending) -> Loaded:
     try:
         found = load(options)
     except RuntimeError as error:
-        of_plugin = "Traceback (most" in str(error)
-        if is_mistake(error) or of_plugin:
+        if status_of(error) == USAGE or "Traceback (most" in str(error):  # of a plugin in Python
             raise
         raise CommandError(in_words(error)) from error
     finally:
@@ -143,44 +119,28 @@ def loaded(options: Namespace, ending: Ending) -> Loaded:
     return found
 
 
-def render_job(scene: mi.Scene, integrator: mi.Integrator, job: Namespace, ending: Ending) -> bool:
-    """Render and write one image; returns whether it was completed.
-
-    Writing ignores signals, and the checkpoint is removed afterwards.
-    """
-    sensor, spp = choose_sensor(scene, job.sensor), samples_per_pixel(scene, job)
-    if checkpoints.is_done(job, spp):
-        say(f"{job.output}: rendered before by the same command")
-        return True
-    outcome = render(scene, integrator, job, spp)
-    ending.patient = True
-    try:
-        if outcome.interrupted and not outcome.spp:
-            print("interrupted before the first pass was over; no image written", file=sys.stderr)
-            return False
-        found = report(outcome)
-        attributes = {"bdptSettings": json.dumps(settings(job, spp)), STATISTICS: json.dumps(found)}
-        if job.checkpoint is not None and not outcome.interrupted:
-            attributes[checkpoints.IDENTITY] = checkpoints.identity(job, spp)
-        write(sensor.film(), job, attributes)
-        if job.statistics is not None:
-            write_json(job.statistics, {"settings": settings(job, spp)} | found)
-        outcome.written()
-        target = integrator.settings.target_error if is_ours(integrator) else 0
-        stopped = stopped_by(job, integrator, outcome, spp)
-        say(summary(job.output, outcome, sensor.film().crop_size(), target, stopped))
-    finally:
-        ending.patient = False
+def finish(film: mi.Film, integrator: mi.Integrator, options: Namespace, outcome: Outcome, spp: int) -> bool:
+    """Write an image, then remove its checkpoint; returns whether it was completed."""
+    if outcome.interrupted and not outcome.spp:
+        print("interrupted before the first pass was over; no image written", file=sys.stderr)
+        return False
+    pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
+    settings, found = plain(vars(options) | {"spp": spp} | pairs), report(outcome)
+    write(film, options, {"bdptSettings": json.dumps(settings), STATISTICS: json.dumps(found)})
+    if options.statistics is not None:
+        write_json(options.statistics, {"settings": settings} | found)
+    outcome.written()
+    say(summary(options, outcome, film, integrator.settings if is_ours(integrator) else None, spp))
     if outcome.error is not None:
         raise outcome.error
-    return not outcome.interrupted and not ending.signalled
+    return not outcome.interrupted
 
 
-def samples_per_pixel(scene: mi.Scene, job: Namespace) -> int:
-    """Return the samples per pixel of a job, at most; ``CommandError`` if none."""
-    if is_open_ended(job):
+def samples_per_pixel(scene: mi.Scene, options: Namespace) -> int:
+    """Return the samples per pixel, at most; ``CommandError`` if none."""
+    if is_open_ended(options):
         return UNLIMITED_SPP
-    spp = job.spp or choose_sensor(scene, job.sensor).sampler().sample_count()
+    spp = options.spp or choose_sensor(scene, options.sensor).sampler().sample_count()
     if not spp:
         raise CommandError("The scene's sampler has sample_count=0: nothing is to be rendered; give --spp N.")
     return spp
@@ -191,15 +151,15 @@ def is_open_ended(options: Namespace) -> bool:
     return not options.spp and (options.time is not None or options.target_error is not None)
 
 
-def write(film: mi.Film, job: Namespace, attributes: Mapping[str, str]) -> None:
-    """Write the image of a job; where that fails into a temporary folder, which the error names."""
+def write(film: mi.Film, options: Namespace, attributes: Mapping[str, str]) -> None:
+    """Write the image; where that fails into a temporary folder, which the error names."""
     try:
-        write_images(film, job.output, attributes, job.exposure)
+        write_images(film, options.output, attributes, options.exposure)
     except OSError as error:
-        error.filename = error.filename or str(job.output)
-        rescued = Path(tempfile.mkdtemp(prefix="mitsuba-bdpt-")) / job.output.name
+        error.filename = error.filename or str(options.output)
+        rescued = Path(tempfile.mkdtemp(prefix="mitsuba-bdpt-")) / options.output.name
         try:
-            write_images(film, rescued, attributes, job.exposure)
+            write_images(film, rescued, attributes, options.exposure)
         except OSError:
             raise error from None
         raise FailureError(f"{in_words(error)}; the image is {str(rescued)!r} instead") from error
@@ -283,16 +243,16 @@ class Preview:
     A full disk does not end the render.
     """
 
-    def __init__(self, job: Namespace, film: mi.Film):
-        self._job, self._film, self._last = job, film, -math.inf
+    def __init__(self, options: Namespace, film: mi.Film):
+        self._options, self._film, self._last = options, film, -math.inf
 
     def __call__(self, report: PassReport) -> None:
-        if time.monotonic() - self._last < self._job.preview:
+        if time.monotonic() - self._last < self._options.preview:
             return
         report.image()
-        path = self._job.output.with_suffix(".png")
+        path = self._options.output.with_suffix(".png")
         try:
-            write_png(self._film, self._film.bitmap(), path, self._job.exposure)
+            write_png(self._film, self._film.bitmap(), path, self._options.exposure)
         except OSError as error:
             print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
         self._last = time.monotonic()
@@ -371,11 +331,6 @@ def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
     return Outcome(time.perf_counter() - started, done, interrupted)
 
 
-def settings(options: Namespace, spp: int) -> dict:
-    pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
-    return {key: plain(value) for key, value in (vars(options) | {"spp": spp} | pairs).items()}
-
-
 def report(outcome: Outcome) -> dict:
     """Return what was rendered, and with which versions, as JSON values."""
     own = {
@@ -385,10 +340,10 @@ def report(outcome: Outcome) -> dict:
         "resident_memory": memory.peak(),
         "versions": versions(),
     }
-    return {key: plain(value) for key, value in (own | outcome.statistics).items()}
+    return plain(own | outcome.statistics)
 
 
-def plain(value):
+def plain(value) -> Any:
     """Convert a ``value`` to JSON: None if non-finite, text for other objects."""
     if isinstance(value, Mapping):
         return {str(key): plain(held) for key, held in value.items()}
@@ -399,48 +354,44 @@ def plain(value):
     return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
-def stopped_by(job: Namespace, integrator: mi.Integrator, outcome: Outcome, spp: int) -> str:
+def stopped_by(options: Namespace, parameters, outcome: Outcome, spp: int) -> str:
     """Return what ended a render before all of its ``spp`` samples per pixel; empty if nothing did.
 
     With the time of compilation if that is a large part of a time limit.
     """
     if outcome.interrupted or outcome.spp >= spp:
         return ""
-    done = f"{outcome.spp} spp" if is_open_ended(job) else f"{outcome.spp} of {spp} spp"
-    parameters = integrator.settings if is_ours(integrator) else None
-    target = parameters.target_error if parameters else 0
-    if 0 < target and outcome.statistics.get("error", math.inf) <= target:
+    done = f"{outcome.spp} spp" if is_open_ended(options) else f"{outcome.spp} of {spp} spp"
+    target, limit = (parameters.target_error, parameters.timeout) if parameters else (0, options.time)
+    if outcome.statistics.get("error", math.inf) <= target:
         return f"stopped by target_error={target:g} after {done}"
-    limit = job.time if job.time is not None else parameters.timeout if parameters else -1
-    if limit < 0:
+    if limit is None or limit < 0:
         return ""
     compiling = outcome.statistics.get("seconds", {}).get("compile", 0)
     spent = f", compiling took {compiling:.0f} s" if compiling > max(limit / 4, 1) else ""
     return f"stopped by the time limit of {limit:g} s after {done}{spent}"
 
 
-def summary(output: Path, outcome: Outcome, size: Iterable[int], target_error: float, stopped: str) -> str:
-    """Return the closing line; ``stopped``: see `stopped_by`."""
-    width, height = size
+def summary(options: Namespace, outcome: Outcome, film: mi.Film, parameters, spp: int) -> str:
+    """Return the closing line; ``parameters``: `Settings`, or None of other integrators."""
+    statistics, (width, height) = outcome.statistics, film.crop_size()
     parts = [
-        f"{output}: {outcome.seconds:.1f} s",
+        f"{options.output}: {outcome.seconds:.1f} s",
         f"{outcome.spp} spp ({readable(outcome.spp * width * height)} samples)",
-        *([stopped] if stopped else []),
+        stopped_by(options, parameters, outcome, spp),
     ]
-    if rays := outcome.statistics.get("rays"):
+    if rays := statistics.get("rays"):
         kinds = ", ".join(f"{kind} {readable(count)}" for kind, count in rays.items())
         parts.append(f"{readable(sum(rays.values()))} rays ({kinds})")
-    if "error" in outcome.statistics:
-        error = outcome.statistics["error"]
-        text = f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known"
-        if 0 < target_error < error:
-            text += f", not the {target_error:g} asked for: that takes more samples (--spp, --time)"
-        parts.append(text)
-    if outcome.statistics.get("no_pilot"):
-        parts.append(f"no pilot: {outcome.statistics['no_pilot']}")
-    if invalid := outcome.statistics.get("non_finite"):
+    if "error" in statistics:
+        error, target = statistics["error"], parameters.target_error
+        parts.append(f"relMSE about {error:.2g}" if math.isfinite(error) else "relMSE not known")
+        if 0 < target < error:
+            parts[-1] += f", not the {target:g} asked for: that takes more samples (--spp, --time)"
+    if statistics.get("no_pilot"):
+        parts.append(f"no pilot: {statistics['no_pilot']}")
+    if invalid := statistics.get("non_finite"):
         parts.append(f"{invalid} invalid samples (NaN or infinite) count as zero")
     parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
-    if outcome.interrupted:
-        parts.append("interrupted")
-    return "; ".join(parts)
+    parts.append("interrupted" if outcome.interrupted else "")
+    return "; ".join(filter(None, parts))

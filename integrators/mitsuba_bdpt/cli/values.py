@@ -8,9 +8,6 @@ import re
 
 PropertyValue = bool | int | float | str
 
-MOST_FRAMES = 1 << 20
-"""Sensors in a range, at most."""
-
 
 def _utf8(text: str) -> str:
     """Decode an argument as UTF-8, in which Mitsuba's texts are, whatever the encoding of the locale."""
@@ -45,23 +42,6 @@ def _pixels(text: str, pattern: str, form: str) -> tuple[int, ...]:
     if not all(numbers[-2:]):
         raise argparse.ArgumentTypeError(f"got {text!r}, which must have the form {form}, in pixels")
     return numbers
-
-
-def frames(text: str) -> list[int]:
-    """Parse sensor indices: ``3``, ``0-9``, ``0-99:10`` (every tenth), or a list."""
-    found = []
-    for part in text.split(","):
-        match = re.fullmatch(r"\s*(\d+)(?:-(\d+)(?::(\d+))?)?\s*", part)
-        first, last, step = (match and match[i] for i in (1, 2, 3)) if match else (None, None, None)
-        if first is None or step == "0" or (last is not None and int(last) < int(first)):
-            raise argparse.ArgumentTypeError(
-                f"got {text!r}, which must be numbers of sensors such as 3, 0-9, 0-99:10 or 0,5,7"
-            )
-        numbers = range(int(first), int(last or first) + 1, int(step or 1))
-        if len(numbers) > MOST_FRAMES:
-            raise argparse.ArgumentTypeError(f"got {text!r}, which must be {MOST_FRAMES} numbers at most")
-        found += numbers
-    return found
 
 
 def definition(text: str) -> tuple[str, str]:

@@ -269,14 +269,12 @@ def _check_no_meter(scene: mi.Scene, options: Namespace) -> None:
     given = next((name for name in ("size", "crop") if getattr(options, name)), None)
     if given is None:
         return
-    for index in getattr(options, "frames", None) or [options.sensor]:
-        if choose_sensor(scene, index).class_name() in METERS.values():
-            value = getattr(options, given)
-            written = "x".join(map(str, value)) if given == "size" else ",".join(map(str, value))
-            raise CommandError(
-                f"{given}={written} is for images, and sensor {index} is a meter, whose film keeps its size; "
-                f"leave out --{given}, or choose another sensor by --sensor."
-            )
+    if choose_sensor(scene, options.sensor).class_name() in METERS.values():
+        written = ("x" if given == "size" else ",").join(map(str, getattr(options, given)))
+        raise CommandError(
+            f"{given}={written} is for images, and sensor {options.sensor} is a meter, whose film keeps its "
+            f"size; leave out --{given}, or choose another sensor by --sensor."
+        )
 
 
 def set_film_size(film: mi.Properties, size: Sequence[int] | None, crop: Sequence[int] | None) -> None:

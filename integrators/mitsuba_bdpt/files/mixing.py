@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..emitters.light_groups import NO_LAMP, called, is_pattern
-from ..errors import CommandError, UsageTypeError, did_you_mean, listed
+from ..errors import CommandError, did_you_mean, listed
 from ..image.layers import GROUP, PATH
 from .images import STATISTICS, read_exr
 
@@ -30,22 +30,17 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
     ``image``: rendered with ``light_groups`` or ``path_layers``, an EXR file or ``film.bitmap()``.
     ``weights`` by the name of the group or path layer, not of both kinds: a number, or one for each colour; 1
     for layers that are left out. ``groups.NAME`` and ``path.NAME`` are names too; in names ``*`` and ``?``
-    stand for any characters; a pattern that matches no layer is a warning. The result has the layers'
-    colours, the image's alpha if it has one, in single precision, and the weights as JSON in the metadata
-    ``bdptMix``. Raises ``CommandError``, ``OSError``, and ``UsageTypeError`` for other types.
+    stand for any characters, and exact names win over them. The result has the layers' colours, the image's
+    alpha if it has one, in single precision, and the weights as JSON in the metadata ``bdptMix``. Raises
+    ``CommandError`` and ``OSError``.
     """
-    if not isinstance(image, (mi.Bitmap, Path, str)):
-        raise UsageTypeError(f"image={type(image).__name__} must be an mi.Bitmap or the path of an EXR")
-    if not isinstance(weights, Mapping):
-        raise UsageTypeError(f"weights={type(weights).__name__} must be a dictionary, by names of layers")
     channels = _channels(image)
     layers, colours = _layers(channels)
-    factors = {str(name): _factors(name, weight, colours) for name, weight in weights.items()}
-    own = _chosen(layers, factors)
-    kind = _kind(next(iter(own or layers)))
+    own = {layer: _factors(name, weights[name], colours) for layer, name in _chosen(layers, weights).items()}
+    kind = next(iter(own or layers)).partition(".")[0]
     total, alpha = 0.0, [channels["A"][..., None]] if "A" in channels else []
-    for layer in (layer for layer in layers if _kind(layer) == kind):
-        factor = factors[own[layer]] if layer in own else np.ones(len(colours))
+    for layer in (layer for layer in layers if layer.startswith(f"{kind}.")):
+        factor = own.get(layer, np.ones(len(colours)))
         with np.errstate(invalid="ignore"):  # infinite light of a layer may be switched off
             total += np.where(factor > 0, factor * layers[layer], 0)
     pixels = np.concatenate([total, *alpha], axis=-1).astype(np.float32)
@@ -53,7 +48,7 @@ def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitm
         result = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.RGBA if alpha else mi.Bitmap.PixelFormat.RGB)
     else:
         result = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, colours + ["A"] * len(alpha))
-    result.metadata()[WEIGHTS] = json.dumps({layer: list(factors[name]) for layer, name in own.items()})
+    result.metadata()[WEIGHTS] = json.dumps({layer: list(factor) for layer, factor in own.items()})
     return result
 
 
@@ -95,28 +90,20 @@ def _layers(channels: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], 
     return {name: np.stack(own, axis=-1, dtype=np.float64) for name, own in planes.items()}, colours
 
 
-def _kind(layer: str) -> str:
-    """Return the prefix of a layer's name, without the dot."""
-    return layer.partition(".")[0]
-
-
 def _chosen(layers: Iterable[str], names: Iterable[str]) -> dict[str, str]:
-    """Return the name by layer, of one kind; exact names win, patterns without a layer warn."""
+    """Return the name by layer, of one kind; exact names win."""
     short = {layer: layer.partition(".")[2] for layer in layers}
     own: dict[str, str] = {}
     for name in sorted(names, key=is_pattern):
         found = [layer for layer in short if fnmatchcase(layer if "." in name else short[layer], name)]
         if not found:
             near = did_you_mean(name, short.values(), parts=True)
-            text = f"the image has no layer {name!r}; {near}there are {', '.join(short)}"
-            if not is_pattern(name):
-                raise CommandError(text)
-            mi.Log(mi.LogLevel.Warn, f"bdpt: {name!r} changes nothing: {text}")
+            raise CommandError(f"the image has no layer {name!r}; {near}there are {', '.join(short)}")
         for layer in found:
             other = own.setdefault(layer, name)
             if other != name and is_pattern(other) == is_pattern(name):
                 raise CommandError(f"{layer} has two weights, by {other!r} and {name!r}; give it one")
-    if len(set(map(_kind, own))) > 1:
+    if len({layer.partition(".")[0] for layer in own}) > 1:
         raise CommandError(
             f"{', '.join(own)} are light groups and path layers, which divide the same light; mix one kind "
             f"at a time, and write {GROUP}NAME or {PATH}NAME for a name of both kinds"
@@ -126,10 +113,7 @@ def _chosen(layers: Iterable[str], names: Iterable[str]) -> dict[str, str]:
 
 def _factors(name: str, weight: Weight, colours: list[str]) -> np.ndarray:
     """Return the weight of each colour that ``name`` is given."""
-    try:
-        values = np.asarray(weight).reshape(-1)  # colours of vectorised variants are (3, 1)
-    except ValueError:  # a ragged list
-        values = np.array([None])
+    values = np.asarray(weight).reshape(-1)  # colours of vectorised variants are (3, 1)
     is_numeric = values.dtype.kind in "iuf" and len(values) in (1, len(colours))
     if not is_numeric or not ((values >= 0) & (values <= MOST)).all():
         raise CommandError(
