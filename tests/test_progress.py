@@ -96,7 +96,8 @@ def test_a_report_has_the_image_so_far():
     expected = np.array(integrator.render(scene, spp=8))
     assert len(images) > 1 and not np.array_equal(images[0], images[1])
     assert np.allclose(images[-1], expected, rtol=1e-4, atol=1e-6)
-    with pytest.raises(UsageError, match="came too late"):
-        reports[0].image()
+    for late in (reports[0].image, reports[0].snapshot):
+        with pytest.raises(UsageError, match="came too late"):
+            late()
     integrator.on_pass = None
     assert np.allclose(integrator.assemble(first[0], scene), images[0], rtol=1e-4, atol=1e-6)

@@ -2,13 +2,11 @@
 
 import io
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import mitsuba as mi
-import mitsuba_bdpt
 import numpy as np
 import pytest
 from mitsuba_bdpt.cli.arguments import main
@@ -68,10 +66,3 @@ def test_what_utf8_cannot_write():
         utf8(Path(name))
     write_text(Path("a.txt"), f"<p>光 {name}")
     assert Path("a.txt").read_bytes() == "<p>光 sc\\udce9ne.xml".encode()
-
-
-def test_files_of_text_have_an_encoding():
-    text = re.compile(r"\.(read|write)_text\((?!.*encoding)|\bopen\((?!.*(b\"|encoded))")
-    files = [file for file in Path(mitsuba_bdpt.__file__).parent.rglob("*.py") if file.parent.name != "host"]
-    lines = [line for file in files for line in file.read_text(encoding="utf-8").splitlines()]
-    assert [line for line in lines if text.search(line)] == []

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1333,  # top files
 }
-OUTSIDE = {"scripts": 2924, "tests": 31280}
+OUTSIDE = {"scripts": 2924, "tests": 30914}
 MOST_WORDS = 28905
 
 

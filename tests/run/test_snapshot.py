@@ -55,23 +55,6 @@ def test_a_resumed_render_is_the_uninterrupted_one(rfilter, parameters, after):
         assert resumed.statistics["error"] == pytest.approx(whole.statistics["error"], rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    "size, samples, layers", [(16, 256, ""), (5000, 20000, ""), (5000, 80000, "variance")]
-)
-def test_few_pixels_go_on(size, samples, layers):
-    """Expected: it has them too when it goes on, and when its decisions (none) are replayed."""
-    way = {"spp_per_pass": size, "layers": layers}
-    target, whole = scene(size=4), bdpt(**way)
-    expected = np.array(whole.render(target, seed=1, spp=samples))
-    start = stopped(bdpt(**way), target, 3, seed=1, spp=samples)
-    assert 0 < start.spp < samples and whole.statistics["decisions"] == []
-    for parameters, begun in (({}, {"start": start}), ({"decisions": []}, {})):
-        again = bdpt(**way, **parameters)
-        image = np.array(again.render(target, seed=1, spp=samples, **begun))
-        np.testing.assert_allclose(image, expected, **ROUNDING)
-        assert again.statistics["rays"] == whole.statistics["rays"]
-
-
 @pytest.mark.parametrize("blind", [False, True])
 def test_pilots_and_decisions_go_on(monkeypatch, blind):
     """Expected: a render stopped after 41 spp or so goes on as the uninterrupted one, its decision included;
@@ -89,18 +72,6 @@ def test_pilots_and_decisions_go_on(monkeypatch, blind):
     image = np.array(resumed.render(anew, seed=1, spp=256, start=start))
     assert resumed.statistics["decisions"] == whole.statistics["decisions"]
     assert resumed.statistics["passes"] == whole.statistics["passes"]
-    np.testing.assert_allclose(image, expected, **ROUNDING)
-
-
-def test_a_snapshot_of_the_last_pass_traces_nothing():
-    target = scene()
-    start = stopped(bdpt(), target, None, seed=0, spp=16)
-    expected = np.array(bdpt().render(target, seed=0, spp=16))
-    passes = []
-    resumed = bdpt()
-    resumed.on_pass = passes.append
-    image = np.array(resumed.render(target, seed=0, spp=16, start=start))
-    assert sum(start.passes) == 16 and not passes
     np.testing.assert_allclose(image, expected, **ROUNDING)
 
 
@@ -191,16 +162,6 @@ def test_the_format_has_a_new_number_where_names_change():
     assert (FORMAT, zlib.crc32(repr((names, sizes)).encode())) == (13, 2998143257)
 
 
-def test_only_the_newest_report_has_a_snapshot():
-    """Rationale: reports that are kept must not keep the sums of their time. Expected: older ones refuse."""
-    reports, integrator = [], bdpt()
-    integrator.on_pass = reports.append
-    integrator.render(scene(), spp=16, develop=False)
-    assert reports[-1].snapshot().spp == 16
-    with pytest.raises(ValueError, match="after 1 passes came too late"):
-        reports[0].snapshot()
-
-
 def test_decide_is_the_pilot_of_a_render():
     """Expected: the decisions that a client asks for once are those of the render itself, and a render
     that replays them is the same."""
@@ -235,15 +196,3 @@ def test_a_render_ends_at_the_error_that_is_asked_for():
     assert integrator.statistics["error"] == reports[-1].error <= 0.004
     errors = [report.error for report in reports if report.error is not None]
     assert all(error > 0.004 for error in errors if error != errors[-1])
-
-
-@pytest.mark.parametrize(
-    ("parameters", "error", "message"),
-    [
-        ({"target_error": -1.0}, ValueError, "the relMSE to stop at, or 0 for none"),
-        ({"target_error": "low"}, TypeError, "must be a number"),
-    ],
-)
-def test_bad_parameters(parameters, error, message):
-    with pytest.raises((error, RuntimeError), match=message):
-        bdpt(**parameters)

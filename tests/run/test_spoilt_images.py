@@ -5,7 +5,6 @@ import math
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.scene import diagnostics
 from support import variants
 from warned import Warned
 
@@ -75,13 +74,6 @@ def test_black_skies(colour):
     mi.set_variant(variants.of(colour))
     sky = {"type": "envmap", "bitmap": mi.Bitmap(np.zeros((4, 8, 3), np.float32))}
     assert "no emitter of the scene emits light" in rendered({"sky": sky})[1][0]
-
-
-def test_lamps_are_compared_once(monkeypatch):
-    """Expected: once for two renders and `explain`."""
-    seen = []
-    monkeypatch.setattr(diagnostics, "overlapping_lamps", lambda scene: seen.append(scene) or [])
-    assert rendered(SKY)[1] == [] and len(seen) == 1
 
 
 SOUND = {
