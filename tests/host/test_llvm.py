@@ -193,4 +193,4 @@ def test_quick_compilation_leaves_unknown_libraries_alone(monkeypatch, named):
         monkeypatch.setenv(llvm.VARIABLE, named)
     else:
         monkeypatch.setattr(llvm, "KNOWN_GOOD", (19,))
-    assert llvm._option_setter() is llvm._no_options
+    assert not llvm._set_options()

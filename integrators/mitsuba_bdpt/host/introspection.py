@@ -151,15 +151,10 @@ def _collector(variant: str):
 def media_of(scene: mi.Scene, sensors: Iterable[mi.Sensor]) -> dict[int, mi.Medium]:
     """Media that rays of a scene and these sensors may be in, by registry index."""
     media = [sensor.get_medium() for sensor in sensors]
-    media += [medium for shape in all_shapes(scene) for medium in _sides(shape)]
+    for shape in all_shapes(scene):
+        if not is_instance(shape) and shape.is_medium_transition():  # the shapes of instances have them
+            media += [shape.interior_medium(), shape.exterior_medium()]
     return {registry_id(medium): medium for medium in media if medium is not None}
-
-
-def _sides(shape: mi.Shape) -> tuple:
-    """Media on both sides of a shape; none for instances (their shapes have them)."""
-    if is_instance(shape) or not shape.is_medium_transition():
-        return ()
-    return shape.interior_medium(), shape.exterior_medium()
 
 
 def registry_id(plugin: mi.Medium | mi.BSDF | mi.Shape) -> int:

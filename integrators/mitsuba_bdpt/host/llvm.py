@@ -16,7 +16,6 @@ import platform
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -132,31 +131,24 @@ def quick_compilation():
     Results are the same; for times see experiments, "First images". Holds for the whole process, and Dr.Jit
     caches kernels as if they were compiled as usual. No effect with untested versions of LLVM.
     """
-    set_options = _option_setter()
-    set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
+    _set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
     try:
         yield
     finally:
-        set_options(b"-opt-bisect-limit=%d" % (2**31 - 1))  # limits nothing
+        _set_options(b"-opt-bisect-limit=%d" % (2**31 - 1))  # limits nothing
 
 
-def _option_setter() -> Callable[..., object]:
-    """Return what sets options of the LLVM library in use; `_no_options` for an untested version."""
+def _set_options(*options: bytes) -> bool:
+    """Set options of the LLVM library in use; False, without effect, for an untested version."""
+    if sys.modules["drjit"].detail.llvm_version()[0] not in KNOWN_GOOD:
+        return False
     try:
         parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
     except (OSError, AttributeError):
-        return _no_options
-    if sys.modules["drjit"].detail.llvm_version()[0] not in KNOWN_GOOD:
-        return _no_options
-
-    def set_options(*options: bytes) -> None:
-        arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
-        parse(len(arguments), arguments, b"")
-
-    return set_options
-
-
-def _no_options(*options: bytes) -> None: ...
+        return False
+    arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
+    parse(len(arguments), arguments, b"")
+    return True
 
 
 def cuda_driver() -> bool:
