@@ -285,49 +285,6 @@ def test_a_lamp_of_glass_does_not_light_itself(bsdf, parameters):
     assert abs(means[0] / means[1] - 1) < 1e-3, means
 
 
-TURNED = T().translate([-1, 1.6, 0.5]).rotate([0.26726124, 0.53452248, 0.80178373], 130)
-SPHERE = {"type": "sphere", "bsdf": grey(0.1), "emitter": {"type": "area", "radiance": 5.0}}
-# Mitsuba samples a texture on one face of a cube and with another density on cylinders, and rotates the
-# points of a sphere, but not their normals.
-AGREED = {
-    "textured cube": EMITTERS["cube"],
-    "textured cylinder": EMITTERS["cylinder"],
-    "textured mesh": lambda: {
-        "type": "ply",
-        "to_world": T().translate([0.6, 1.6, 0.3]).scale(0.5).translate([2.4, -2.6, 0.8]),
-        "bsdf": grey(0.1),
-    },
-    "textured sphere": EMITTERS["sphere"],
-    "textured disk": lambda: (
-        EMITTERS["disk"]() | {"to_world": T().translate([0.5, 1.8, 0]).rotate([1, 0, 0], 45).scale(0.4)}
-    ),
-    "textured turned sphere": lambda: SPHERE | {"to_world": TURNED.scale(0.3)},
-    "turned sphere": lambda: SPHERE | {"to_world": TURNED.scale(0.3)},
-    "mirrored sphere": lambda: SPHERE | {"to_world": TURNED.scale([-0.3, 0.3, 0.3]), "flip_normals": True},
-    "turned dome": lambda: SPHERE | {"to_world": TURNED.scale(7), "flip_normals": True},
-}
-
-
-@pytest.mark.parametrize("name", AGREED)
-def test_strategies_agree(name, tmp_path):
-    """(0,2) equals (1,1), and (0,3), (1,2) and (2,1) equal each other."""
-    lamp = AGREED[name]()
-    if name.startswith("textured"):
-        lamp["emitter"] = {"type": "area", "radiance": texture() | {"to_uv": T().scale(3)}}
-    if name == "textured mesh":
-        lamp["filename"] = egg_with_coordinates(tmp_path)
-    scene = mi.load_dict(room() | {"lamp": lamp})
-    bdpt = integrator(max_depth=2, skip="none", layers="strategies")
-    a, b, c = (renders(scene, bdpt, 512, 10, s) for s in (0, 50, 100))
-
-    def images(x, name):
-        return tiles(layer(x, bdpt, f"unweighted.{name}"))
-
-    agree(images(a, "s0t2"), images(b, "s1t1"), 0.04)
-    agree(images(a, "s0t3"), images(b, "s1t2"), 0.1)
-    agree(images(c, "s2t1"), images(b, "s1t2"), 0.1)
-
-
 def attributed_lamp(scale=1.0):
     """A quad that emits what an attribute of its vertices says."""
     properties = mi.Properties()

@@ -114,6 +114,8 @@ SHEARED_LAMPS = {
     # its normal, and a mesh keeps no matrix.
     "turned rectangle": ("rectangle", T().rotate([1, 1, 0], 40)),
     "turned cube": ("cube", T().rotate([1, 1, 1], 40).scale(0.6)),
+    # Mitsuba rotates the points of a sphere, but not their normals.
+    "turned sphere": ("sphere", PLACED["rotated"].scale(0.6)),
 }
 # Rectangles, disks and spheres are one surface for all strategies, whatever turned them.
 REFLECTORS = {

@@ -94,23 +94,6 @@ def sign_kernel(difference: np.ndarray, k: int) -> np.ndarray:
     return agree * (1 - 2 * ((difference >> k) & 1))
 
 
-def kernel(difference: np.ndarray) -> np.ndarray:
-    """E[z z'], z = sqrt(12) (x - 1/2): digit k has (3/4) 4^-k of its variance."""
-    return sum(0.75 * 0.25**k * sign_kernel(difference, k) for k in range(16))
-
-
-def gain(m: int) -> float:
-    """Exact n Var of the mean of f(p_i) f(p'_i) over n = 2^m points of two independent seeds, f = z(x) z(y).
-    Indices whose highest differing bit is t come out of the shuffle with that bit different and random lower
-    bits. Independent draws have 1; neighbours in index are opposite in the first digit of either seed: a
-    little more."""
-    total = 1.0
-    for t in range(m):
-        d = (1 << t) + np.arange(1 << t)
-        total += 2**t * (kernel(d) * kernel(second(d))).mean() ** 2
-    return total
-
-
 def test_digits_vary_as_in_nested_uniform_scrambling():
     """Product of digit k of x and digit j of y over 2^m points: exact variance if the trees of x, y and the
     shuffle are independent, from the digits alone. Over 8000 hashed seeds the relative deviation is 1.6 %
@@ -213,20 +196,6 @@ def _exact_smooth() -> float:
     x, w = 0.5 * (x + 1), 0.5 * w
     grid = np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1)
     return float(w @ smooth(grid) @ w)
-
-
-def test_padded_dimensions_of_a_product():
-    """Expected: the exact variance, 1.73 / n. Over 10000 scrambles it has a relative deviation of 2.5 %
-    (tails): 12 % is over 4 sigma. Two pairs in the same order give several times more."""
-    m, scrambles = 6, 10000
-    n = 1 << m
-    seeds = np.arange(scrambles, dtype=np.uint32)
-    product = 1
-    for dim in (0, 1):
-        seed = sobol.hash_u32(mi.UInt32(seeds), dim).numpy()
-        product = product * (pair(np.arange(n)[:, None], seed[None, :]) - 0.5).prod(-1) * 12
-    variance = (product.mean(0) ** 2).mean()
-    assert variance * n == pytest.approx(gain(m), rel=0.12)
 
 
 def test_range():
