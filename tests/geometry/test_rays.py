@@ -8,8 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import variants
+from meshes import as_ply, ball_mesh, folder
 from mitsuba_bdpt.geometry import quadrics, rays, rounding
 from scene_parts import T, perspective
+
+from scenes import DOWNWARDS, area, floor, integrator, layer, load, matte, renders, square
 
 # (scale of the unit-sized shape, distance by which it is moved in each coordinate)
 PLACES = {"small": (1e-3, 0.0), "unit": (1.0, 0.0), "large": (1e3, 0.0), "moved": (1.0, 1e3)}
@@ -19,35 +22,17 @@ CONVEX = CLOSED | {"disk", "rectangle", "bsplinecurve", "linearcurve"}  # sdfgri
 FLAT = {"disk", "rectangle"}  # both sides are outside
 
 
-def _curve(folder, kind, scale, shift):
+def count(mask):
+    return int(dr.count(mask)[0])
+
+
+def _curve(kind, scale, shift):
     """A straight curve of constant radius, so that it is convex."""
     points = np.linspace([-1, -0.5, -0.2], [1, 0.5, 0.3], 6) * scale + shift
-    path = folder / f"{kind}-{scale}-{shift}.txt"
+    path = folder() / f"{kind}-{scale}-{shift}.txt"
     lines = [" ".join(f"{x:.9g}" for x in (*p, 0.2 * scale)) for p in points]
     path.write_text("\n".join(lines) + "\n")
     return {"type": kind, "filename": str(path)}
-
-
-def _mesh(folder, transform):
-    """A coarse sphere with interpolated normals, far from the facets' own."""
-    u, v = np.meshgrid(np.arange(12), np.arange(7))
-    phi, theta = u.ravel() * 2 * np.pi / 12, v.ravel() * np.pi / 6
-    p = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1)
-    faces = []
-    for j in range(6):
-        for i in range(12):
-            a, b = j * 12 + i, j * 12 + (i + 1) % 12
-            faces += [[a, a + 12, b], [b, a + 12, b + 12]]
-    faces = [f for f in faces if len({tuple(np.round(p[k], 6)) for k in f}) == 3]
-    mesh = mi.Mesh("ball", len(p), len(faces), has_vertex_normals=True)
-    values = mi.traverse(mesh)
-    values["vertex_positions"] = mi.Float(p.ravel().astype(np.float32))
-    values["vertex_normals"] = mi.Float(p.ravel().astype(np.float32))
-    values["faces"] = mi.UInt32(np.array(faces, dtype=np.uint32).ravel())
-    values.update()
-    path = folder / "ball.ply"
-    mesh.write_ply(str(path))
-    return {"type": "ply", "filename": str(path), "to_world": transform}
 
 
 def _sdf(transform):
@@ -62,7 +47,7 @@ def _sdf(transform):
     }
 
 
-def shape_scene(kind, place, folder):
+def shape_scene(kind, place):
     """A scene of one shape, about 2 units wide before scaling, turned to no axis; ``place`` of `PLACES`, or a
     scale and three shifts."""
     scale, shift = PLACES[place] if isinstance(place, str) else place
@@ -71,14 +56,15 @@ def shape_scene(kind, place, folder):
     placed = T().translate(shift.tolist()) @ T().scale(scale)
     transform = placed @ turn
     if kind in ("bsplinecurve", "linearcurve"):
-        shape = {"shape": _curve(folder, kind, scale, shift)}
+        shape = {"shape": _curve(kind, scale, shift)}
     elif kind == "mesh":
-        shape = {"shape": _mesh(folder, transform)}
+        shape = {"shape": ball_mesh(1) | {"to_world": transform}}
     elif kind == "sdfgrid":
         shape = {"shape": _sdf(placed)}  # takes no rotation
     elif kind == "instance":
         instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": placed}
-        shape = {"group": {"type": "shapegroup", "ball": _mesh(folder, turn)}, "shape": instance}
+        group = {"type": "shapegroup", "ball": ball_mesh(1) | {"to_world": turn}}
+        shape = {"group": group, "shape": instance}
     elif kind == "cylinder":
         p0, p1 = (np.array([[-0.3, 0.2, -1], [0.3, -0.1, 1]]) * scale + shift).tolist()
         shape = {"shape": {"type": kind, "p0": p0, "p1": p1, "radius": 0.6 * scale}}
@@ -109,9 +95,9 @@ def anchor_of(scene, si, ray):
     return rays.surface_anchor(si, ray, rounding.ShapeErrors(scene))
 
 
-def bad_rays(kind, place, folder, n, seed=0):
+def bad_rays(kind, place, n, seed=0):
     """Shares of hits from which a ray finds its own start, and from which one leaks."""
-    scene = shape_scene(kind, place, folder)
+    scene = shape_scene(kind, place)
     own = leaks = total = 0
     for inside in (False, True) if kind in CLOSED or kind == "cylinder" else (False,):
         rng = mi.PCG32(n, seed + 10 * inside)
@@ -127,10 +113,10 @@ def bad_rays(kind, place, folder, n, seed=0):
         found &= dr.abs(dr.dot(again.n, si.n)) > 0.999
         if kind in CONVEX:
             found |= again.is_valid() & (mi.Bool(kind in FLAT) | (cos > 0))
-        own += int(dr.count(hit & found)[0])
+        own += count(hit & found)
         if kind in CLOSED:
-            leaks += int(dr.count(hit & (cos < 0) & ~again.is_valid())[0])
-        total += int(dr.count(hit)[0])
+            leaks += count(hit & (cos < 0) & ~again.is_valid())
+        total += count(hit)
     return own, leaks, total
 
 
@@ -152,7 +138,7 @@ def _allowed(kind, place, total):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_ray_finds_its_own_start(kind, tmp_path):
+def test_no_ray_finds_its_own_start(kind):
     """Rays leave the surface that they start on, and none leaves a closed shape through it. mitsuba3 #1871,
     #1962. Expected: of hits by rays from all sides, none finds its start again (from convex shapes outwards:
     nothing at all), and none of the rays that go into a closed shape fails to meet its other side. Counts,
@@ -160,7 +146,7 @@ def test_no_ray_finds_its_own_start(kind, tmp_path):
     4 spheres, rectangles, cubes and instances too."""
     n = HITS.get(kind, 1_000_000)
     for place in PLACES:
-        own, leaks, total = bad_rays(kind, place, tmp_path, n // 4)
+        own, leaks, total = bad_rays(kind, place, n // 4)
         most_own, most_leaks = _allowed(kind, place, total)
         assert total > 0.005 * n
         assert own <= most_own, f"{kind}, {place}: {own} of {total} hits find their own start"
@@ -169,13 +155,13 @@ def test_no_ray_finds_its_own_start(kind, tmp_path):
 
 @pytest.mark.parametrize("distance", [30.0, 300.0])
 @pytest.mark.parametrize("kind", KINDS)
-def test_far_ends_do_not_block(kind, distance, tmp_path):
+def test_far_ends_do_not_block(kind, distance):
     """A shape that is small against its distance sees and is seen. Mitsuba solves the quadratics of
     cylinders, and of spheres in visibility tests, in single precision. Expected: segments back to where those
     rays came from, in both directions, are free, and no ray that starts there finds its own start: exactly so
     on flat shapes, up to one in 1e4 where limbs and edges are grazed."""
     n = 1 << (14 if kind == "sdfgrid" else 17)
-    scene = shape_scene(kind, "unit", tmp_path)
+    scene = shape_scene(kind, "unit")
     rng = mi.PCG32(n, 7)
     si, ray = first_hits(scene, "unit", n, rng, False, distance)
     anchor = anchor_of(scene, si, ray)
@@ -193,18 +179,18 @@ def test_far_ends_do_not_block(kind, distance, tmp_path):
         outwards = si.is_valid() & (dr.dot(-ray.d, si.n) * side > 0)
         outwards &= dr.dot(d, si.n) * side > 1e-3
         found = outwards & scene.ray_test(rays.spawn(anchor, d, ray))
-        assert int(dr.count(found)[0]) <= (0 if kind in FLAT else 1e-4 * n)
+        assert count(found) <= (0 if kind in FLAT else 1e-4 * n)
 
 
 @pytest.mark.parametrize("small", [False, True])
 @pytest.mark.parametrize("kind", [k for k in KINDS if k != "sdfgrid"])
-def test_what_was_found_from_near_by_is_seen_from_afar(kind, small, tmp_path):
+def test_what_was_found_from_near_by_is_seen_from_afar(kind, small):
     """A visibility ray errs in proportion to its own length. Expected: points at the origin, found from 3
     away, are seen from 300 away, on the same side, with and without a ball in the scene that is so small that
     rays ask what they meet (on flat shapes all, else all but one in 1e4, near edges and outlines; cosines
     below 0.1, where curves and cylinders hide themselves, are left out)."""
     n = 1 << 16
-    scene = shape_scene(kind, "unit", tmp_path)
+    scene = shape_scene(kind, "unit")
     rng = mi.PCG32(n, 7)
     si, ray = first_hits(scene, "unit", n, rng, False)
     ball = {"type": "sphere", "center": [0, 0, 1e3], "radius": 1e-3 if small else 1e3 - 600}
@@ -220,19 +206,12 @@ def test_what_was_found_from_near_by_is_seen_from_afar(kind, small, tmp_path):
     number = rounding.met(si.shape, si.instance)
     shadow_ray, own = rays.shadow_ray(errors, from_afar, anchor, number, dr.zeros(mi.SurfaceInteraction3f, n))
     blocked = counts & rays.occluded(scene, errors, shadow_ray, counts, own)
-    assert int(dr.count(counts)[0]) > 0.01 * n
-    assert int(dr.count(blocked)[0]) <= (0 if kind in FLAT else 1e-4 * n)
-
-
-def _points(place, n, rng, z, half=1.0):
-    """Anchors on the plane at height ``z`` (unit scale), found by rays from a point beside it."""
-    scale, shift = PLACES[place]
-    x, y = (2 * rng.next_float32() - 1) * half, (2 * rng.next_float32() - 1) * half
-    return mi.Point3f(x, y, z) * scale + shift
+    assert count(counts) > 0.01 * n
+    assert count(blocked) <= (0 if kind in FLAT else 1e-4 * n)
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_thin_walls_block_and_ends_do_not(place, tmp_path):
+def test_thin_walls_block_and_ends_do_not(place):
     """A segment through a thin wall is blocked; without the wall, its ends do not block it. mitsuba3 #1871,
     #1962. Expected: with the plate all segments between the squares are blocked, without it none. The moved
     scene, where coordinates of 1e3 leave steps of 6e-5, has ten times the gap and the thickness."""
@@ -254,9 +233,11 @@ def test_thin_walls_block_and_ends_do_not(place, tmp_path):
     rng = mi.PCG32(n, 3)
     anchors = []
     for z, side in ((-gap, 1), (gap, -1)):
-        target = _points(place, n, rng, z, 0.99)
         # From between plate and square, so that the point is found with the plate in place.
-        origin = _points(place, n, rng, z + side * 0.5 * gap, 0.99)
+        target, origin = (
+            mi.Point3f(*(0.99 * (2 * rng.next_float32() - 1) for _ in range(2)), height) * scale + shift
+            for height in (z, z + side * 0.5 * gap)
+        )
         ray = mi.Ray3f(origin, dr.normalize(target - origin))
         si = open_scene.ray_intersect(ray)
         assert dr.all(si.is_valid())
@@ -264,19 +245,19 @@ def test_thin_walls_block_and_ends_do_not(place, tmp_path):
     like = dr.zeros(mi.SurfaceInteraction3f, n)
     for a, b in (anchors, anchors[::-1]):
         segment = rays.segment(a, b, like)
-        assert int(dr.count(~walled.ray_test(segment))[0]) == 0, "leaks through the plate"
-        assert int(dr.count(open_scene.ray_test(segment))[0]) == 0, "blocked by its ends"
+        assert count(~walled.ray_test(segment)) == 0, "leaks through the plate"
+        assert count(open_scene.ray_test(segment)) == 0, "blocked by its ends"
 
 
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("kind", ["sphere", "cube", "mesh", "instance"])
-def test_points_of_a_hollow_see_each_other(kind, place, tmp_path):
+def test_points_of_a_hollow_see_each_other(kind, place):
     """From inside a convex shape every point sees every other. A segment's end must not be blocked by the
     surface it lies on, at grazing angles too. Expected: none of 2.5e5 segments between points found from near
     the centre is blocked, except those that stay within one offset of an end's surface, as between two points
     of one face: they carry no light to speak of. Moved by 1e3: at most 1e-4 of them, near edges."""
     n = 1 << 18
-    scene = shape_scene(kind, place, tmp_path)
+    scene = shape_scene(kind, place)
     anchors = []
     for seed in (1, 2):
         si, ray = first_hits(scene, place, n, mi.PCG32(n, seed), inside=True)
@@ -286,8 +267,8 @@ def test_points_of_a_hollow_see_each_other(kind, place, tmp_path):
     counts = dr.abs(dr.dot(between, a.n)) > a.offset
     counts &= dr.abs(dr.dot(between, b.n)) > b.offset
     segment = rays.segment(a, b, dr.zeros(mi.SurfaceInteraction3f, n))
-    blocked = int(dr.count(counts & scene.ray_test(segment))[0])
-    assert int(dr.count(counts)[0]) > 0.5 * n
+    blocked = count(counts & scene.ray_test(segment))
+    assert count(counts) > 0.5 * n
     assert blocked <= (1e-4 * n if place == "moved" else 0)
 
 
@@ -303,14 +284,13 @@ def patch_and_far_wall(kind, distance, shift):
         return T().look_at([x + shift, y, z], [target[0] + shift, *target[1:]], [0, 0, 1]).scale(scale)
 
     size = 0.5 if kind == "rectangle" else 0.3
-    white = {"bsdf": {"type": "diffuse", "reflectance": 0.8}}
+    white = {"bsdf": matte(0.8)}
     emitter = {"type": "area", "radiance": 5.0 * distance**2}
     lamp, wall = (
         {"type": "rectangle", "to_world": facing(*place, (0, 0, 0), scale)}
         for place, scale in (((0, 0.9, 0.3), 0.2), ((0, distance, 0), 0.3 * distance))
     )
     return {
-        "type": "scene",
         "sensor": seen_by([shift - 0.2 * distance, 0.9 * distance, 0], [shift, distance, 0], 40),
         "patch": {"type": kind, "to_world": facing(0, 0, 0, (0, 1, 0.3), size)} | white,
         "lamp": lamp | {"emitter": emitter},
@@ -334,17 +314,14 @@ def test_lamps_at_the_origin_are_seen_from_afar_in_fog(kind):
     """Expected: unweighted, (1,1) finds what s = 0 finds, within 2 %, five standard errors."""
     fog = {"type": "homogeneous", "sigma_t": 0.01, "albedo": 0.9}
     lamp = {"type": kind, "to_world": T().look_at([0, 0, 0], [0, -1, 0.2], [0, 0, 1]).scale(0.7)}
-    scene = {
-        "type": "scene",
-        "fog": fog,
-        "sensor": seen_by([0, -29, 7], [0, 0, 0], 5, medium={"type": "ref", "id": "fog"}),
-        "lamp": lamp | {"emitter": {"type": "area", "radiance": 5.0}},
-    }
-    integrator = {"type": "bdpt", "max_depth": 1, "skip": "none", "layers": "strategies"}
-    scene = mi.load_dict(scene)
-    image = np.array(mi.render(scene, integrator=mi.load_dict(integrator), spp=64, seed=0))
-    names = [channel.name for channel in scene.sensors()[0].film().bitmap().struct_()]
-    joined, hit = (image[..., names.index(f"unweighted.{kind}.R")].mean() for kind in ("s1t1", "s0t2"))
+    scene = load(
+        fog=fog,
+        sensor=seen_by([0, -29, 7], [0, 0, 0], 5, medium={"type": "ref", "id": "fog"}),
+        lamp=lamp | {"emitter": area(5.0)},
+    )
+    bdpt = integrator(max_depth=1, skip="none", layers="strategies")
+    images = renders(scene, bdpt, 64, 1)
+    joined, hit = (layer(images, bdpt, f"unweighted.{name}").mean() for name in ("s1t1", "s0t2"))
     assert abs(joined / hit - 1) < 0.02
 
 
@@ -355,25 +332,19 @@ def test_lamps_on_spheres_however_small(radius, parameters):
     alone and with all strategies. Tolerance: 0.05 %; the mean of 2^22 samples has a standard error below 0.01
     %, the density of a cone is right within 0.012 %, and the floor seen is so small that its middle stands
     for it within 0.01 %."""
-    scene = small_lamp(radius)
+    emitter = {"type": "area", "radiance": 1 / radius**2}
+    ground = {"type": "rectangle", "to_world": T().translate([4, 0, 0]).rotate([1, 0, 0], -90)}
+    eye = {"to_world": T().look_at([4, 3, 0], [4, 0, 0], [1, 0, 0])}
+    scene = load(
+        sensor=perspective(fov=2, keys=eye, component_format="float32"),
+        floor=ground | {"bsdf": matte(0.5)},
+        lamp={"type": "sphere", "center": [0, 6.5, 2.7], "radius": radius, "emitter": emitter},
+    )
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 2} | parameters)
     mean = np.mean([np.array(mi.render(scene, integrator=integrator, spp=1 << 12, seed=s)) for s in range(4)])
     d2 = 4**2 + 6.5**2 + 2.7**2
     expected = 0.5 * 6.5 / d2**1.5  # at the middle of a view of 0.1 x 0.1
     assert abs(mean / expected - 1) < 5e-4, f"{mean / expected - 1:.2e} off"
-
-
-def small_lamp(radius):
-    """A floor seen from near by in the light of a lamp on a sphere, of radiance 1 / radius^2."""
-    emitter = {"type": "area", "radiance": 1 / radius**2}
-    floor = {"type": "rectangle", "to_world": T().translate([4, 0, 0]).rotate([1, 0, 0], -90)}
-    eye = {"to_world": T().look_at([4, 3, 0], [4, 0, 0], [1, 0, 0])}
-    parts = {
-        "sensor": perspective(fov=2, keys=eye, component_format="float32"),
-        "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}},
-        "lamp": {"type": "sphere", "center": [0, 6.5, 2.7], "radius": radius, "emitter": emitter},
-    }
-    return mi.load_dict({"type": "scene"} | parts)
 
 
 @pytest.mark.parametrize("radius, place", [(1.0, [0, 0, 0]), (1e-6, [100, 50, 20]), (1e-5, [1e3, 5e2, 2e2])])
@@ -435,34 +406,29 @@ def test_reach_with_optix(monkeypatch):
     assert set(rounding.reaches(cube)) == {2, 10}
 
 
-def near_hits(scene, n, rng):
-    """Hits near the origin, of rays from 3 units away or less: ``(si, ray)``."""
-    target = mi.Point3f(_sphere(rng) * dr.cbrt(rng.next_float32()))
-    origin = mi.Point3f(_sphere(rng) * (3 * rng.next_float32()))
-    ray = mi.Ray3f(origin, dr.normalize(target - origin))
-    return scene.ray_intersect(ray), ray
-
-
 @pytest.mark.parametrize("kind", [k for k in KINDS if "curve" not in k])
-def test_no_ray_finds_its_own_start_on_large_shapes(kind, tmp_path):
+def test_no_ray_finds_its_own_start_on_large_shapes(kind):
     """The coordinates that a hit is computed from may be larger than those of the hit. Expected: no ray finds
     its own start (within ten offsets with the same normal; on flat shapes anywhere)."""
     scale, n = 1e4, 1 << (13 if kind == "sdfgrid" else 17)
     d = mi.Vector3f(0.36, 0.48, 0.8)
-    at_origin = shape_scene(kind, (scale, 0.0), tmp_path)
+    at_origin = shape_scene(kind, (scale, 0.0))
     si = at_origin.ray_intersect(mi.Ray3f(mi.Point3f(-4 * scale * d), d))
     assert si.is_valid()[0]
-    scene = shape_scene(kind, (scale, (-np.array(si.p)[:, 0]).tolist()), tmp_path)
+    scene = shape_scene(kind, (scale, (-np.array(si.p)[:, 0]).tolist()))
     rng = mi.PCG32(n, 3)
-    si, ray = near_hits(scene, n, rng)
+    target = mi.Point3f(_sphere(rng) * dr.cbrt(rng.next_float32()))
+    origin = mi.Point3f(_sphere(rng) * (3 * rng.next_float32()))
+    ray = mi.Ray3f(origin, dr.normalize(target - origin))
+    si = scene.ray_intersect(ray)
     anchor = anchor_of(scene, si, ray)
     d = _sphere(rng)
     hit = si.is_valid() & (dr.abs(dr.dot(d, si.n)) > 1e-3)
     again = scene.ray_intersect(rays.spawn(anchor, d, ray), hit)
     own = again.is_valid() & (dr.abs(dr.dot(again.n, si.n)) > 0.999)
     own &= mi.Bool(kind in FLAT) | (again.t < 10 * anchor.offset)
-    assert int(dr.count(hit)[0]) > 0.1 * n
-    assert int(dr.count(hit & own)[0]) == 0
+    assert count(hit) > 0.1 * n
+    assert count(hit & own) == 0
 
 
 @pytest.mark.parametrize("kind", ["rectangle", "cube", "mesh"])
@@ -473,13 +439,9 @@ def test_floors_along_the_axes_keep_what_is_small(kind):
     if kind == "mesh":
         rows = [[-size, -size, -size - 9], [size, -size, -9], [0, size, -9]]  # far below
         box = mi.load_dict({"type": "cube", "to_world": t.scale(0.01)})
-        params = mi.traverse(box)
-        p, faces = (np.array(params[k]).reshape(-1, 3) for k in ("vertex_positions", "faces"))
-        shape = mi.Mesh("mesh", len(p) + 3, len(faces) + 1)
-        params = mi.traverse(shape)
-        params["vertex_positions"] = mi.Float(np.concatenate([p, rows]).astype(np.float32).ravel())
-        params["faces"] = mi.UInt32(np.concatenate([faces, [[len(p), len(p) + 1, len(p) + 2]]]).ravel())
-        params.update()
+        p, faces = (np.array(mi.traverse(box)[k]).reshape(-1, 3) for k in ("vertex_positions", "faces"))
+        corners = len(p) + np.arange(3)[None]
+        shape = as_ply(np.concatenate([p, rows]), np.concatenate([faces, corners]))
     else:
         down = t.translate([0, 0, -size]).scale(size) if kind == "cube" else t.scale(size)
         shape = {"type": kind, "to_world": down}
@@ -492,7 +454,7 @@ def test_floors_along_the_axes_keep_what_is_small(kind):
     ray = mi.Ray3f(origin, dr.normalize(target - origin))
     si = scene.ray_intersect(ray)
     anchor = anchor_of(scene, si, ray)
-    assert int(dr.count(si.is_valid() & (dr.abs(si.p.z) < 1))[0]) == n
+    assert count(si.is_valid() & (dr.abs(si.p.z) < 1)) == n
     assert float(dr.max(anchor.offset)[0]) <= (side + 3) * rounding.OFFSET_ULPS * 2.0**-24
 
 
@@ -503,11 +465,16 @@ def is_seen(scene, errors, origin, end, number, active=True):
     return ~rays.occluded(scene, errors, ray, mi.Bool(active), own)
 
 
-def grouped(shape, to_world):
-    """A scene of one instance of a shape."""
-    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": T(to_world)}
-    group = {"type": "shapegroup", "shape": shape}
-    return mi.load_dict({"type": "scene", "group": group, "instance": instance})
+def sight(origin, p, n, active=True, **shapes):
+    """Mask: the points ``p`` with normals ``n`` of the shape ``target`` are seen from ``origin``; and whether
+    rays ask what they meet, in a scene that is 16 wide."""
+    scene = load(**shapes, far=far_away(16))
+    errors = rounding.ShapeErrors(scene)
+    shape = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "target"))
+    end = rays.sampled_anchor(mi.Point3f(p), mi.Normal3f(n), errors.at(shape))
+    seen = is_seen(scene, errors, origin, end, rounding.met(shape), active)
+    dr.eval(seen)  # while there is the scene
+    return seen, errors.small
 
 
 @pytest.mark.parametrize("stretch", [1.0, 50.0])
@@ -516,10 +483,10 @@ def test_cylinders_in_groups_are_seen_from_afar(stretch):
     ones), also where the instance stretches one direction by ``stretch``, not along an axis of the
     cylinder."""
     turn = np.array(T().rotate([0, 0, 1], 45).rotate([1, 0, 0], 35).matrix)
-    scene = grouped(
-        {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 1]},
-        0.02 * np.diag([1, stretch, stretch, 50]) @ turn,
-    )
+    instance = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    instance["to_world"] = T(0.02 * np.diag([1, stretch, stretch, 50]) @ turn)
+    tube = {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 1]}
+    scene = load(group={"type": "shapegroup", "shape": tube}, instance=instance)
     n = 1 << 16
     rng = mi.PCG32(n, 11)
     origin = mi.Point3f(7 * _sphere(rng))
@@ -531,12 +498,11 @@ def test_cylinders_in_groups_are_seen_from_afar(stretch):
     outside = si.is_valid() & (dr.dot(si.n, ray.d) < -0.05)
     errors = rounding.ShapeErrors(scene)
     anchor = rays.surface_anchor(si, ray, errors)
-    count = int(dr.count(outside)[0])
-    assert count > 0.02 * n
+    assert count(outside) > 0.02 * n
     seen = is_seen(scene, errors, origin, anchor, rounding.met(si.shape, si.instance), outside)
-    assert int(dr.count(outside & ~seen)[0]) <= 1e-3 * count
+    assert count(outside & ~seen) <= 1e-3 * count(outside)
     found = scene.ray_test(rays.spawn(anchor, si.n, ray), outside)
-    assert int(dr.count(outside & found)[0]) <= 1e-3 * count
+    assert count(outside & found) <= 1e-3 * count(outside)
 
 
 @pytest.mark.parametrize("flipped", [False, True])
@@ -551,7 +517,6 @@ def test_backs_of_small_shapes_are_not_seen(kind, radius, flipped):
     of 0.01, one in five at 3e-3)."""
     shape = {"type": kind, "flip_normals": flipped}
     ends = {"p0": [0, 0, -1], "p1": [0, 0, 1]} if kind == "cylinder" else {}
-    scene = mi.load_dict({"type": "scene", "shape": shape | ends | {"radius": radius}, "far": far_away(16)})
     n = 1 << 16
     rng = mi.PCG32(n, 13)
     phi, z = 2 * dr.pi * rng.next_float32(), rng.next_float32() * 2 - 1
@@ -559,15 +524,12 @@ def test_backs_of_small_shapes_are_not_seen(kind, radius, flipped):
     outwards = mi.Vector3f(dr.cos(phi) * across, dr.sin(phi) * across, 0 if kind == "cylinder" else z)
     p = mi.Point3f(outwards * radius)
     p.z += 0.5 * z if kind == "cylinder" else 0
-    errors, target = rounding.ShapeErrors(scene), scene.shapes()[0]
-    number = rounding.met(mi.ShapePtr(target))
     origin = mi.Point3f(8, 0, 0) + _sphere(rng)
-    n_ = mi.Normal3f(-outwards if flipped else outwards)
-    end = rays.sampled_anchor(p, n_, errors.at(mi.ShapePtr(target)))
-    seen = is_seen(scene, errors, origin, end, number)
+    target = shape | ends | {"radius": radius}
+    seen, _ = sight(origin, p, -outwards if flipped else outwards, target=target)
     cos = dr.dot(outwards, dr.normalize(origin - p))
     wrong = (dr.abs(cos) > 0.15) & (seen != (cos > 0))
-    assert int(dr.count(wrong)[0]) <= (2e-3 if kind == "cylinder" else 1e-4) * n
+    assert count(wrong) <= (2e-3 if kind == "cylinder" else 1e-4) * n
 
 
 @pytest.mark.parametrize("radius", [0.02, 0.01, 1e-3])
@@ -575,14 +537,11 @@ def test_a_shell_about_a_small_sphere_hides_it(radius):
     """Rationale: shadow rays end before a small sphere, by more than its radius from afar. Expected: of its
     points that face 8 away, not one is seen through a shell 3 % of the radius in front."""
     lamp, shell = ({"type": "sphere", "radius": r * radius} for r in (1, 1.03))
-    scene = mi.load_dict({"type": "scene", "lamp": lamp, "far": far_away(16), "shell": shell})
-    rng, errors = mi.PCG32(1 << 16, 13), rounding.ShapeErrors(scene)
-    shape = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "lamp"))
+    rng = mi.PCG32(1 << 16, 13)
     outwards, origin = _sphere(rng), mi.Point3f(8, 0, 0) + _sphere(rng)
     facing = dr.dot(outwards, origin) > 0
-    end = rays.sampled_anchor(mi.Point3f(outwards * radius), mi.Normal3f(outwards), errors.at(shape))
-    seen = is_seen(scene, errors, origin, end, rounding.met(shape), facing)
-    assert errors.small and int(dr.count(facing & seen)[0]) == 0
+    seen, small = sight(origin, outwards * radius, outwards, facing, target=lamp, shell=shell)
+    assert small and count(facing & seen) == 0
 
 
 @pytest.mark.parametrize("radius", [0.01, 1e-3])
@@ -591,20 +550,15 @@ def test_small_spheres_hide_flat_shapes(radius):
     within 0.999 radii, seen beyond 1.001 (single precision errs by 1e-6 / radius)."""
     turned = T().translate([-1.5 * radius, 0, 0]).rotate([0, 1, 0], 90).scale(2 * radius)
     ball, disk = {"type": "sphere", "radius": radius}, {"type": "disk", "to_world": turned}
-    scene = mi.load_dict({"type": "scene", "ball": ball, "far": far_away(16), "disk": disk})
-    rng, errors = mi.PCG32(1 << 14, 13), rounding.ShapeErrors(scene)
-    shape = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == "disk"))
+    rng = mi.PCG32(1 << 14, 13)
     y, z = 1.4 * radius * (2 * rng.next_float32() - 1), 1.4 * radius * (2 * rng.next_float32() - 1)
     p, origin = mi.Point3f(-1.5 * radius, y, z), mi.Point3f(8, 0, 0)
-    end = rays.sampled_anchor(p, mi.Normal3f(1, 0, 0), errors.at(shape))
-    number, like = rounding.met(shape), dr.zeros(mi.SurfaceInteraction3f)
-    alone = rays.segment(rays.free_anchor(origin), rays.free_anchor(p), like)
-    rows = (is_seen(scene, errors, origin, end, number), ~rays.occluded(scene, errors, alone, mi.Bool(True)))
+    seen, small = sight(origin, p, mi.Normal3f(1, 0, 0), ball=ball, target=disk)
     to, o = p.numpy().T.astype(float), np.array([8.0, 0, 0])
     d = (to - o) / np.linalg.norm(to - o, axis=1)[:, None]
     miss = np.linalg.norm(np.cross(d, -o), axis=1) / radius
-    for seen in map(np.array, rows):
-        assert errors.small and not seen[miss < 0.999].any() and seen[miss > 1.001].all()
+    seen = np.array(seen)
+    assert small and not seen[miss < 0.999].any() and seen[miss > 1.001].all()
 
 
 @pytest.mark.parametrize("flipped", [False, True])
@@ -614,8 +568,8 @@ def test_the_inside_of_small_tubes_is_seen_through_their_end(radius, flipped):
     points inside, seen from 8 away at 0.6 from the axis, those are seen whose line leaves through the end,
     and no others, but for 2e-3 (those within 5 % of the rim, and at cosines below 0.05, are left out)."""
     half = 2 * radius
-    tube = {"type": "cylinder", "p0": [0, 0, -half], "p1": [0, 0, half], "radius": radius}
-    scene = mi.load_dict({"type": "scene", "shape": tube | {"flip_normals": flipped}, "far": far_away(16)})
+    ends = {"p0": [0, 0, -half], "p1": [0, 0, half]}
+    tube = {"type": "cylinder", "radius": radius, "flip_normals": flipped} | ends
     n = 1 << 16
     rng = mi.PCG32(n, 13)
     phi, z = 2 * dr.pi * rng.next_float32(), half * (rng.next_float32() * 2 - 1)
@@ -623,9 +577,7 @@ def test_the_inside_of_small_tubes_is_seen_through_their_end(radius, flipped):
     p = mi.Point3f(outwards.x * radius, outwards.y * radius, z)
     shift = mi.Vector3f(*(rng.next_float32() for _ in range(3)))
     origin = mi.Point3f(float(8 * np.sin(0.6)), 0, float(8 * np.cos(0.6))) + 0.2 * shift
-    errors, shape = rounding.ShapeErrors(scene), mi.ShapePtr(scene.shapes()[0])
-    end = rays.sampled_anchor(p, mi.Normal3f(-outwards if flipped else outwards), errors.at(shape))
-    seen = np.array(is_seen(scene, errors, origin, end, rounding.met(shape)))
+    seen = np.array(sight(origin, p, -outwards if flipped else outwards, target=tube)[0])
     p, d = np.array(p, dtype=float), np.array(origin - p, dtype=float)
     inside = (np.array(outwards) * d).sum(0) < -0.05 * np.linalg.norm(d, axis=0)
     # Where the line meets the cylinder, as long as it were without ends, once more.
@@ -645,41 +597,37 @@ def far_away(distance):
 # -- thin things ------------------------------------------------------------------------------
 
 
-BLACK = {"type": "twosided", "inner": {"type": "diffuse", "reflectance": 0.0}}
+BLACK = {"type": "twosided", "inner": matte(0)}
 
 
 def seen_through_a_sheet(distance):
     """A white sky seen through a sheet of opacity 0.5 that is 0.3 mm thick, ``distance`` from the origin."""
-    sheet = {"type": "cube", "to_world": T().translate([0, 0, distance]).scale([1, 1, 1.5e-4])}
     return {
-        "type": "scene",
         "sensor": perspective((0, 0, distance + 3), (0, 0, distance), 20),
-        "sheet": sheet | {"bsdf": {"type": "mask", "opacity": 0.5, "inner": BLACK}},
+        "sheet": {
+            "type": "cube",
+            "to_world": T().translate([0, 0, distance]).scale([1, 1, 1.5e-4]),
+            "bsdf": {"type": "mask", "opacity": 0.5, "inner": BLACK},
+        },
         "sky": {"type": "constant", "radiance": 1.0},
     }
 
 
 def lamp_behind_a_plate(gap):
     """A floor 5 below a lamp of which a black plate, ``gap`` before it, hides half; None: half a lamp."""
-    down, half = T().rotate([1, 0, 0], 90), T().scale([0.1, 0.2, 1])
-    to_world, plate = T().translate([0, 5, 0]) @ down.scale(0.2), {}
+    lamp, half = square((0, 5, 0), DOWNWARDS, 0.2, BLACK), [0.1, 0.2, 1]
+    parts = {"plate": square((0.1, 5 - (gap or 0), 0), DOWNWARDS, half, BLACK)}
     if gap is None:
-        to_world = T().translate([-0.1, 5, 0]) @ down @ half
-    else:
-        placed = T().translate([0.1, 5 - gap, 0]) @ down @ half
-        plate["plate"] = {"type": "rectangle", "to_world": placed, "bsdf": BLACK}
-    emitter = {"type": "area", "radiance": 10.0}
-    floor = {"type": "rectangle", "to_world": T().rotate([1, 0, 0], -90).scale(2)}
-    return plate | {
-        "type": "scene",
+        lamp, parts = square((-0.1, 5, 0), DOWNWARDS, half, BLACK), {}
+    return parts | {
         "sensor": perspective((0, 3, 3.5), (0, 0, 0)),
-        "lamp": {"type": "rectangle", "to_world": to_world, "bsdf": BLACK, "emitter": emitter},
-        "floor": floor | {"bsdf": {"type": "diffuse", "reflectance": 0.5}},
+        "lamp": lamp | {"emitter": area(10.0)},
+        "floor": floor(),
     }
 
 
 def _mean(parts, integrator, spp=256):
-    scene = mi.load_dict(parts, optimize=False)
+    scene = mi.load_dict({"type": "scene"} | parts, optimize=False)
     made = mi.load_dict({"max_depth": 4} | integrator)
     return float(np.mean([np.array(mi.render(scene, integrator=made, spp=spp, seed=s)) for s in range(4)]))
 
@@ -689,8 +637,8 @@ OURS = {"all": {"type": "bdpt", "skip": "none"}, "path tracing": {"type": "bdpt"
 
 @pytest.mark.parametrize("distance", [0.0, 3.0])
 def test_a_thin_mask_is_two_surfaces(distance):
-    """Expected: of white light a quarter passes a sheet of opacity 0.5, wherever it is; under `path` half of
-    it, 3 from the origin. Tolerance: 1 %, five standard errors."""
+    """Of white light a quarter passes, wherever the sheet is; under `path` half of it, 3 from the origin.
+    Tolerance: 1 %, five standard errors."""
     for name, parameters in OURS.items():
         assert abs(_mean(seen_through_a_sheet(distance), parameters, 1024) / 0.25 - 1) < 0.01, name
     by_path = _mean(seen_through_a_sheet(distance), {"type": "path"}, 1024)
@@ -698,9 +646,9 @@ def test_a_thin_mask_is_two_surfaces(distance):
 
 
 def test_a_plate_close_to_a_lamp_hides_it():
-    """Expected: with a plate 3 mm before half of the lamp the mean of the floor is that of the other half
-    alone; `path` has the light of both, which its own hits deny. Tolerance: 1 %, of which 0.3 % for what the
-    edge of the plate hides obliquely."""
+    """With a plate 3 mm before half of the lamp the floor has the light of the other half alone; `path` has
+    that of both, which its own hits deny. Tolerance: 1 %, of which 0.3 % for what the edge hides
+    obliquely."""
     half = _mean(lamp_behind_a_plate(None), {"type": "path", "max_depth": 2})
     for name, parameters in OURS.items():
         assert abs(_mean(lamp_behind_a_plate(3e-3), parameters | {"max_depth": 2}) / half - 1) < 0.01, name
