@@ -7,7 +7,9 @@ python scripts/floor.py --record results/benchmark/probes.json    # of some scen
 from __future__ import annotations
 
 import json
+import os
 import statistics
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -15,7 +17,6 @@ from pathlib import Path
 import command_line
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import read_json, write_json
-from mitsuba_bdpt.measure import probes
 from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.preset import machine, software
 from repository import PROJECT, ROOT
@@ -53,9 +54,16 @@ print(time.perf_counter() - began, memory.peak() / 2**30)
 """
 
 
+def numbers(code: str, *arguments: str, **environment: str) -> list[float]:
+    """Return the numbers that ``code`` prints last in a new process; ``environment``: added to this one's."""
+    command, variables = [sys.executable, "-c", code, *arguments], os.environ | environment
+    done = subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True)
+    return [float(word) for word in done.stdout.splitlines()[-1].split()]
+
+
 def of_kernels(rounds: int) -> dict[str, list[float]]:
     """Return the ratios of `floor`, by scene."""
-    return {name: probes.numbers(CODE, str(ROOT / "scripts"), name, str(rounds)) for name in RECORDED}
+    return {name: numbers(CODE, str(ROOT / "scripts"), name, str(rounds)) for name in RECORDED}
 
 
 def coldstart(rounds: int) -> dict[str, list[float]]:
@@ -68,7 +76,7 @@ def coldstart(rounds: int) -> dict[str, list[float]]:
         for name, seconds in found.items():
             wanted = json.dumps([{}, {"type": name, "max_depth": 6}, 16])
             with tempfile.TemporaryDirectory() as cache:
-                seconds.append(probes.numbers(BOX, wanted, DRJIT_CACHE_DIR=cache, HOME=cache)[0])
+                seconds.append(numbers(BOX, wanted, DRJIT_CACHE_DIR=cache, HOME=cache)[0])
     return found
 
 
@@ -76,7 +84,7 @@ def memory(rounds: int) -> dict[str, list[float]]:
     """Return the peak resident GiB of a render, by samples per pixel: Cornell box, 1920x1080, depth 8."""
     film, way = {"width": 1920, "height": 1080}, {"type": "bdpt", "max_depth": 8}
     wanted = {f"{spp} spp": json.dumps([film, way, spp]) for spp in (2, 8)}
-    return {name: [probes.numbers(BOX, one)[1] for _ in range(rounds)] for name, one in wanted.items()}
+    return {name: [numbers(BOX, one)[1] for _ in range(rounds)] for name, one in wanted.items()}
 
 
 def record(file: Path, rounds: int) -> None:

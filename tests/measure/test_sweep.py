@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,11 +27,9 @@ from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import (
     agreement,
-    analysis,
     limited,
     making,
     metrics,
-    probes,
     reference,
     report,
     scenes,
@@ -41,9 +38,9 @@ from mitsuba_bdpt.measure import (
 )
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.models import PresetFile
-from mitsuba_bdpt.measure.preset import Cells, preset_of, read_preset
+from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
-from mitsuba_bdpt.measure.results import errors, keep_missing, missing_of, write_tables
+from mitsuba_bdpt.measure.results import cell_file, errors, image_file, keep_missing, missing_of, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
 
@@ -61,17 +58,6 @@ type = "bdpt"
 type = "path"
 match = "seconds"
 """
-
-MORE = """
-[more]
-scenes = ["cornell_box"]
-integrators = ["ours", "path"]
-spp = 4
-seeds = [3, 9]
-width = 0.5
-"""
-METHODS = ("ours", "path", "ptracer")
-
 
 REPOSITORY = Project(ROOT)
 
@@ -381,32 +367,6 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swep
     assert swept(*words) == 0 and rendered == [table[3]["key"]] and len(rows_of(output)) == 8
 
 
-def test_a_sweep_on_a_cluster(folder, monkeypatch, workers, known, swept):
-    """The same seeds, so the same errors up to rounding."""
-    path = preset_file(folder, PRESET.replace("seeds = 2", "seeds = 3") + MORE)
-    assert swept(path, "-o", folder / "here") == 0
-    there = ["-o", folder / "there", "--scheduler", workers.scheduler_address]
-    assert swept(path, *there) == 0
-    ours = [
-        {row["key"]: row for row in rows_of(folder / name) if row["method"] == "ours"}
-        for name in ("here", "there")
-    ]
-    common = set(ours[0]) & set(ours[1])
-    assert len(common) >= 6
-    for key in common:
-        here, remote = (table[key] for table in ours)
-        assert remote["rel_mse"] == pytest.approx(here["rel_mse"], rel=1e-3) and remote["seconds"] > 0
-        assert (folder / "there" / "images" / "cornell_box" / f"{key}.exr").exists()
-    monkeypatch.setattr(sweep.workers, "results", None)
-    assert swept(path, *there) == 0
-
-
-def test_a_worker_with_other_software_is_refused(folder, monkeypatch, workers, known, swept):
-    monkeypatch.setattr("mitsuba_bdpt.measure.preset.software", lambda: {"mitsuba-bdpt": "other"})
-    with pytest.raises(RuntimeError, match="failed on the cluster: a worker has other software"):
-        swept(preset_file(folder), "-o", folder / "out", "--scheduler", workers.scheduler_address)
-
-
 def test_one_scene_of_a_preset_anew(folder, job, swept, known):
     making.make(job(3, "furnace_emission"))
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "furnace_emission"]')
@@ -496,9 +456,8 @@ def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, 
     monkeypatch.setattr(making, "write", lambda path, made: None)
     for name in ("cornell_box", "pool"):
         making.make(job(None, name))
-    preset = read_preset(project.preset("benchmark"), project)
-    subjects = {subject.name: subject for subject in preset.subjects}
-    assert depths == [subjects[name].max_depth for name in ("cornell_box", "pool")]
+    preset = read_preset(project.preset("benchmark"), project, ["cornell_box", "pool"])
+    assert depths == [cells.max_depth for cells in preset.cells]
     assert depths[0] != project.scene("cornell_box").max_depth
     file = PresetFile.model_validate({"max_depth": 3, "scene": {"pool": {"max_depth": 4}}})
     assert [file.depth(name, 9) for name in ("pool", "cornell_box")] == [4, 3]
@@ -576,24 +535,11 @@ def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
     after = rows_of(output)
     for a, b in zip(before, after, strict=True):
         assert a["seconds"] == b["seconds"] and a["mean"] == pytest.approx(b["mean"], rel=1e-6)
-        assert b["mape"] != a["mape"] and b["reference_rel_mse"] == 0
-    with OpenEXR.File(str(next((output / "images").rglob(f"{after[0]['key']}.exr"))), True) as file:
+        assert b["rel_mse"] != a["rel_mse"] and b["reference_rel_mse"] == 0
+    with OpenEXR.File(str(next((output / "images").glob(f"*_{after[0]['key'][:8]}.exr"))), True) as file:
         pixels = np.stack([file.channels()[c].pixels for c in "RGB"], axis=-1).astype(np.float64)
     new = reference_of(project, 3).image
     assert after[0]["rel_mse"] == pytest.approx(metrics.rel_mse(pixels, new))
-
-
-def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, known, swept):
-    path, output = preset_file(folder, PRESET + '[[integrator]]\ntype = "ptracer"\n' + MORE), folder / "out"
-    words = path, "-o", output
-    ratio = lambda self, scene, rival: SimpleNamespace(low=0, high=3.9 / len(self.rows))  # noqa: E731
-    monkeypatch.setattr(analysis.Results, "efficiency", ratio)
-    for _ in range(2):
-        assert swept(*words) == 0
-        table = rows_of(output)
-        seeds = {m: [r["seed"] for r in table if r["method"] == m and r["budget"] == 4] for m in METHODS}
-        # Two rows a seed: 3.9 / 8 from four seeds is below 0.5.
-        assert seeds == {"ours": [1, 2, 3, 4, 5], "path": [1, 2, 3, 4, 5], "ptracer": [1, 2]}
 
 
 @pytest.mark.parametrize(
@@ -616,15 +562,7 @@ def test_more_seeds_until_the_interval_is_narrow(folder, monkeypatch, known, swe
         (('match = "seconds"', "x = [1]"), r"integrator.1.x=\[1\]: must be a number, a text"),
         (('match = "seconds"', "[scene.pool]\nspp = [1]\nseeds = 1"), r"\[scene.pool\]: 'pool' is not among"),
         (('match = "seconds"', "[scene.cornell_box]\ndepth = 1"), "cornell_box.depth=1: .*max_depth"),
-        (('match = "seconds"', "seeds = 1" + MORE), "'path' of .* is limited by scenes or seeds"),
-        (('match = "seconds"', MORE.replace('"path"', '"none"')), r"'none' of \[more\] integrators"),
-        (('match = "seconds"', MORE.replace('"ours", ', "")), r"more.integrators=\['path'\]"),
-        (('match = "seconds"', MORE.replace('"ours", "path"', '"path", "ours"')), "must be the first one"),
-        (('match = "seconds"', MORE.replace("[3, 9]", "[9, 3]")), r"must be \[at least, at most\]"),
-        (
-            ('match = "seconds"', MORE.replace('["cornell_box"]', '["pool"]')),
-            r"\[more\]: 'pool' is not among",
-        ),
+        (('match = "seconds"', "[more]\nspp = 4"), "more={'spp': 4}: there is no such key"),
     ],
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
@@ -635,36 +573,29 @@ def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
 @pytest.mark.parametrize("path", sorted((ROOT / "presets").glob("*.toml")), ids=lambda p: p.stem)
 def test_presets_are_read(path):
     named = ["cornell_box"] if path.stem == "public" else None
-    for method in read_preset(path, REPOSITORY, named).methods:
+    for method in read_preset(path, REPOSITORY, named).cells[0].methods:
         mi.load_dict(dict(method.parameters))
 
 
-@pytest.mark.parametrize("name", ["cornell_box", "lamp_behind_glass", "fog_lamp", "skin_ball", "cloud_sky"])
-def test_rivals_are_those_that_see_the_media(name):
-    scene = REPOSITORY.scene(name)
-    assert scene.has_media == (name in ("fog_lamp", "skin_ball", "cloud_sky"))
-    preset = read_preset(REPOSITORY.preset("benchmark"), REPOSITORY)
-    subject = next(subject for subject in preset.subjects if subject.name == name)
-    rendered = {m.name for m in Cells(REPOSITORY, preset, subject).methods}
+def test_rivals_are_those_that_see_the_media():
+    names = ["cornell_box", "lamp_behind_glass", "fog_lamp", "skin_ball", "cloud_sky"]
     tracers = {"path", "path multijitter", "ptracer"}, {"volpath", "volpathmis"}
-    assert tracers[scene.has_media] <= rendered and not tracers[not scene.has_media] & rendered
-    assert set(path_tracers(scene.has_media)) <= tracers[scene.has_media]
-    assert making._way(scene, "path") == {"type": path_tracers(scene.has_media)[0]}
+    for cells in read_preset(REPOSITORY.preset("benchmark"), REPOSITORY, names).cells:
+        has_media, rendered = cells.scene.has_media, {m.name for m in cells.methods}
+        assert has_media == (cells.scene.name in ("fog_lamp", "skin_ball", "cloud_sky"))
+        assert tracers[has_media] <= rendered and not tracers[not has_media] & rendered
+        assert set(path_tracers(has_media)) <= tracers[has_media]
+        assert making._way(cells.scene, "path") == {"type": path_tracers(has_media)[0]}
 
 
 def test_three_lines_are_a_preset(tmp_path):
     text = 'scenes = ["cornell_box", "fog_lamp"]\nspp = [4, 16]\nseeds = 5\n'
-    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
-    found = [[m.name for m in Cells(REPOSITORY, preset, one).methods] for one in preset.subjects]
-    assert found == [["bdpt", "path"], ["bdpt", "volpath"]]
-    assert {m.match for m in preset.methods[1:]} == {"seconds"}
-    assert {one.resolution for one in preset.subjects} == {128}
-    assert [(one.spp, one.seeds) for one in preset.subjects] == [((4, 16), (5, 5))] * 2
-    given = Project(tmp_path, {"mine": REPOSITORY.scene("cornell_box")})
-    (subject,) = preset_of(Path("preset"), {"seeds": 3}, given).subjects
-    assert subject.name == "cornell_box" and subject.spp == (4, 16, 64) and subject.seeds == (3, 3, 3)
-    with pytest.raises(CommandError, match="preset: sedes=3: there is no such key"):
-        preset_of(Path("preset"), {"sedes": 3}, given)
+    cells = read_preset(preset_file(tmp_path, text), REPOSITORY).cells
+    assert [[m.name for m in one.methods] for one in cells] == [["bdpt", "path"], ["bdpt", "volpath"]]
+    assert {m.match for one in cells for m in one.methods[1:]} == {"seconds"}
+    assert [(one.resolution, one.spp, one.seeds) for one in cells] == [(128, (4, 16), (5, 5))] * 2
+    (one,) = read_preset({"seeds": 3}, REPOSITORY, scenes=["cornell_box"]).cells
+    assert one.scene.name == "cornell_box" and one.spp == (4, 16, 64) and one.seeds == (3, 3, 3)
 
 
 SCENE = (ROOT / "scenes" / "cornell_box.xml").read_text()
@@ -689,7 +620,7 @@ def test_a_folder_of_scenes_is_a_preset(tmp_path, others, monkeypatch):
     for pattern in (f"{others}/*/scene_v3.xml", "theirs/*/*.xml", "~/theirs/*/scene_v?.xml"):
         text = f'scenes = ["{pattern}"]\n{OPEN}'
         preset = read_preset(preset_file(tmp_path, text), Project(tmp_path))
-        assert [one.name for one in preset.subjects] == ["attic", "cellar"]
+        assert [one.scene.name for one in preset.cells] == ["attic", "cellar"]
         assert preset.scenes == ("attic", "broken", "cellar")
         (said,) = preset.left_out
         assert said.startswith("broken: left out: ") and "gone.ply" in said
@@ -727,53 +658,17 @@ def test_widths_fit_the_film(tmp_path, others):
         for side in sides:
             text = text.replace('value="$resolution"', f'value="{side}"', 1)
         (others / name / "scene_v3.xml").write_text(text)
-    preset = preset_of(
-        Path("preset"), {"scenes": [f"{others}/[ac]*/scene_v3.xml"], "spp": [2]}, Project(tmp_path)
-    )
-    (subject,) = preset.subjects
-    assert subject.name == "attic" and subject.resolution == 120 and subject.scene.size(120) == (120, 100)
+    preset = read_preset({"scenes": [f"{others}/[ac]*/scene_v3.xml"], "spp": [2]}, Project(tmp_path))
+    (cells,) = preset.cells
+    assert cells.scene.name == "attic" and cells.resolution == 120 and cells.scene.size(120) == (120, 100)
     assert "1009 x 4 pixels, which divides into 4 x 4 tiles at no width near 128" in preset.left_out[0]
-
-
-def test_first_images_are_rows_too(folder, monkeypatch, known, swept):
-    text = PRESET.replace("seeds = 2", "seeds = 2\nfirst_image = 3")
-    values, asked = iter([1.0, 9.0, 3.0, 1.0, 2.0, 1.5] * 2), []
-
-    def first(wanted):
-        asked.append(wanted)
-        seconds = next(values)
-        return {"seconds": seconds, "cpu_seconds": 10 * seconds}
-
-    monkeypatch.setattr(probes, "first_image", first)
-    for _ in range(2):
-        assert swept(preset_file(folder, text), "-o", folder / "out") == 0
-    found = rows_of(folder / "out")
-    seconds = {row["method"]: row["seconds_first_image"] for row in found}
-    assert seconds == {"ours": 3.0, "path": 1.5} and len(asked) == 6
-    assert {(one["spp"], one["resolution"], one["max_depth"]) for one in asked} == {(2, 8, 3)}
-    text = text.replace("seeds = 2", 'seeds = 2\nclock = "processor"')
-    assert swept(preset_file(folder, text), "-o", folder / "out") == 0
-    assert {row["seconds_first_image"] for row in rows_of(folder / "out")} == {30.0, 15.0}
-    given = Project(folder, {"mine": REPOSITORY.scene("cornell_box")})
-    with pytest.raises(CommandError, match="first_image=1 needs scene files"):
-        preset_of(Path("preset"), {"first_image": 1}, given)
-
-
-def test_a_first_image_without_kernel_cache():
-    wanted = {"file": str(ROOT / "scenes" / "cornell_box.xml"), "resolution": 8, "sampler": "independent"}
-    wanted |= {"parameters": {"type": "path"}, "max_depth": 3, "spp": 2}
-    began = time.perf_counter()
-    found = probes.first_image(wanted)
-    assert 0 < found["seconds"] < time.perf_counter() - began and found["cpu_seconds"] > 0
-    with pytest.raises(RuntimeError, match="gone.xml"):
-        probes.first_image(wanted | {"file": "gone.xml"})
 
 
 def test_time_left_follows_from_work(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("rich.console.monotonic", lambda: clock[0])
     with showing.Renders() as made, showing.Renders(limit=25) as limited:
-        assert made.seconds_left() is None and limited.seconds_left() == 25
+        assert made.seconds_left() == math.inf and limited.seconds_left() == 25
         for shown in (made, limited):
             shown.plan([4, 4, 8])
             shown.begin("box")
@@ -783,28 +678,25 @@ def test_time_left_follows_from_work(monkeypatch):
         assert made.seconds_left() == 30 and limited.seconds_left() == 15
 
 
-def test_a_time_limit_is_of_everything(tmp_path, monkeypatch, capsys):
+def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool"]')
-    preset = read_preset(preset_file(tmp_path, text), REPOSITORY)
-    asked = []
+    preset = read_preset(preset_file(tmp_path, text), Project(new_project(tmp_path)))
+    asked, limits, clock = [], [], [0.0]
     monkeypatch.setattr(sweep, "obtained", lambda job: asked.append(job.seconds))
-    for given, found in (((None, 100.0), 25), ((None, None), 600), ((7.0, 100.0), 7)):
-        sweep.Sweep(Project(tmp_path, {}), preset, tmp_path).prepare(*given)
+    for given, found in (((None, 100.0), 25), ((None, math.inf), 600), ((7.0, 100.0), 7)):
+        sweep.Sweep(preset, tmp_path).prepare(*given)
         assert asked[-2:] == [found, found]
-    limits, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(sweep.Sweep, "run", lambda self, progress, seconds: limits.append(seconds))
-    for spent, left in ((10.0, 90.0), (70.0, 30.0), (170.0, 0.0)):
+    monkeypatch.setattr(sweep.Sweep, "rows", lambda self: pd.DataFrame())
+    for spent, left in ((10.0, 90.0), (170.0, 0.0)):
 
         def prepared(self, *_, spent=spent):
             clock[0] += spent
 
         monkeypatch.setattr(sweep.Sweep, "prepare", prepared)
-        monkeypatch.setattr(sweep.Sweep, "rows", lambda self: pd.DataFrame())
-        asked = build_parser().parse_args(["sweep", "x", "--seconds", "100", "-o", str(tmp_path / "out")])
-        sweep.swept(REPOSITORY, str(preset_file(tmp_path, text)), asked)
+        sweep_of(tmp_path, tmp_path / "tiny.toml", "--seconds", 100, "-o", tmp_path / "out")
         assert limits[-1] == left
-    assert capsys.readouterr().out.count("took 70 s more than --seconds 100:") == 1
 
 
 def test_the_table_is_tidy(tmp_path):
@@ -830,21 +722,17 @@ def test_the_table_is_tidy(tmp_path):
         "rays_camera": 7,
         "tile_means": [1.0, 2.0],
     }
-    stored = tmp_path / "images" / "box" / "abc.exr"
-    stored.parent.mkdir(parents=True)
+    table = pd.DataFrame([row, row | {"seed": 2, "key": "gone"}])
+    stored = image_file(tmp_path, table.iloc[0])
+    stored.parent.mkdir()
     stored.write_bytes(b"an image")
-    mine = tmp_path / "images" / "mine.exr"
-    mine.touch()
-    for seed in (3, 1):
-        write_tables(pd.DataFrame([row | {"seed": seed}, row | {"seed": 2, "key": "gone"}]), tmp_path)
+    write_tables(table, tmp_path)
     first, second = csv.DictReader((tmp_path / "rows.csv").read_text().splitlines())
     assert not [cell for cell in first.values() if set(cell) & set("{}[]")]
     assert first["sampler"] == "multijitter"
     assert first["parameters"] == "path rr_depth=3" and first["integrator"] == "path multijitter"
     assert [first[name] for name in ("variance", "energy", "rays_camera", "flip")] == ["0.25", "0.9", "7", ""]
-    assert first["image"] == "box_path-multijitter_16_1.exr" and second["image"] == ""
-    named = tmp_path / "images" / first["image"]
-    assert named.read_bytes() == b"an image" and {*named.parent.glob("*.exr")} == {named, mine}
+    assert first["image"] == stored.name == "box_path-multijitter_8_1_abc.exr" and second["image"] == ""
     (kept, _) = json.loads((tmp_path / "rows.json").read_text())
     assert kept["parameters"] == {"type": "path", "rr_depth": 3}
     assert set(pyarrow.parquet.read_table(tmp_path / "rows.parquet").column_names) == set(row)
@@ -864,13 +752,13 @@ def test_samplers_of_rows_are_those_of_the_table(folder, known, swept, more, poi
         assert len(table) == 4 and samplers == {"ours": points, "path": "independent"}
 
 
-def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
+def test_what_time_does_not_allow_is_cut(folder, monkeypatch):
     """Two integrators and seeds; a budget takes twice as long where it compiles: 8, 16, 4 and 8 s."""
-    preset = read_preset(preset_file(tmp_path), REPOSITORY)
+    preset = read_preset(preset_file(folder), Project(folder))
     found, clock = [], [0.0]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
 
-    def rendered(self, bench, cell):
+    def rendered(self, progress, bench, cell):
         is_first = (cell.method, cell.budget) not in {(c.method, c.budget) for c in found}
         clock[0] += cell.budget * (1 + is_first)
         found.append(cell)
@@ -878,8 +766,8 @@ def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
 
     def swept(seconds):
         found.clear()
-        made = sweep.Sweep(REPOSITORY, preset, tmp_path)
-        made.run(showing.Renders(), seconds=seconds)
+        made = sweep.Sweep(preset, folder)
+        made.run(showing.Renders(), seconds)
         keys = [(cell.seed, cell.budget) for cell in found]
         assert keys[::2] == keys[1::2]  # both integrators
         return keys[::2], made
@@ -898,22 +786,21 @@ def test_what_time_does_not_allow_is_cut(tmp_path, monkeypatch):
 
 def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
-    made = sweep.Sweep(REPOSITORY, read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
-    made._todo[made.scenes[1]], clock, shares = [], [0.0], []
+    made = sweep.Sweep(read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
+    clock, shares = [0.0], []
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
 
     class Scene:
-        """Renders four times for 10 s each, but no more than twice in a share."""
+        """Renders four times for 10 s each, but no more than twice in a share; of the pool nothing lacks."""
 
         needed, text = 7.0, "text"
 
-        def __init__(self, cells, missing, known):
-            self.cells, self.done = cells, 0
-            assert not known
+        def __init__(self, cells, output):
+            self.cells, self.done = cells, 4 * (cells.scene.name == "pool")
 
         @property
         def late(self):
-            return [None] * (4 - self.done)
+            return self.cells.planned[: 4 - self.done]
 
         def render(self, rendered, seconds):
             shares.append(seconds)
@@ -922,51 +809,49 @@ def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
             return count
 
     monkeypatch.setattr(sweep, "Pending", Scene)
-    made.run(showing.Renders(), seconds=74)
+    made.run(showing.Renders(), 74)
     assert shares[:4] == [37, 54, 17, 24] and made.wanted == 9  # of one scene, 7 s and a quarter more
     assert made.cut == {"furnace_emission": "text"} or made.cut == {"cornell_box": "text"}
 
 
-def test_a_second_run_knows_the_seconds_of_the_first(folder, monkeypatch, known, swept):
+def test_a_second_run_uses_the_seconds_of_the_first(folder, monkeypatch, known):
     path, output = preset_file(folder, PRESET.replace("[2, 4]", "[2, 64, 6400]")), folder / "out"
     monkeypatch.setattr(sweep, "Bench", Clock)
-    made = sweep.Sweep(Project(folder), read_preset(path, Project(folder)), output)
-    cells = made.scenes[0]
-    for cell in cells.of(64, 1):
-        write_json(sweep.cell_file(output, cell), {"seconds": 0.064})
-    made._todo = {cells: cells.of(6400, 1)}
-    assert made._known_seconds(cells) == {"ours": {64: 0.064}, "path": {64: 0.064}}
-    made.run(showing.Renders(), seconds=0.1)
-    assert made.cut == {"cornell_box": "2 of 12 renders: 2 at 6400 spp"}
-    assert made.wanted == math.ceil(1.25 * 2 * 2 * 6.4)
+    made = sweep.Sweep(read_preset(path, Project(folder)), output)
+    (cells,) = made.scenes
+    for cell in cells.planned:
+        if cell.budget < 6400:
+            write_json(cell_file(output, cell), {"seconds": 0.001 * cell.budget})
+    made.run(showing.Renders(), 0.1)
+    assert made.cut == {"cornell_box": "4 of 12 renders: 4 at 6400 spp"}
+    assert made.wanted == math.ceil(1.25 * 2 * 4 * 6.4)
 
 
 def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
     """At least half of the proportion, for noise."""
     preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
-    cells = sweep.Cells(REPOSITORY, preset, preset.subjects[0])
-    made = limited.Pending(cells, cells.planned(), {})
-    assert made._seconds_of("ours", 4) == 0
-    made._seconds["ours"] = {2: 0.7}
-    assert made._seconds_of("ours", 4) == pytest.approx(0.7 + 0.35 * 2)
-    made._seconds["ours"] = {2: 0.7, 4: 0.9}
-    assert made._seconds_of("ours", 16) == pytest.approx(0.9 + max(0.1, 0.5 * 0.9 / 4) * 12)
-    assert made._seconds_of("ours", 4) == 0.9 and made._seconds_of("ours", 2) == 0.7
-    made._seconds["ours"] = {4: 0.8}
-    assert made._seconds_of("ours", 2) == pytest.approx(0.4)
+    made = limited.Pending(preset.cells[0], tmp_path)
+    for known, budget, expected in (
+        ({}, 4, 0),
+        ({2: 0.7}, 4, 0.7 + 0.35 * 2),
+        ({2: 0.7, 4: 0.9}, 16, 0.9 + max(0.1, 0.5 * 0.9 / 4) * 12),
+        ({2: 0.7, 4: 0.9}, 2, 0.7),
+        ({4: 0.8}, 2, 0.4),
+    ):
+        made._seconds["ours"] = known
+        assert made._seconds_of("ours", budget) == pytest.approx(expected)
 
 
-def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch, job):
+def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch):
     """1.25 ms a sample of both; a quarter of 1.6 s holds 320 renders of 5 ms."""
     text = PRESET.replace("[2, 4]", "[4, 40, 400]")
-    preset = read_preset(preset_file(folder, text), REPOSITORY)
-    cells = sweep.Cells(Project(folder), preset, preset.subjects[0])
+    (cells,) = read_preset(preset_file(folder, text), Project(folder)).cells
     monkeypatch.setattr(Clock, "timed", lambda self, cell, spp, seed: Timed(None, spp * PER[cell.method], 0))
     monkeypatch.setattr(Clock, "first_seconds", lambda self, cell, spp: None)
-    for seconds, budget in ((0.016, 4), (1.6, 40), (None, 400)):
+    for seconds, budget in ((0.016, 4), (1.6, 40), (math.inf, 400)):
         bench = Clock(cells, folder / f"{budget}", seconds)
         assert bench.spp_of(cells.of(4, 1)[1]) == 16 and bench.spp_of(cells.of(400, 1)[1]) == 1600
-        assert [bench.equal_time_spp(cell) for cell in cells.of(4, 1)] == [None, budget]
+        assert bench.equal(cells.of(4, 1)[1])["spp"] == budget
 
 
 PER = {"ours": 1e-3, "path": 0.25e-3}
@@ -986,14 +871,10 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
     assert missing_of(output) == missing != {}
     assert swept(*words) == 0 and missing_of(output) == {}
     assert "warning" not in capsys.readouterr().out
-    path = preset_file(folder, PRESET.replace('type = "path"', 'type = "ptracer"'))
-    assert swept(path, "-o", output) == 0
-    assert "4 rows are not of this preset, and no longer in the tables" in capsys.readouterr().out
 
 
 def keys(folder, text=PRESET):
-    preset = read_preset(preset_file(folder, text), REPOSITORY)
-    return {cell.key for cell in Cells(REPOSITORY, preset, preset.subjects[0]).planned()}
+    return {cell.key for cell in read_preset(preset_file(folder, text), REPOSITORY).cells[0].planned}
 
 
 def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 6148,
+    "measure": 5588,
     "transport merging guided_emission": 5726,
     "planning": 1731,
     "emitters": 2230,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1333,  # top files
 }
-OUTSIDE = {"scripts": 2924, "tests": 30747}
-MOST_WORDS = 28905
+OUTSIDE = {"scripts": 2932, "tests": 30593}
+MOST_WORDS = 28804
 
 
 def _lines(files):

@@ -12,18 +12,18 @@ as a dictionary (that of ``mi.load_dict``) where the command takes a file::
     for shot in measure.compare_at_equal_time(scene, ways, resolution=64):
         print(shot.caption)
 
-References, pictures and rows lie in the folder ``project``. They are kept by the scene's name; a dictionary
-gets one that says what is in it, unless it is given as ``measure.SceneDict(name, dictionary)``.
+References, pictures and rows lie in the folder ``project``, by the scene's name. A dictionary is written into
+a scene file there, named by its content unless it is given as ``measure.SceneDict(name, dictionary)``.
 
 Needs the extra ``[measure]``. Within the package nothing but the commands import it (see `cli.measuring`).
 
 * For Python: `api`; options, their defaults and bounds: `options`.
 * Scenes: `project` (the user's folder), `scenes` (any scene file, at any size).
-* Renders: `timing` (a render, and several sides in turns), `probes` (renders in new processes).
+* Renders: `timing` (a render, and several sides in turns).
 * Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
   made).
-* Sweeps: `models` (contents of TOML files), `preset` (which renders), `sweep`, `results` (their files and
-  tables).
+* Sweeps: `models` (contents of TOML files), `preset` (which renders), `limited` (which fit into a time),
+  `sweep`, `results` (their files and tables).
 * Reports: `analysis` (figures, or why there are none), `tables`, `figures` (plots), `crops` (images side by
   side), `paper` (widths and formats for print), `report` (Markdown), `page` (HTML).
 * A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.

@@ -114,42 +114,47 @@ def run_sweep(
     from . import sweep as module
 
     asked = _options(available.Sweep, options)
-    with _measured(dictionaries, project) as (found, _):
+    with _measured(dictionaries, project) as (found, names):
         named = preset if isinstance(preset, Mapping) else available.text_of_path("preset", preset)
-        rows, failed = module.swept(found, named, asked)
+        rows, failed = module.swept(found, named, asked, names)
     if failed:
         raise FailureError(f"preset={str(preset)!r}: {len(failed)} failed: {'; '.join(failed)}")
     return rows
 
 
 @contextmanager
-def _measured(scenes: Scene | Sequence[Scene], project: str | Path) -> Iterator[tuple[Project, list[str]]]:
-    """Yield the project with these scenes, and their names; sets `VARIANT`."""
+def _measured(scenes: Scene | Sequence[Scene], root: str | Path) -> Iterator[tuple[Project, list[str]]]:
+    """Yield the project, and the names or files of these scenes; sets `VARIANT`."""
     import mitsuba as mi
 
     from .project import Project
-    from .scenes import DictionaryScene
 
-    root, before, given, names = Path(available.text_of_path("project", project)), mi.variant(), {}, []
+    project, before = Project(Path(available.text_of_path("project", root))), mi.variant()
     mi.set_variant(VARIANT)
     try:
-        for scene in [scenes] if isinstance(scenes, _SCENES) else scenes:
-            if not isinstance(scene, _SCENES):
-                raise CommandError(
-                    f"scene={scene!r} must be the path of a scene file, a name in {str(project)!r}/scenes, "
-                    "or a dictionary as of mi.load_dict"
-                )
-            if isinstance(scene, Mapping):
-                scene = DictionaryScene.named_by_content(scene)
-            elif isinstance(scene, SceneDict):
-                scene = DictionaryScene(scene.name, scene.dictionary)
-            if isinstance(scene, DictionaryScene):
-                given[scene.name] = scene
-            names.append(scene.name if isinstance(scene, DictionaryScene) else str(scene))
-        yield Project(root, given), names
+        yield project, [_file(project, one) for one in ([scenes] if isinstance(scenes, _SCENES) else scenes)]
     finally:
         if before is not None:
             mi.set_variant(before)
+
+
+def _file(project: Project, scene: Scene) -> str:
+    """Return the file or name of a scene; writes a dictionary into PROJECT/dictionaries/NAME.xml."""
+    import mitsuba as mi
+
+    from .scenes import digest
+
+    if isinstance(scene, str | Path):
+        return str(scene)
+    name, content = (scene.name, scene.dictionary) if isinstance(scene, SceneDict) else ("", scene)
+    if not isinstance(content, Mapping) or content.get("type") != "scene":
+        raise CommandError(f"scene={scene!r} must be a file, a name or a dictionary of type 'scene'")
+    if (project.scenes / f"{name}.xml").exists():
+        raise CommandError(f"scene={name!r} is the name of a file in {str(project.scenes)!r}; take another")
+    project.dictionaries.mkdir(parents=True, exist_ok=True)
+    file = project.dictionaries / f"{name or 'unnamed'}.xml"
+    mi.parser.write_file(mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), dict(content)), str(file))
+    return str(file if name else file.replace(file.with_name(f"scene_{digest(file)[:8]}.xml")))
 
 
 def _options(kind: type[OptionsT], given: dict) -> OptionsT:

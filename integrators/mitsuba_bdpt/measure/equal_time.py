@@ -29,7 +29,7 @@ from .options import RESOLUTION, VARIANT, EqualTime
 from .paper import check_figure
 from .project import Project
 from .results import relative_errors
-from .scenes import MeasuredScene, depth_of, integrator_of, path_tracers, samples_taken
+from .scenes import SceneFile, depth_of, integrator_of, path_tracers, samples_taken
 from .showing import steps
 from .timing import alternating, timed
 
@@ -67,7 +67,7 @@ class Subject:
     error: Callable[[np.ndarray], RelativeError]
 
 
-def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespace) -> Subject:
+def subject(project: Project, file: SceneFile, options: EqualTime | Namespace) -> Subject:
     if options.reference is None:
         seconds = options.reference_seconds
         width = fitted(file, options.resolution or RESOLUTION)
@@ -86,7 +86,7 @@ def subject(project: Project, file: MeasuredScene, options: EqualTime | Namespac
     if target.shape[:2] != (height, width):
         raise CommandError(
             f"reference={str(options.reference)!r} has {target.shape[1]} x {target.shape[0]} pixels, the "
-            f"film of {file.called} {width} x {height}; render it from this scene"
+            f"film of {str(file.file)!r} {width} x {height}; render it from this scene"
         )
 
     def bound(image: np.ndarray) -> RelativeError:  # of an image, whose own error is unknown

@@ -1,31 +1,30 @@
-"""Renders of a sweep under a limit of time: which of them fit, predicted from those that were rendered."""
+"""The missing renders of a scene, in an order in which those that fit into a time are rendered first."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from pathlib import Path
 
 from .preset import FIRST_SEED, Cell, Cells
+from .results import cell_file, read_cell
 
 LEAST_SLOPE = 0.5  # of a larger budget's seconds over samples, in those of the budgets before
 
 
 class Pending:
-    """The ``missing`` renders of a scene, in the order of seeds, all budgets of each.
+    """The renders of a scene that are not in ``output``, in the order of seeds, all budgets of each.
 
-    Integrators of one budget and seed are rendered together or not at all. ``known``: seconds of earlier
-    renders by integrator and budget.
+    Integrators of one budget and seed are rendered together or not at all.
     """
 
-    def __init__(self, cells: Cells, missing: Sequence[Cell], known: Mapping[str, Mapping[int, float]]):
-        self.cells = cells
-        ordered = sorted(missing, key=lambda cell: (cell.seed, cell.budget))
-        self._groups = [
-            list(group) for _, group in groupby(ordered, key=lambda cell: (cell.seed, cell.budget))
-        ]
-        self._seconds = {method: dict(seconds) for method, seconds in known.items()}
+    def __init__(self, cells: Cells, output: Path):
+        self.cells, self._output = cells, output
+        missing = [[c for c in group if not cell_file(output, c).exists()] for group in cells.groups]
+        self._groups = [group for group in missing if group]
+        self._seconds: dict[str, dict[int, float]] = defaultdict(dict)
         self._compiled = set[tuple[str, int]]()
 
     @property
@@ -39,10 +38,9 @@ class Pending:
     @property
     def text(self) -> str:
         """How many renders are missing, and at which budgets."""
-        late = self.late
-        counts = Counter(cell.budget for cell in late)
+        counts = Counter(cell.budget for cell in self.late)
         at = ", ".join(f"{count} at {budget} spp" for budget, count in sorted(counts.items()))
-        return f"{len(late)} of {len(self.cells.planned())} renders: {at}"
+        return f"{counts.total()} of {len(self.cells.planned)} renders: {at}"
 
     def render(self, rendered: Callable[[Cell], float | None], seconds: float) -> int:
         """Render what fits into the ``seconds``; returns the number of renders.
@@ -51,9 +49,14 @@ class Pending:
         budget are rendered in any case: with fewer there is no figure.
         """
         end = time.monotonic() + seconds
+        if seconds < math.inf and not self._seconds:
+            finished = {cell: cell_file(self._output, cell) for cell in self.cells.planned}
+            for cell, file in finished.items():
+                if file.exists():
+                    self._seconds[cell.method][cell.budget] = read_cell(file)["seconds"]
 
         def fits(group: list[Cell]) -> bool:
-            is_least = group[0].budget == min(self.cells.subject.spp) and group[0].seed < FIRST_SEED + 2
+            is_least = group[0].budget == min(self.cells.spp) and group[0].seed < FIRST_SEED + 2
             left = end - time.monotonic()
             return is_least or (left > 0 and self._predicted(group) <= left)
 
@@ -63,7 +66,7 @@ class Pending:
             for cell in group:
                 taken = rendered(cell)
                 if taken is not None:
-                    self._seconds.setdefault(cell.method, {})[cell.budget] = taken
+                    self._seconds[cell.method][cell.budget] = taken
                 self._compiled.add((cell.method, cell.budget))
                 done += 1
         return done
@@ -76,12 +79,12 @@ class Pending:
 
     def _seconds_of(self, method: str, budget: int) -> float:
         """Return the seconds of a render: the last of its budget, else extrapolated; 0 before the first."""
-        known = self._seconds.get(method, {})
+        known = self._seconds[method]
         if not known or budget in known:
             return known.get(budget, 0.0)
         *_, before, last = [0, *sorted(known)]
         proportional = known[last] / last
-        slope = (known[last] - known.get(before, 0.0)) / (last - before)
         if budget < last:
             return proportional * budget
+        slope = (known[last] - known.get(before, 0.0)) / (last - before)
         return known[last] + max(slope, LEAST_SLOPE * proportional) * (budget - last)

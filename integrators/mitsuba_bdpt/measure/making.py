@@ -45,7 +45,7 @@ from .reference import (
     source_digest,
     write,
 )
-from .scenes import MeasuredScene, integrator_of, path_tracers, samples_taken
+from .scenes import SceneFile, integrator_of, path_tracers, samples_taken
 from .showing import amount
 
 EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all", "merging": False}
@@ -96,7 +96,7 @@ class Job:
     """
 
     project: Project
-    scene: MeasuredScene
+    scene: SceneFile
     resolution: int
     max_depth: int | None = None
     spp: int = 64
@@ -210,7 +210,7 @@ def _announced(job: Job) -> str:
     return f"{job.scene.name}: {why}, for at most about {job.seconds:g} s"
 
 
-def fitted(scene: MeasuredScene, wanted: int) -> int:
+def fitted(scene: SceneFile, wanted: int) -> int:
     """Load a scene, and return the nearest width at which it can be measured; prints a message if it differs.
 
     Raises ``CommandError`` if there is none near.
@@ -341,7 +341,7 @@ class AccuracyTarget:
         )
 
 
-def _way(scene: MeasuredScene, by: str, merging_radius: float = 0.25) -> dict:
+def _way(scene: SceneFile, by: str, merging_radius: float = 0.25) -> dict:
     """Return the integrator's parameters for a key ``by`` of `WAYS`, for `_loaded`.
 
     ``merging_radius``: in pixels.

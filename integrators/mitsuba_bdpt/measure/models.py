@@ -111,38 +111,16 @@ class SceneKeys(Model):
     seeds: Seeds | None = None
 
 
-class More(Model):
-    """Further seeds of some ``integrators``, the first of the preset first, in some scenes at one budget.
-
-    ``seeds``: at least, at most; they end when the interval of the median ratio of efficiencies is narrower
-    than ``width``.
-    """
-
-    scenes: Names
-    integrators: Annotated[tuple[Text, ...], Field(min_length=2)]
-    spp: Whole
-    seeds: tuple[Annotated[int, Field(strict=True, ge=2)], Whole]
-    width: Annotated[float, Field(strict=True, gt=0, lt=1)]
-
-    @validator(mode="after")
-    def _check(self) -> More:
-        if self.seeds[0] > self.seeds[1]:
-            raise ValueError(f"seeds={list(self.seeds)} must be [at least, at most]")
-        return self
-
-
 class PresetFile(Model):
     """A preset; by default the package's integrator and Mitsuba's path tracer in equal time.
 
-    ``clock``: whose seconds decide. ``first_image``: processes that render the first image of each scene and
-    integrator. ``scenes``: files, names or patterns; None where the command names them.
+    ``clock``: whose seconds decide. ``scenes``: files, names or patterns; None where the command names them.
     """
 
     scenes: Names | None = None
     resolution: Annotated[int, Field(strict=True, ge=TILES, multiple_of=TILES)] = RESOLUTION
     max_depth: Whole | None = None
     clock: Literal["wall", "processor"] = "wall"
-    first_image: Annotated[int, Field(strict=True, ge=0)] = 0
     spp: Numbers = (4, 16, 64)
     seeds: Seeds = (FEWEST_RUNS,)
     scene: dict[str, SceneKeys] = {}
@@ -151,7 +129,12 @@ class PresetFile(Model):
         Method(type="path", media=False),
         Method(type="volpath", media=True),
     )
-    more: More | None = None
+
+    @property
+    def methods(self) -> tuple[Method, ...]:
+        """The integrators; the first one has its samples, whose time the others match."""
+        first, *others = self.integrator
+        return first.model_copy(update={"match": "spp"}), *others
 
     def depth(self, scene: str, own: int) -> int:
         """Return the ``max_depth`` of a scene: its table's, else the preset's, else the file's ``own``."""
@@ -179,18 +162,7 @@ class PresetFile(Model):
                 f"the first integrator, {first.name!r}, sets the time of the others; it takes neither "
                 "scenes nor media nor seeds nor match = 'seconds'"
             )
-        if self.more is not None:
-            self._check_more(self.more, names)
         return self
-
-    def _check_more(self, more: More, names: list[str]) -> None:
-        if unknown := [name for name in more.integrators if name not in names]:
-            raise ValueError(f"{unknown[0]!r} of [more] integrators is not in the preset")
-        if more.integrators[0] != names[0]:
-            raise ValueError(f"integrators of [more] must be the first one, {names[0]!r}, and its rivals")
-        for method in self.integrator:
-            if method.name in more.integrators and (method.scenes or method.seeds):
-                raise ValueError(f"{method.name!r} of [more] is limited by scenes or seeds of its own")
 
 
 class Radiance(Model):

@@ -161,7 +161,6 @@ class Sweep(Options):
         None, str, "scenes of the preset, or files where it lists none; default: all", nargs="+"
     )
     output: Path | None = option(None, Path, "folder; default: PROJECT/results/NAME_OF_PRESET", short="-o")
-    scheduler: str | None = option(None, str, "address of a dask.distributed scheduler (extra [cluster])")
     reference_seconds: float | None = option(
         None,
         SECONDS,

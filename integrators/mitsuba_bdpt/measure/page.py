@@ -44,7 +44,6 @@ COLUMNS = {
     "seconds": "seconds",
     "relMSE, trimmed": "rel_mse_trimmed",
     "relMSE, raw": "rel_mse",
-    "MAPE": "mape",
     "HDR-FLIP": "flip",
     "ΔE ITP": "delta_e_itp",
 }
@@ -104,7 +103,7 @@ def lines(results: Results) -> list[list]:
     Over seeds the mean of errors, and the median of samples and seconds.
     """
     averages = dict.fromkeys(["spp", "seconds"], "median")
-    averages |= dict.fromkeys(["mape", "flip", "delta_e_itp"], "mean")
+    averages |= dict.fromkeys(["flip", "delta_e_itp"], "mean")
     groups = results.rows.groupby(["scene", "method", "budget"])
     found = groups.agg(averages).assign(renders=groups.size()).astype({"spp": int})
     for kind in KINDS:

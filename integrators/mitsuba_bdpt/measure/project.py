@@ -1,6 +1,7 @@
 """The folder of a project's measurements.
 
     PROJECT/scenes/NAME.xml             scenes with a NAME; others are given by their file
+    PROJECT/dictionaries/NAME.xml       scenes that were given to a function as dictionaries
     PROJECT/references/                 reference images, made according to references/scenes.toml
     PROJECT/presets/NAME.toml           definitions of sweeps
     PROJECT/results/NAME/               results of sweeps
@@ -14,14 +15,13 @@ from __future__ import annotations
 import glob
 import re
 import shlex
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import CommandError, did_you_mean, listed
 from ..files.texts import read_toml
 from .models import PresetFile, checked
-from .scenes import DictionaryScene, MeasuredScene, SceneFile
+from .scenes import SceneFile
 
 PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
 """Stems of scene files that are named by their folders: of exporters, one folder per scene."""
@@ -30,12 +30,14 @@ PLAIN = re.compile(r"scene(_v[\d.]+)?", re.IGNORECASE)
 @dataclass(frozen=True)
 class Project:
     root: Path
-    given: Mapping[str, DictionaryScene] = field(default_factory=dict[str, DictionaryScene], compare=False)
-    """Scenes that are given as dictionaries, by their names."""
 
     @property
     def scenes(self) -> Path:
         return self.root / "scenes"
+
+    @property
+    def dictionaries(self) -> Path:
+        return self.root / "dictionaries"
 
     @property
     def references(self) -> Path:
@@ -48,28 +50,32 @@ class Project:
     def scene_names(self) -> list[str]:
         return sorted(path.stem for path in self.scenes.glob("*.xml"))
 
-    def scene(self, name: str) -> MeasuredScene:
+    def scene(self, name: str) -> SceneFile:
         """Return a scene by name, or by file relative to here or to the project.
 
         Raises ``CommandError`` that lists scenes if there is none.
         """
-        if name in self.given:
-            return self.given[name]
-        for file in (Path(name), self.scenes / f"{name}.xml", self.root / name):
+        named = (folder / f"{name}.xml" for folder in (self.scenes, self.dictionaries))
+        for file in (Path(name), *named, self.root / name):
             if file.is_file():
-                return SceneFile(name_of(file), file)
+                stem = file.resolve().parent.name if PLAIN.fullmatch(file.stem) else file.stem
+                return SceneFile(stem, file)
+        known = self.scene_names()
+        text = f"or put it into {str(self.scenes)!r} and give its name"
+        if known:
+            text = f"or a name; there are {listed(known, 30)}; {did_you_mean(name, known)}".rstrip("; ")
         raise CommandError(
             f"scene={name!r} is neither a scene file nor the name of one in {str(self.scenes)!r}; "
-            f"give the path of an XML file{self._names_for(name)}"
+            f"give the path of an XML file, {text}"
         )
 
-    def matching(self, name: str) -> list[MeasuredScene]:
+    def matching(self, name: str) -> list[SceneFile]:
         """Return the scenes of a pattern like ``rooms/*/scene.xml``, sorted; else `scene` of that name.
 
         A ``~`` is the home folder. Raises ``CommandError`` if there are none.
         """
         name = str(Path(name).expanduser()) if name.startswith("~") else name
-        if name in self.given or not glob.has_magic(name):
+        if not glob.has_magic(name):
             return [self.scene(name)]
         for pattern in (name, str(self.root / name)):
             if found := sorted(glob.glob(pattern, recursive=True)):
@@ -78,10 +84,9 @@ class Project:
             f"scenes={name!r} matches no file; give the paths of XML files, e.g. 'rooms/*/scene.xml'"
         )
 
-    def called(self, scene: MeasuredScene) -> str:
+    def called(self, scene: SceneFile) -> str:
         """Return the name by which `scene` finds a scene."""
-        named = self.scenes / f"{scene.name}.xml"
-        return str(scene.file) if isinstance(scene, SceneFile) and scene.file != named else scene.name
+        return scene.name if scene.file == self.scenes / f"{scene.name}.xml" else str(scene.file)
 
     def command(self, *words: str | Path) -> str:
         there = [] if self.root == Path() else ["--project", str(self.root)]
@@ -92,14 +97,7 @@ class Project:
         known = (self.root / "presets" / f"{folder.name}.toml").is_file()
         return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
 
-    def _names_for(self, name: str) -> str:
-        known = self.scene_names()
-        if not known:
-            return f", or put it into {str(self.scenes)!r} and give its name"
-        text = f", or a name; there are {listed(known, 30)}; {did_you_mean(name, known)}"
-        return text.rstrip("; ")
-
-    def depth(self, scene: MeasuredScene) -> int:
+    def depth(self, scene: SceneFile) -> int:
         """Return the default ``max_depth`` of a scene.
 
         That of presets/benchmark.toml if it exists, else that of the scene's file.
@@ -119,8 +117,3 @@ class Project:
     @staticmethod
     def _found(given: str, named: Path) -> Path:
         return named if named.exists() and not Path(given).exists() else Path(given)
-
-
-def name_of(file: Path) -> str:
-    """Return the name of a scene file: that of its folder where all files are called scene.xml or so."""
-    return file.resolve().parent.name if PLAIN.fullmatch(file.stem) else file.stem

@@ -26,7 +26,7 @@ from .metrics import tone_map
 from .options import FIGURE_FORMATS, VARIANT, Pyramid
 from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
-from .scenes import MeasuredScene, integrator_of
+from .scenes import SceneFile, integrator_of
 from .showing import amount
 
 KINDS = ("weighted", "unweighted")
@@ -52,7 +52,7 @@ def technique_images(image, names: list, kind: str) -> dict:
     return found
 
 
-def render(file: MeasuredScene, options: Pyramid | Namespace):
+def render(file: SceneFile, options: Pyramid | Namespace):
     """Return the film after a render, and technique images, weighted and unweighted."""
     scene = file.load(options.resolution)
     parameters = {"type": "bdpt", "layers": "strategies", "heuristic": options.heuristic}

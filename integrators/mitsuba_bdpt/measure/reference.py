@@ -20,7 +20,7 @@ from .agreement import Means, Sample
 from .metrics import reference_rel_mse, rel_mse
 from .options import REFERENCE_SECONDS
 from .project import Project
-from .scenes import MeasuredScene, digest
+from .scenes import SceneFile, digest
 
 HALF_MAX = 65504.0
 """The largest number in half precision."""
@@ -62,20 +62,15 @@ def reference_path(project: Project, name: str, resolution: int, max_depth: int)
 
 
 def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """Return the command line, or for a dictionary the call, that makes or refines a reference.
+    """Return the command line that makes or refines a reference.
 
     ``called``: the scene's name. ``more``: further options and their values.
     """
     size = "--resolution", str(resolution), "--max-depth", str(max_depth)
-    words = [*size, *more, "--seconds", f"{REFERENCE_SECONDS:g}"]
-    if called not in project.given:
-        return project.command("reference", called, *words)
-    names = (name.strip("-").replace("-", "_") for name in words[::2])
-    said = "".join(f", {name}={value}" for name, value in zip(names, words[1::2], strict=True))
-    return f"mitsuba_bdpt.measure.make_reference(SceneDict({called!r}, ...){said})"
+    return project.command("reference", called, *size, *more, "--seconds", f"{REFERENCE_SECONDS:g}")
 
 
-def load_reference(project: Project, scene: MeasuredScene, resolution: int, max_depth: int) -> Reference:
+def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
     """Return the stored reference.
 
     Raises ``CommandError``, with the command that makes it, if it is missing or of another scene file.

@@ -1,12 +1,10 @@
-"""A sweep's files: cells, tables, variances over seeds."""
+"""A sweep's files: cells, images, tables, variances over seeds."""
 
 from __future__ import annotations
 
 import io
 import json
-import os
 import re
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,10 +19,10 @@ from ..files.images import read_layers, write_layers
 from ..files.texts import list_of, read_json, read_toml, text_of, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
-from .preset import FIRST_SEED, Cell, Cells, Preset
+from .preset import FIRST_SEED, Cell, Cells
 from .project import Project
-from .reference import Reference, load_reference, read_reference, reference_path
-from .scenes import MeasuredScene, digest
+from .reference import Reference, read_reference, reference_path
+from .scenes import digest
 from .tables import described
 
 
@@ -32,28 +30,21 @@ def cell_file(output: Path, cell: Cell) -> Path:
     return output / "cells" / f"{cell.key}.json"
 
 
-def first_image_file(output: Path, cell: Cell) -> Path:
-    """Return the file of the seconds of first images, by the cell of the smallest budget's first seed."""
-    return output / "first" / f"{cell.key}.json"
+def read_cell(file: Path) -> dict[str, Any]:
+    return read_json(file, "delete it, to render it anew")
 
 
 def image_file(output: Path, render: Any) -> Path:
     """Return the file of the image of a render: a `Cell` or a row."""
-    return output / "images" / render.scene / f"{render.key}.exr"
+    method = re.sub(r"[^\w.=+-]+", "-", render.method)
+    names = render.scene, method, render.budget, render.seed, render.key[:8]
+    return output / "images" / f"{'_'.join(map(str, names))}.exr"
 
 
-def judge_of(project: Project, scene: MeasuredScene, resolution: int, depth: int):
-    """Return a reference, and the SHA-256 of its file, computed before reading."""
-    path = reference_path(project, scene.name, resolution, depth)
-    sha256 = digest(path) if path.exists() else ""
-    return load_reference(project, scene, resolution, depth), sha256
-
-
-def store(output: Path, cell: Cell, row: dict, image: np.ndarray, judge) -> None:
-    """Write image and row of a cell, with errors against ``judge`` (see `judge_of`)."""
+def store(output: Path, cells: Cells, cell: Cell, row: dict, image: np.ndarray) -> None:
+    """Write image and row of a cell, with errors against the stored reference."""
     write_layers(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
-    found = row | errors(image, *judge, cell.seed == FIRST_SEED)
-    write_json(cell_file(output, cell), found)
+    write_json(cell_file(output, cell), row | errors(image, *cells.judge, cell.seed == FIRST_SEED))
 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
@@ -65,9 +56,6 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
         "mean": float(image.mean()),
         "energy": float(image.mean() / ref.image.mean()),
         "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
-        "mse": metrics.mse(image, ref.image),
-        "rel_mse_epsilon": metrics.rel_mse_epsilon(ref.image),
-        "mape": metrics.mape(image, ref.image),
         "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
     }
@@ -82,23 +70,24 @@ def relative_errors(image: np.ndarray, ref: Reference) -> dict[str, float]:
     return found
 
 
-def read_rows(output: Path, cells: Cells, wanted: Sequence[Cell]) -> pd.DataFrame:
-    """Return the rows of the finished cells among ``wanted``.
+def rows(cells: Cells, output: Path) -> pd.DataFrame:
+    """Return the rows of all finished cells of a scene, by budgets.
 
     Computes errors again if the reference has changed.
     """
-    project, scene, resolution, depth = cells.where()
-    path, found = reference_path(project, scene.name, resolution, depth), []
-    for cell in wanted:
+    found = []
+    for cell in sorted(cells.planned, key=lambda cell: cell.budget):
         file = cell_file(output, cell)
-        if not file.exists():
-            continue
-        row = read_json(file, "delete it, to render it anew")
-        if not path.exists() or row["reference_sha256"] != digest(path):
-            row |= errors(_image(output, cell), *judge_of(*cells.where()), cell.seed == FIRST_SEED)
-            write_json(file, row)
-        found.append(row)
-    return pd.DataFrame(found)
+        if file.exists():
+            row = read_cell(file)
+            if row["reference_sha256"] != cells.judge[1]:
+                row |= errors(_image(output, cell), *cells.judge, cell.seed == FIRST_SEED)
+                write_json(file, row)
+            found.append(row)
+    table = pd.DataFrame(found)
+    if not found:
+        return table
+    return table.assign(variance=_variances(output, cells, table), first=cells.methods[0].name)
 
 
 def _image(output: Path, render: Any) -> np.ndarray:
@@ -111,101 +100,38 @@ def _image(output: Path, render: Any) -> np.ndarray:
     return image
 
 
-def rows(preset: Preset, cells: Cells, output: Path) -> pd.DataFrame:
-    """Return the rows of all finished cells of a scene, in order.
-
-    Cells are those that were rendered: a source edited meanwhile changes their names.
-    """
-    found = read_rows(output, cells, cells.possible())
-    if found.empty:
-        return found
-    first = {c.method: _first_image(output, c) for c in cells.of(min(cells.subject.spp), FIRST_SEED)}
-    return found.assign(
-        variance=_variances(output, cells, found),
-        first=preset.methods[0].name,
-        seconds_first_image=found["method"].map(first).astype(float),
-    )
-
-
-def _first_image(output: Path, cell: Cell) -> float | None:
-    """Return the median seconds of an integrator's first images; None without."""
-    file = first_image_file(output, cell)
-    return float(np.median(read_json(file, "delete it, to render it anew"))) if file.exists() else None
-
-
 def _variances(output: Path, cells: Cells, table: pd.DataFrame) -> pd.Series:
     """Return `metrics.spread` of each row, over the seeds of its integrator and budget.
 
     NaN for fewer than two renders, differing numbers of samples, or missing images.
     """
-    found, ref = pd.Series(np.nan, table.index), None
+    found = pd.Series(np.nan, table.index)
     for _, group in table.groupby(["method", "budget"]):
         renders = list(group.itertuples())
         are_there = all(image_file(output, render).exists() for render in renders)
         if len(group) > 1 and group["spp"].nunique() == 1 and are_there:
-            ref = ref or load_reference(*cells.where())
-            found[group.index] = metrics.spread([_image(output, render) for render in renders], ref.image)
+            images = [_image(output, render) for render in renders]
+            found[group.index] = metrics.spread(images, cells.judge[0].image)
     return found
 
 
-def _stored(file: Path) -> pd.DataFrame:
-    """Return the rows of a file; older sweeps have the variance as ``spread``."""
-    return pd.read_parquet(file).rename(columns={"spread": "variance"})
+def _stored(folder: Path, remedy: str) -> pd.DataFrame:
+    """Return the rows of a folder; older sweeps have the variance as ``spread``."""
+    try:
+        return pd.read_parquet(folder / "rows.parquet").rename(columns={"spread": "variance"})
+    except (FileNotFoundError, NotADirectoryError, pa.ArrowInvalid) as error:
+        raise CommandError(f"{folder}: rows.parquet is missing or not whole; {remedy}") from error
 
 
 def beside(table: pd.DataFrame, order: Sequence[str] | None, output: Path) -> pd.DataFrame:
     """Return ``table`` and stored rows of other scenes, in ``order``; None: as stored, new ones last."""
-    file = output / "rows.parquet"
-    try:
-        others = _stored(file) if file.exists() else table[:0]
-    except pa.ArrowInvalid as error:
-        raise CommandError(
-            f"{str(file)!r} is damaged ({error}); run the sweep without --scenes, which writes it anew"
-        ) from error
-    if others.empty:
+    if not (output / "rows.parquet").exists():
         return table
-    done = set(table.get("scene", ()))
-    every = pd.concat([others, table])
-    order = list(order or every["scene"].unique())
-    kept = pd.concat([table, others[~others["scene"].isin(done)]])
-    kept = kept[kept["scene"].isin(order)]
-    return kept.sort_values("scene", key=lambda names: names.map(order.index), kind="stable")
-
-
-def lost(table: pd.DataFrame, output: Path) -> list[str]:
-    """Return messages about stored rows whose render is not among those of the ``table``.
-
-    An edited scene has its own message.
-    """
-    before = _before(output)
-    if table.empty or before.empty:
-        return []
-    now = before["scene"].map(table.groupby("scene")["scene_sha256"].first())
-    is_edited = now.notna() & (now != before["scene_sha256"])
-    told = [
-        f"{name}: the scene has changed: {count} renders of it before are no longer in the tables, and used "
-        "again if it is reverted"
-        for name, count in before["scene"][is_edited].value_counts(sort=False).items()
-    ]
-    keys = ["scene", "method", "budget", "seed", "resolution", "max_depth", "parameters"]
-    is_kept = pd.MultiIndex.from_frame(before[keys]).isin(pd.MultiIndex.from_frame(table[keys]))
-    gone = before[~is_edited & ~is_kept]
-    if gone.empty:
-        return told
-    names = ", ".join((gone["scene"] + " by " + gone["method"]).unique())
-    text = (
-        f"{output}: {len(gone)} rows are not of this preset, and no longer in the tables: {names}. Their "
-        "renders are kept: sweep the earlier preset again to have its rows, and name another folder by -o"
-    )
-    return [*told, text]
-
-
-def _before(output: Path) -> pd.DataFrame:
-    """Return the stored rows; none if they are missing or damaged, and so written anew."""
-    try:
-        return _stored(output / "rows.parquet")
-    except (FileNotFoundError, pa.ArrowInvalid):
-        return pd.DataFrame()
+    others = _stored(output, "run the sweep without --scenes, which writes it anew")
+    order = list(order or pd.concat([others, table])["scene"].unique())
+    kept = others["scene"].isin(order) & ~others["scene"].isin(table.get("scene", ()))
+    found = pd.concat([table, others[kept]])
+    return found.sort_values("scene", key=lambda names: names.map(order.index), kind="stable")
 
 
 def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:
@@ -213,13 +139,12 @@ def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], co
 
     Entries of other scenes stay.
     """
-    file = output / "missing.json"
     kept = {name: one for name, one in missing_of(output).items() if name not in scenes}
     kept |= {name: {"text": text, "command": command} for name, text in cut.items()}
     if kept:
-        write_json(file, kept)
+        write_json(output / "missing.json", kept)
     else:
-        file.unlink(missing_ok=True)
+        (output / "missing.json").unlink(missing_ok=True)
 
 
 def missing_of(output: Path) -> dict[str, dict[str, str]]:
@@ -230,37 +155,11 @@ def missing_of(output: Path) -> dict[str, dict[str, str]]:
 
 COLUMNS = (
     *("scene", "integrator", "parameters", "sampler", "spp", "seed", "clock", "budget", "equal_time_spp"),
-    *("seconds", "cpu_seconds", "seconds_compile", "seconds_pilot", "seconds_first_image"),
+    *("seconds", "cpu_seconds", "seconds_compile", "seconds_pilot"),
     *("rel_mse", "rel_mse_trimmed", "reference_rel_mse", "reference_rel_mse_trimmed", "variance"),
-    *("mse", "mape", "flip", "delta_e_itp", "mean", "energy", "width", "height", "max_depth"),
+    *("flip", "delta_e_itp", "mean", "energy", "width", "height", "max_depth"),
 )
 """Columns of rows.csv, before those of the rays and the image."""
-
-
-def named_image(row: Any) -> str:
-    """Return the name of a render's image, scene_integrator_spp_seed.exr."""
-    method = re.sub(r"[^\w.=+-]+", "-", row.method)
-    return f"{row.scene}_{method}_{row.spp}_{row.seed}.exr"
-
-
-def _name_images(table: pd.DataFrame, output: Path) -> list[str]:
-    """Link the images of the rows under their names; returns these, empty where there is no image.
-
-    Names of the rows before are removed.
-    """
-    names: list[str] = []
-    for row in table.itertuples():
-        stored, name = image_file(output, row), named_image(row)
-        names.append(name if stored.exists() else "")
-        if stored.exists():
-            with replacing(output / "images" / name) as temporary:
-                try:
-                    os.link(stored, temporary)
-                except OSError:  # no links on this file system
-                    shutil.copyfile(stored, temporary)
-    for name in {named_image(row) for row in _before(output).itertuples()}.difference(names):
-        (output / "images" / name).unlink(missing_ok=True)
-    return names
 
 
 def write_tables(table: pd.DataFrame, output: Path) -> None:
@@ -277,10 +176,10 @@ def write_tables(table: pd.DataFrame, output: Path) -> None:
     }
     plain = ["scene", "method", "spp", "seed", "key", "machine", "started"]
     write_json(output / "rows.json", table[plain].assign(**parts).to_dict("records"))
+    images = [image_file(output, row) for row in table.itertuples()]
     tidy = table.rename(columns={"method": "integrator"}).assign(
         parameters=[described(dict(sorted(found.items()))) for found in parts["parameters"]],
-        clock=table.get("clock", pd.Series("wall", table.index)).fillna("wall"),
-        image=_name_images(table, output),
+        image=[file.name if file.exists() else "" for file in images],
     )
     encoded = {"encoding": "utf-8", "errors": "backslashreplace"}
     with replacing(output / "rows.csv") as temporary:
@@ -297,23 +196,16 @@ def decided(row: Mapping[str, Any]) -> float:
     return row["cpu_seconds"] if row.get("clock") == "processor" else row["seconds"]
 
 
-def decisive(table: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows with the seconds by which they are compared."""
-    return table.assign(seconds=table.apply(decided, axis=1))
-
-
 def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference], dict[str, str]]:
     """Return the results in a folder, and the references of its scenes and the notes by scene.
 
-    The integrators that notes.toml lists as ``aside`` are not compared. Raises ``CommandError`` if there are
-    no results, or if errors are against other references than the ``project``'s.
+    Rows have the seconds by which they are compared. The integrators that notes.toml lists as ``aside`` are
+    not compared. Raises ``CommandError`` if there are no results, or if errors are against other references
+    than the ``project``'s.
     """
-    try:
-        table = decisive(_stored(folder / "rows.parquet"))
-    except (FileNotFoundError, NotADirectoryError, pa.ArrowInvalid) as error:
-        raise CommandError(
-            f"{folder}: rows.parquet is missing or not whole; run {project.sweep_command(folder)}"
-        ) from error
+    again = f"run {project.sweep_command(folder)}"
+    table = _stored(folder, again)
+    table = table.assign(seconds=table.apply(decided, axis=1))
     made: dict[str, Reference] = {}
     for scene, rows in table.groupby("scene", sort=False):
         path = reference_path(project, scene, rows["resolution"].iloc[0], rows["max_depth"].iloc[0])
@@ -325,8 +217,8 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
         made[scene] = read_reference(path)
         if (rows["reference_sha256"] != digest(path)).any():
             raise CommandError(
-                f"{folder}: the errors in {scene} were taken against another reference; run "
-                f"{project.sweep_command(folder)}, which takes them anew"
+                f"{folder}: the errors in {scene} were taken against another reference; {again}, which takes "
+                "them anew"
             )
     means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
     notes = folder / "notes.toml"

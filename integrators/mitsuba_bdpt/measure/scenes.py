@@ -1,17 +1,16 @@
-"""Scenes for measurements, from files and dictionaries, at any size and sampler."""
+"""Scene files for measurements, at any size and with any sampler."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mitsuba as mi
-import numpy as np
 
 from ..errors import CommandError, message
 from ..files.loading import (
@@ -23,45 +22,47 @@ from ..files.loading import (
     spectra,
     unless_incompatible,
 )
-from ..files.whole import from_utf8
 from ..host.introspection import media_of
 
 
 class _Look(NamedTuple):
-    """A scene's integrator, `has_media`, the size of its film, and whether that has colours."""
+    """A scene's ``max_depth``, `has_media`, the size of its film, and whether that has colours."""
 
-    integrator: mi.Integrator
+    max_depth: int
     has_media: bool
     size: tuple[int, int]
     has_colours: bool
 
 
-class MeasuredScene:
-    """A scene with a ``name``, the key of its references and rows.
-
-    ``called``: its name in messages; ``sha256``: SHA-256 of the scene and of all files that it names.
-    """
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene in an XML ``file``, with a ``name``, the key of its references and rows."""
 
     name: str
-    called: str
-    sha256: str
+    file: Path
 
-    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
-        raise NotImplementedError
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the scene and of all files that it names."""
+        with searching(self.file):
+            state = parsed_anyway(self.file, {})
+            content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
+        return hashlib.sha256(b"".join(content)).hexdigest()
 
-    def _instantiated(self, sampler: str | None, merges: bool = True) -> mi.Scene:
+    def _instantiated(self, sampler: str | None, merges: bool) -> mi.Scene:
         """Return the scene; with another type of ``sampler`` unless None. ``merges`` meshes of a BSDF."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel, config.merge_meshes = False, merges
-        state = self._parsed(config)
-        if sampler is not None:
-            sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
-            if not sensors:
-                raise CommandError(f"scene={self.called} has no sensor; add one to it.")
-            _replace_sampler(state.nodes, sensors[0], sampler)
-        mi.parser.transform_all(config, state)
-        # The stub says object.
-        return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
+        with searching(self.file):
+            state = parsed(self.file, {}, config)
+            if sampler is not None:
+                sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
+                if not sensors:
+                    raise CommandError(f"scene={str(self.file)!r} has no sensor; add one to it.")
+                _replace_sampler(state.nodes, sensors[0], sampler)
+            mi.parser.transform_all(config, state)
+            # The stub says object.
+            return mi.parser.instantiate(config, state)  # pyright: ignore[reportReturnType]
 
     def load(self, resolution: int | None = None, sampler: str | None = None) -> mi.Scene:
         """Load the scene, ``resolution`` pixels wide, with a ``sampler`` of this type.
@@ -81,19 +82,19 @@ class MeasuredScene:
         """
         if not self._look.has_colours:
             raise CommandError(
-                f"scene={self.called}: its film has no colours, of which errors are taken; give it the "
+                f"scene={str(self.file)!r}: its film has no colours, of which errors are taken; give it the "
                 'pixel_format "rgb"'
             )
         return self._look.size if resolution is None else _widened(self._look.size, resolution)
 
-    @cached_property
+    @property
     def max_depth(self) -> int:
         """The integrator's ``max_depth``; -1 (no limit) without one."""
-        return depth_of(self._look.integrator)
+        return self._look.max_depth
 
-    @cached_property
+    @property
     def has_media(self) -> bool:
-        """Whether rays can be in a medium, see `has_media`."""
+        """Whether a sensor is in a medium, or a shape bounds one."""
         return self._look.has_media
 
     @cached_property
@@ -102,125 +103,17 @@ class MeasuredScene:
         scene = self.load()
         film = choose_sensor(scene, 0).film()
         width, height = map(int, film.size())
-        return _Look(scene.integrator(), has_media(scene), (width, height), film.base_channels_count() >= 3)
-
-
-@dataclass(frozen=True)
-class SceneFile(MeasuredScene):
-    """A scene in an XML ``file``."""
-
-    name: str
-    file: Path
-
-    def __reduce__(self):
-        """For workers: without what is cached."""
-        return SceneFile, (self.name, self.file.resolve())
-
-    @property
-    def called(self) -> str:
-        return repr(str(self.file))
-
-    @property
-    def sha256(self) -> str:
-        with searching(self.file):
-            state = parsed_anyway(self.file, {})
-            content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
-        return hashlib.sha256(b"".join(content)).hexdigest()
-
-    def _instantiated(self, sampler: str | None, merges: bool = True) -> mi.Scene:
-        with searching(self.file):
-            return super()._instantiated(sampler, merges)
-
-    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
-        return parsed(self.file, {}, config)
-
-
-class DictionaryScene(MeasuredScene):
-    """A scene as a ``dictionary`` for ``mi.load_dict``.
-
-    Raises ``CommandError`` unless sensors and films are dictionaries too: measurements change their size and
-    sampler.
-    """
-
-    def __init__(self, name: str, dictionary: Mapping[str, Any]):
-        if not isinstance(dictionary, Mapping) or dictionary.get("type") != "scene":
-            raise CommandError(f"scene={name!r} must be a dictionary of type 'scene', as of mi.load_dict")
-        self.name, self._dictionary = name, _copied(dictionary)
-        for key, value in self._dictionary.items():
-            held = value if isinstance(value, dict) else {"": value}
-            if made := [inner for inner in held.values() if isinstance(inner, mi.Sensor | mi.Film)]:
-                raise CommandError(
-                    f"scene={name!r}: {key!r} holds a {type(made[0]).__name__} that is made already; give "
-                    "sensors and films as dictionaries, since images of other sizes are measured"
-                )
-
-    @classmethod
-    def named_by_content(cls, dictionary: Mapping[str, Any]) -> DictionaryScene:
-        """Name a dictionary by a hash of its content."""
-        unnamed = cls("scene", dictionary)
-        return cls(f"scene_{unnamed.sha256[:8]}", dictionary)
-
-    @property
-    def called(self) -> str:
-        return f"the dictionary {self.name!r}"
-
-    @property
-    def sha256(self) -> str:
-        return hashlib.sha256(b"".join(_bytes_of(self._dictionary, self.name))).hexdigest()
-
-    def _parsed(self, config: mi.parser.ParserConfig) -> mi.parser.ParserState:
-        return mi.parser.parse_dict(config, self._dictionary)
-
-
-def _copied(dictionary: Mapping) -> dict:
-    return {key: _copied(value) if isinstance(value, Mapping) else value for key, value in dictionary.items()}
-
-
-def _bytes_of(value: Any, where: str) -> Iterator[bytes]:
-    """Yield the bytes of a scene dictionary's ``value``; ``where``: its key.
-
-    Raises ``CommandError`` for objects whose content cannot be hashed.
-    """
-    if isinstance(value, Mapping):
-        for key, held in value.items():
-            yield f"{len(value)} {key}".encode()
-            yield from _bytes_of(held, f"{where}.{key}")
-        if isinstance(name := value.get("filename"), str):
-            path = from_utf8(str(mi.file_resolver().resolve(name)))
-            yield path.read_bytes() if path.is_file() else b""
-    elif value is None or isinstance(value, str | bool | int | float):
-        yield f"{type(value).__name__} {value!r}".encode()
-    elif isinstance(value, list | tuple):
-        for held in value:
-            yield from _bytes_of(held, where)
-    elif isinstance(value, mi.Object):
-        yield value.class_name().encode()
-        parameters = mi.traverse(value)
-        for key in parameters.keys():
-            yield key.encode()
-            yield from _bytes_of(parameters[key], f"{where}.{key}")
-    else:
-        array = np.array(getattr(value, "matrix", value))
-        if array.dtype == object:
-            raise CommandError(
-                f"{where} is a {type(value).__name__}, of which it cannot be known whether it has changed "
-                "since a reference was made; give a dictionary, a number, a text or an array"
-            )
-        yield f"{array.dtype} {array.shape}".encode()
-        yield array.tobytes()
+        has_media = bool(media_of(scene, scene.sensors()))
+        has_colours = film.base_channels_count() >= 3
+        return _Look(depth_of(scene.integrator()), has_media, (width, height), has_colours)
 
 
 def digest(*paths: Path) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
-def has_media(scene: mi.Scene) -> bool:
-    """Return whether a sensor is in a medium, or a shape bounds one."""
-    return bool(media_of(scene, scene.sensors()))
-
-
 def path_tracers(media: bool) -> tuple[str, ...]:
-    """Return Mitsuba's path tracers for a scene with or without media (`has_media`).
+    """Return Mitsuba's path tracers for a scene with or without media.
 
     `path` ignores media; without media the others are slower.
     """

@@ -5,6 +5,7 @@ Elsewhere than on a terminal only long `Renders` are shown, by lines. Print befo
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
@@ -48,10 +49,10 @@ EVERY, SHARE = 30.0, 0.02
 class Renders:
     """Progress of many renders of different lengths, whose time left follows from their work.
 
-    The work of a render is any number in proportion to its seconds. ``limit``: of the seconds, if any.
+    The work of a render is any number in proportion to its seconds. ``limit``: of the seconds.
     """
 
-    def __init__(self, limit: float | None = None):
+    def __init__(self, limit: float = math.inf):
         self._bar = bar()
         task = self._bar.add_task("", total=0.0)
         self._task, self._update = self._bar.tasks[0], partial(self._bar.update, task)
@@ -84,16 +85,14 @@ class Renders:
             self._printed = elapsed
             print(self.words(text), file=sys.stderr, flush=True)
 
-    def seconds_left(self) -> float | None:
-        """Return the estimated seconds until all is rendered or the limit is over; None before the first."""
+    def seconds_left(self) -> float:
+        """Return the estimated seconds until all is rendered or the limit is over."""
         task, elapsed = self._task, self._task.elapsed or 0.0
-        left = [] if self._limit is None else [self._limit - elapsed]
-        if task.completed:
-            left.append(elapsed * (task.remaining or 0.0) / task.completed)
-        return max(min(left), 0.0) if left else None
+        left = elapsed * (task.remaining or 0.0) / task.completed if task.completed else math.inf
+        return max(min(left, self._limit - elapsed), 0.0)
 
     def words(self, text: str) -> str:
         """Return how many renders are done, and the time left."""
         left = self.seconds_left()
-        time_left = "" if left is None else f", {timedelta(seconds=round(left))} left"
+        time_left = f", {timedelta(seconds=round(left))} left" if left < math.inf else ""
         return f"{self._done} of {self._total} renders{time_left}: {text}"

@@ -1,7 +1,4 @@
-"""Times whole renders in this process, also of several sides in turns.
-
-For times of a new process see `probes`.
-"""
+"""Times whole renders in this process, also of several sides in turns."""
 
 from __future__ import annotations
 
