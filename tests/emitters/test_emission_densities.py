@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import scene_parts as parts
+import welch
 from mitsuba_bdpt.emitters import disks as emitter_disks
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import boxes
@@ -17,6 +18,9 @@ from mitsuba_bdpt.geometry.rounding import ShapeErrors
 from mitsuba_bdpt.host.jit import evaluated_mode
 from mitsuba_bdpt.transport.photons.aim import Aim
 from scipy import stats
+from welch import tiles
+
+from scenes import integrator, layer, renders
 
 COUNT = 200_000
 LEVEL = 1e-4
@@ -226,12 +230,12 @@ def test_selection_beside_what_cannot_be_traced():
     assert abs(weight.mean() - power) < 5 * weight.std() / np.sqrt(COUNT)
 
 
-def meadow(emitter):
+def meadow(emitter, sensor=None):
     """A block on a large ground."""
     ground = {"type": "rectangle", "to_world": parts.T().rotate([1, 0, 0], -90).scale(8)}
     block = parts.T().translate([1, 0.5, 0]).rotate([0, 1, 0], 30).scale(0.5)
     scene = {
-        "sensor": parts.perspective((0, 4, 6), (0.5, 0, 0), 50, size=8),
+        "sensor": sensor or parts.perspective((0, 4, 6), (0.5, 0, 0), 50, size=8),
         "ground": ground | {"bsdf": {"type": "diffuse", "reflectance": 0.5}},
         "block": {"type": "cube", "to_world": block},
         "emitter": emitter,
@@ -319,23 +323,10 @@ def test_a_vertex_that_is_not_finite():
     assert float(sphere.radius[0]) == pytest.approx(np.sqrt(2), rel=1e-3)
 
 
-CORNER = """<scene version="3.0.0">
-    <bsdf type="diffuse" id="grey"/>
-    <shape type="rectangle"><ref id="grey"/></shape>
-    <shape type="rectangle">
-        <transform name="to_world"><rotate x="1" angle="-90"/></transform><ref id="grey"/>
-    </shape>
-    <shape type="sphere">
-        <point name="center" x="0" y="0.3" z="0.3"/><float name="radius" value="0.1"/>
-    </shape>
-    <emitter type="constant"/>
-</scene>"""
-
-
 GREY = parts.grey(0.5)
 
 
-def room_of_rectangles():
+def room_of_rectangles(bsdf=GREY):
     """A room of five rectangles of one BSDF, open to a white sky, with a small cube on its floor."""
     sides = {"floor": ([1, 0, 0], -90), "ceiling": ([1, 0, 0], 90), "left": ([0, 1, 0], 90)}
     sides |= {"right": ([0, 1, 0], -90), "back": ([0, 1, 0], 0)}
@@ -345,7 +336,7 @@ def room_of_rectangles():
         "cube": {"type": "cube", "to_world": parts.T().translate([0, -0.8, 0]).scale(0.2)},
         "sensor": parts.perspective((0, 0, 0.9), (0, 0, -1), 70),
     } | {
-        name: {"type": "rectangle", "to_world": parts.T().rotate(*turn).translate([0, 0, -1]), "bsdf": GREY}
+        name: {"type": "rectangle", "to_world": parts.T().rotate(*turn).translate([0, 0, -1]), "bsdf": bsdf}
         for name, turn in sides.items()
     }
 
@@ -365,14 +356,11 @@ def test_a_room_of_merged_rectangles(parameters):
 
 
 def test_sizes_of_scenes_with_merged_rectangles():
-    """A ball of radius .1, a thousandth of the rectangles, is small; spheres around merged mirrors are
-    finite."""
-    text = CORNER.replace("diffuse", "conductor").replace(
-        '<rotate x="1" angle="-90"/>', '<scale value="100"/>'
-    )
-    merged, apart = (mi.load_string(text, optimize=on) for on in (True, False))
-    whole, true = (boxes.scene_box(scene) for scene in (merged, apart))
-    assert len(merged.shapes()) == 2 and whole == true and true == apart.bbox()
+    """A ball of radius 0.001 is small beside them; spheres around merged mirrors are finite."""
+    scene = room_of_rectangles({"type": "conductor"})
+    scene["cube"] = {"type": "sphere", "radius": 1e-3}
+    merged, apart = (mi.load_dict(scene, optimize=on) for on in (True, False))
+    assert boxes.scene_box(merged) == boxes.scene_box(apart) == apart.bbox() != merged.bbox()
     assert ShapeErrors(merged).small and ShapeErrors(apart).small
     aims = Aim.of(merged, Emitters(merged))
     assert all(np.isfinite(float(sphere.radius[0])) for sphere in aims.spheres)
@@ -390,40 +378,21 @@ def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
     """Next-event estimation and light tracing alone each give the image of light that is reflected once, and
-    so do all together: t test of each pixel and of the whole over 24 renders, Sidak, at 1e-4."""
-    scene, images = meadow(FROM_INFINITY[name]), {}
-    integrator = mi.load_dict(
-        {"type": "bdpt", "max_depth": 2, "light_paths": 1, "layers": "strategies", "hide_emitters": True}
-    )
+    so do all together."""
+    scene = meadow(FROM_INFINITY[name])
+    bdpt = integrator(max_depth=2, light_paths=1, layers="strategies", hide_emitters=True)
     assert Emitters(scene).disks.details is not None
-    renders = np.array([np.array(integrator.render(scene, seed=s, spp=1024)) for s in range(24)], dtype=float)
-    layers = integrator.aov_names()
-    first = renders.shape[-1] - len(layers)
-    for layer in ("unweighted.s1t2.R", "unweighted.s2t1.R"):
-        images[layer] = renders[..., first + layers.index(layer)]
-    alone = images["unweighted.s1t2.R"].reshape(24, -1)
-    for other in (images["unweighted.s2t1.R"], renders[..., 0]):
-        a, b = (np.c_[x, x.mean(axis=1)] for x in (alone, other.reshape(24, -1)))
-        assert stats.sem(b[:, -1]) < 0.01 * b[:, -1].mean()
-        # The sun's light by (1, 2) is without noise: rounding.
-        error = np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 24) + 1e-5
-        p = 2 * stats.t.sf(np.abs(a.mean(axis=0) - b.mean(axis=0)) / error, 23)
-        assert -np.expm1(p.size * np.log1p(-p.min())) > LEVEL
+    images = renders(scene, bdpt, 1024, 24)
+    alone = tiles(layer(images, bdpt, "unweighted.s1t2"), 1)
+    for other in (layer(images, bdpt, "unweighted.s2t1"), images[..., :3]):
+        welch.agree(tiles(other, 1), alone, 0.04, 1e-4)
 
 
 def test_aimed_light_subpaths_that_reach_a_lens():
-    """For t = 0 the density is asked for at the sensor, which may lie outside the scene: the image is that of
-    a long render by `path` (1e-3 for its error), by a t test as above."""
-    scene = meadow(FROM_INFINITY["sky"])
+    """For t = 0 the density is asked for at the sensor, which may lie outside the scene."""
     lens = {"type": "thinlens", "aperture_radius": 3.0, "focus_distance": 20.0}
-    sensor = mi.load_dict(parts.perspective((0, 5, 25), (0, 0, 0), 60, size=6) | lens)
-    assert Emitters(scene).disks.details is not None
-    integrator = mi.load_dict({"type": "bdpt", "max_depth": 1, "skip": "none"})
-    path = mi.load_dict({"type": "path", "max_depth": 1})
-    images = [np.array(integrator.render(scene, sensor, seed=s, spp=512))[..., 0] for s in range(24)]
-    expected = np.array(mi.render(scene, sensor=sensor, integrator=path, spp=1 << 14))[..., 0].ravel()
-    ours = np.array(images, dtype=float).reshape(24, -1)
-    assert "used: t=0" in integrator.explain(scene, sensor) and 0.3 < expected.mean() < 0.99
-    error = stats.sem(ours, axis=0) + 1e-3
-    p = 2 * stats.t.sf(np.abs(ours.mean(axis=0) - expected) / error, 23)
-    assert -np.expm1(p.size * np.log1p(-p.min())) > LEVEL
+    sensor = parts.perspective((0, 5, 25), (0, 0, 0), 60, size=6) | lens
+    scene, bdpt = meadow(FROM_INFINITY["sky"], sensor), integrator(max_depth=1, skip="none")
+    assert Emitters(scene).disks.details is not None and "used: t=0" in bdpt.explain(scene)
+    path = renders(scene, integrator("path", max_depth=1), 1024, 12, 100)
+    welch.agree(tiles(renders(scene, bdpt, 512, 24), 1), tiles(path, 1), 0.02, 1e-4)

@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from meshes import ball_mesh
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.geometry import mitsubas_choices, smooth_meshes
 from mitsuba_bdpt.geometry.shape_facts import ShapeFacts
@@ -171,44 +172,23 @@ def test_a_sheared_disk_is_found_where_it_is_sampled():
             Emitters(gap(lamp=lamp | {"to_world": turned}))
 
 
-def ball_of_triangles(center=(0, 0, 0), radius=1.0, rows=128, columns=128, emitter=None, flip_normals=False):
-    """A ball of 2 ``rows`` ``columns`` - 2 ``columns`` triangles in an order without rule, with the vertex
-    normals of a sphere."""
-    theta, phi = np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1)
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    n = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), -np.sin(theta) * np.sin(phi)], -1)
-    corner = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)
-    below = corner + columns + 1
-    upper, lower = np.stack([corner, below, below + 1], -1), np.stack([corner, below + 1, corner + 1], -1)
-    faces = np.concatenate([upper[:-1].reshape(-1, 3), lower[1:].reshape(-1, 3)])
-    faces = np.random.default_rng(5).permutation(faces)
-    properties = mi.Properties()
-    properties["flip_normals"] = flip_normals
-    properties["bsdf"] = mi.load_dict(grey(0))
-    properties["emitter"] = mi.load_dict(emitter or {"type": "area", "radiance": 5.0})
-    normals = n.reshape(-1, 3)
-    mesh = mi.Mesh("ball", len(normals), len(faces), has_vertex_normals=True, props=properties)
-    keys = mi.traverse(mesh)
-    keys["vertex_positions"] = (np.array(center) + radius * normals).ravel().tolist()
-    keys["vertex_normals"] = normals.ravel().tolist()
-    keys["faces"] = faces.ravel().tolist()
-    keys.update()
-    return mesh
+def shining_ball(subdivisions, radius=0.5):
+    """A ball of 20 * 4^n triangles at the height of the `gap`'s middle."""
+    return ball_mesh(subdivisions) | LAMP | {"to_world": T().translate([0, 1.5, 0]).scale(radius)}
 
 
-@pytest.mark.parametrize("rows", [3, 32, 128, 256])
-def test_normals_of_fine_meshes(rows):
-    """Within the largest angle between a face and the sphere above it: half a diagonal of a cell, and a tenth
-    more, and 1e-3 for rounding (2e-6 of the height of a face near a pole)."""
+@pytest.mark.parametrize("subdivisions", [0, 3, 5, 6])
+def test_normals_of_fine_meshes(subdivisions):
+    """Within the largest angle between a face and the sphere above it: that to a corner, 37 degrees of an
+    icosahedron, halved by each division, and two fifths more, since the middle triangles are larger."""
     count = 20_000
-    scene = gap(lamp=ball_of_triangles((0, 1.5, 0), 0.5, rows, rows))
-    assert rows < 128 or scene.emitters()[0].get_shape().face_count() > 30_000
+    scene = gap(lamp=shining_ball(subdivisions))
     emitters = Emitters(scene)
     e, u = sampled_emission(emitters, count)
     at = dr.zeros(mi.SurfaceInteraction3f, count)
     at.p = mi.Point3f(0.3, 0, 0.2)
     direct = emitters.sample_direct(at, mi.Point2f(u[:2]), mi.Bool(True))
-    limit = 1.1 * np.hypot(np.pi / rows, 2 * np.pi / rows) / 2 + 1e-3
+    limit = 1.4 * 0.652 / 2**subdivisions
     for anchor in (e.anchor, direct.anchor):
         away = dr.normalize(anchor.p - mi.Point3f(0, 1.5, 0))
         cos = np.abs(np.array(dr.dot(away, anchor.n)))
@@ -223,15 +203,13 @@ def placed_lamps():
 
 
 @pytest.mark.parametrize("shape, placed, flipped", list(placed_lamps()))
-def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
+def test_normals_have_the_sign_of_hits(shape, placed, flipped):
     """The side of an emitting surface decides in which medium light starts. Tolerance: 0.03 (interpolated
     normals of a coarse mesh are off by 0.1 and more) for 99 % of the points, others are on edges."""
     count = 2000
     lamp = {"type": shape, "flip_normals": flipped}
     if shape == "mesh":
-        ball = ball_of_triangles(rows=6, columns=12)
-        ball.write_ply(str(tmp_path / "ball.ply"))
-        lamp = lamp | {"type": "ply", "filename": str(tmp_path / "ball.ply")}
+        lamp |= ball_mesh(1)
     lamp |= {"to_world": PLACED[placed], "emitter": {"type": "area", "radiance": 1.0}}
     scene = mi.load_dict({"type": "scene", "lamp": lamp})
     emitters = Emitters(scene)
@@ -246,14 +224,13 @@ def test_normals_have_the_sign_of_hits(shape, placed, flipped, tmp_path):
 
 
 def test_a_fine_mesh_shines_like_any():
-    check_sums(gap(lamp=ball_of_triangles((0, 1.5, 0), 0.6)), width=0.01)
+    check_sums(gap(lamp=shining_ball(5, 0.6)), width=0.01)
 
 
 def test_another_table_of_faces_is_noticed(monkeypatch):
     """By sums in double precision, and after an edit of the faces alone, after which Mitsuba keeps its
     areas."""
-    mesh = ball_of_triangles((0, 1.5, 0), 0.5)
-    scene = gap(lamp=mesh)
+    scene = gap(lamp=shining_ball(6))
     Emitters(scene)
     right = smooth_meshes._Faces.of
 
