@@ -47,9 +47,8 @@ def traced(monkeypatch):
 
 
 def test_pilots_are_remembered(traced):
-    """Rationale: a pilot takes as long as a preview, and a scene is rendered more than once. Expected: of
-    renders with the seeds 0 to 3 one pilot, the same decision, and each image that of a render of the scene
-    loaded anew, which traces its own (up to the order of sums)."""
+    """Renders with the seeds 0 to 3 have one pilot, one decision, and the image of a scene loaded anew, up to
+    the order of sums."""
     scene, integrator = cornell(), bdpt()
     images, decided = [], []
     for seed in range(4):
@@ -63,8 +62,7 @@ def test_pilots_are_remembered(traced):
 
 
 def test_another_render_asks_another_pilot(traced):
-    """Expected: pilots of another number of samples, other parameters and another sensor are others; then all
-    of them are known."""
+    """For other samples, parameters and sensors; then all of them are known."""
     scene = cornell()
     film = {"type": "hdrfilm", "width": 48, "height": 48}
     other = mi.load_dict(mi.cornell_box()["sensor"] | {"film": film})
@@ -75,13 +73,15 @@ def test_another_render_asks_another_pilot(traced):
         (bdpt(), {"spp": SPP, "sensor": other}),
         (bdpt(spp_per_pass=32), {"spp": 256}),
     ]
-    for integrator, arguments in renders:
-        integrator.render(scene, **arguments)
-    assert len(traced) == len(renders)
-    before = len(traced)
-    for integrator, arguments in renders:
-        integrator.render(scene, **arguments)
-    assert len(traced) == before
+    for _ in range(2):
+        for integrator, arguments in renders:
+            integrator.render(scene, **arguments)
+        assert len(traced) == len(renders)
+
+
+def painted():
+    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
+    return {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
 
 
 EDITS = {
@@ -97,10 +97,8 @@ EDITS = {
 
 @pytest.mark.parametrize("name", EDITS)
 def test_edits_are_seen(name, traced):
-    """Expected: after an edit another pilot; after an update without one none."""
-    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
-    painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
-    scene, integrator = cornell(bumpy=bumpy(), painted=painted), bdpt()
+    """An update without an edit makes no other pilot."""
+    scene, integrator = cornell(bumpy=bumpy(), painted=painted()), bdpt()
     integrator.render(scene, spp=SPP)
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith(name))
@@ -114,8 +112,7 @@ def test_edits_are_seen(name, traced):
 
 
 def test_two_edits_in_between_are_seen():
-    """Rationale: Dr.Jit gives the numbers of freed arrays to others. Expected: after two edits in a row the
-    state is another, for small arrays, which are kept, and large ones, whose contents count."""
+    """Dr.Jit gives the numbers of freed arrays to others; of large arrays the contents count."""
     for entries in (3, 30_000):
         mesh = mi.Mesh("mesh", entries, 1)
         parameters = mi.traverse(mesh)
@@ -129,16 +126,11 @@ def test_two_edits_in_between_are_seen():
         assert len(seen) == 20
 
 
-@pytest.mark.parametrize("entries", [65, 66, 4097, 100_001])
-@pytest.mark.parametrize("kind", ["Float", "UInt32", "Float16", "UInt8", "Bool"])
+@pytest.mark.parametrize("entries", [65, 100_001])
+@pytest.mark.parametrize("kind", ["Float", "Float16", "Bool"])
 def test_each_entry_counts(kind, entries):
-    """Expected: arrays that differ in one entry, the first, the last or another, have other checksums, and
-    an equal one has the same."""
-    numpy_kind = {"Float": np.float32, "Float16": np.float16, "UInt8": np.uint8, "Bool": bool}.get(
-        kind, np.uint32
-    )
-    values = (np.arange(entries) % 2).astype(numpy_kind)
     made = getattr(dr.llvm, kind)
+    values = (np.arange(entries) % 2).astype(made(0).numpy().dtype)
     found = {_checksum(made(values))}
     for place in (0, 1, entries // 2, entries - 1):
         edited = values.copy()
@@ -155,8 +147,7 @@ def test_edits_in_place_are_seen():
 
 
 def test_nothing_large_is_kept():
-    """Rationale: what is remembered would outlive a scene that takes gigabytes. Expected: the state of a mesh
-    of 30,000 vertices keeps none of its large arrays."""
+    """It would outlive a scene that takes gigabytes."""
     mesh = mi.Mesh("mesh", 30_000, 10_000)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = mi.Float(np.zeros(90_000, dtype=np.float32))
@@ -167,8 +158,7 @@ def test_nothing_large_is_kept():
 
 
 def test_scenes_that_are_gone_are_forgotten():
-    """Rationale: what is remembered of them holds variables of Dr.Jit. Expected: with three scenes that were
-    rendered and are gone as many are known as before; one that lives is not forgotten meanwhile."""
+    """What is remembered of them holds variables of Dr.Jit; a scene that lives is not forgotten."""
     scene, integrator = cornell(), bdpt()
     integrator.render(scene, spp=SPP)
     before, others = len(notices._scenes), [cornell() for _ in range(3)]
@@ -189,8 +179,8 @@ def behind_glass(**shapes):
 
 
 def test_parameters_are_read_once(monkeypatch):
-    """Rationale: it takes up to 8 ms; pilot and look for unsampled light both need them. Expected: once
-    in a render, twice where ``on_pass`` was called, which may edit them; beside those of shapes alone."""
+    """Once in a render, for pilot and unsampled light; twice where ``on_pass`` was called, which may edit
+    them; beside those of shapes alone."""
     read, original = [], State.of
 
     def of(owners, deep=True):
@@ -207,8 +197,7 @@ def test_parameters_are_read_once(monkeypatch):
 
 
 def test_edits_during_a_render_are_seen(monkeypatch):
-    """Rationale: what is found of a scene that ``on_pass`` has edited is not of the one that the pilot saw.
-    Expected: it is looked for anew when that one is rendered again."""
+    """What is found of a scene that ``on_pass`` has edited is not of the one that the pilot saw."""
     looks = []
 
     def look(prepared, plan, *others):
@@ -216,9 +205,7 @@ def test_edits_during_a_render_are_seen(monkeypatch):
         return unsampled_light.UnsampledLight({})
 
     monkeypatch.setattr(unsampled_light, "estimate", look)
-    texture = {"type": "bitmap", "data": dr.full(mi.TensorXf, 0.5, (16, 16, 3)), "raw": True}
-    painted = {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": texture}}
-    scene, integrator = behind_glass(painted=painted), bdpt()
+    scene, integrator = behind_glass(painted=painted()), bdpt()
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith("painted.bsdf.reflectance.data"))
 

@@ -57,7 +57,7 @@ def test_library_of_the_environment(library, tmp_path, monkeypatch, listed, pref
     ids=["pending", "done", "none"],
 )
 def test_a_wheel_installed_by_this_process_is_finished(monkeypatch, files, starts):
-    """Rationale: a notebook installs the wheel, whose links to libc++ are made when Python starts next."""
+    """As by a notebook: the wheel's links to libc++ are made when Python starts next."""
     wheel = SimpleNamespace(read_text=lambda name: "" if name in files else None)
     started = []
     monkeypatch.setattr("importlib.metadata.distributions", lambda name: [wheel])
@@ -144,7 +144,6 @@ except Exception as error:
 
 @pytest.mark.parametrize(("variant", "stopped"), [(None, True), ("cuda_ad_rgb", False)])
 def test_import_after_drjit_with_an_old_llvm(variant, stopped):
-    """Expected: an error, unless the current variant needs no LLVM (the import then meets the stand-in)."""
     done = run(FAKE_DRJIT.replace("VARIANT", repr(variant)))
     words = "LLVMNotFoundError drjit was imported first and loaded LLVM 15.0.7"
     assert done.stdout.startswith(words) == stopped and done.stdout, done.stderr
@@ -170,8 +169,8 @@ render(20)
 
 
 def test_quick_compilation(tmp_path):
-    """Expected: other code of the kernel within the block, the usual code of one after it, equal results but
-    for the rounding of some sixty operations."""
+    """Other code of the kernel within the block, the usual code after it; results equal but for rounding of
+    some sixty operations."""
     printed, kernels = [], []
     for way in ("usual", "again", "quick"):
         cache = tmp_path / way

@@ -43,7 +43,6 @@ def system(tmp_path, monkeypatch):
     ],
 )
 def test_limits_of_control_groups_count(system, memberships, limits, expected):
-    """Expected: the least limit of the groups of both versions; the machine's where none has one."""
     system("proc/self/cgroup", memberships)
     machine = memory.available()
     for name, text in limits.items():
@@ -121,22 +120,19 @@ def child():
 
 @pytest.mark.parametrize("option", ["-v", "-d"])
 def test_limits_of_the_process_count_what_it_takes_already(child, option):
-    """Expected: 64 MiB above what a process takes leave 64 MiB; one more stack of a thread, 8 MiB, may have
-    come between."""
+    """One more stack of a thread, 8 MiB, may have come between."""
     left, limit = child["limits"][option]
     assert 48 * 2**20 < left <= 64 * 2**20 and limit == f"the process's limit, ulimit {option}"
 
 
 def test_the_peak_is_of_this_process_alone(system):
-    """Rationale: on Linux ``ru_maxrss`` is at least what the process had that began this one: a small render
-    of a large one had its memory in its statistics. Expected: VmHWM; elsewhere what there is."""
+    """On Linux ``ru_maxrss`` is at least what the process had that began this one."""
     assert 2**26 < memory.peak() < 2**46
     system("proc/self/status", "Name:\tpython\nVmHWM:\t2048 kB\n")
     assert memory.peak() == 2 * 2**20
 
 
 def test_what_was_asked_for_counts():
-    """Expected: a limit that was set is the least of all, until it is taken back."""
     memory.set_limit(GIB / 4)
     try:
         assert memory.available() == memory.Available(GIB / 4, "the limit set by --memory")
@@ -147,17 +143,15 @@ def test_what_was_asked_for_counts():
 
 @pytest.mark.parametrize("name", FILMS)
 def test_a_film_takes_what_is_said_of_it(child, name):
-    """What exceeds a limit ends the process by a signal. Expected: a render's peak of resident memory grows
-    by what its film is said to take. Tolerances: measured are 0.97 to 1.01 of it; 32 MiB above for what else
-    a render takes."""
+    """What exceeds a limit ends the process by a signal. Tolerances: measured are 0.97 to 1.01 of it; 32 MiB
+    above for what else a render takes."""
     film = child["films"][list(FILMS).index(name)]
     assert 0.9 * film["said"] <= film["taken"] <= film["said"] + 32 * 2**20
 
 
 def test_channels_of_a_film_are_those_of_its_sums(monkeypatch):
-    """Expected: an RGB film takes 192 bytes a pixel, as measured with a film of 1024 x 512 pixels; with a
-    wide filter another 48, of four channels in single and double precision, for each thread, unless these
-    copies are too large to be made."""
+    """192 bytes a pixel, as measured; with a wide filter another 48 for each thread, unless these copies are
+    too large to be made."""
     copies = 4 * (4 + 8) * dr.thread_count()
     narrow, wide = {"type": "gaussian"}, {"type": "gaussian", "stddev": 1}
     for rfilter, most, of_a_pixel in ((narrow, GIB, 192), (wide, GIB, 192 + copies), (wide, 1, 192)):

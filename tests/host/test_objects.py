@@ -20,7 +20,6 @@ OBJECTS = {
 
 @pytest.mark.parametrize("kind", OBJECTS)
 def test_own_parameters_are_those_of_traverse(kind):
-    """Expected: names and values of ``mi.traverse`` without what belongs to objects inside. Exact."""
     made = mi.load_dict(OBJECTS[kind])
     everything = mi.traverse(made)
     found = own_parameters(made)
@@ -44,17 +43,11 @@ NAMELESS_GROUP = """<scene version="3.0.0">
 
 
 def test_shapes_of_a_group_need_no_ids():
-    """All shapes without id are called "shape" in what a group holds. Expected: all are found, under the
-    names that ``mi.traverse`` gives them."""
+    """All shapes without id are called "shape" in what a group holds."""
     scene = mi.load_string(NAMELESS_GROUP)
-    found = [s.bsdf().class_name() for s in all_shapes(scene) if s.class_name() != "Instance"]
-    assert sorted(found) == [
-        "RoughPlastic",
-        "SmoothConductor",
-        "SmoothDielectric",
-        "SmoothDiffuse",
-        "SmoothPlastic",
-    ]
+    found = {s.bsdf().class_name() for s in all_shapes(scene) if s.class_name() != "Instance"}
+    smooth = {f"Smooth{name}" for name in ("Conductor", "Dielectric", "Diffuse", "Plastic")}
+    assert found == {"RoughPlastic", *smooth}
     group = children(scene)["group"]
     names = {name.split(".")[1] for name in mi.traverse(scene).keys() if name.startswith("group.")}
     assert set(children(group)) == names == {"shape", "shape_1", "shape_2", "shape_3"}
@@ -84,16 +77,13 @@ print("alive")
 
 
 def test_scenes_that_the_cycle_collector_frees():
-    """A scene in a reference cycle goes whenever Python's cycle collector runs. Expected: renders beside such
-    scenes end, however often the collector runs."""
+    """A scene in a reference cycle goes whenever Python's cycle collector runs."""
     command = [sys.executable, "-c", FREED_MEANWHILE]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.strip() == "alive", done.stderr[-500:]
 
 
 def test_what_has_no_id_is_named_by_its_class_or_shape():
-    """Expected: an id where there is one, for a lamp on a shape the shape's, else the class; a refusal says
-    so in place of a name that is empty."""
     stretched = mi.ScalarTransform4f().scale([1, 2, 1])
     spot = {"type": "spot", "id": "", "to_world": stretched}
     lamp = {"type": "rectangle", "emitter": {"type": "area", "id": ""}}

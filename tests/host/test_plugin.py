@@ -33,8 +33,7 @@ def answers(variant, **environment):
 
 
 def test_mitsuba_is_not_hurt_where_there_is_no_llvm():
-    """Mitsuba imports the module in every process, whatever variant it runs. Expected: without a library of
-    LLVM scalar renders are what they were; who loads the plugin is told why it cannot be."""
+    """Mitsuba 3.10 imports the module in every process, whatever variant it runs."""
     rendered, *words = answers("scalar_rgb", DRJIT_LIBLLVM_PATH="/no/such.so")
     assert rendered == "rendered"
     words = " ".join(words)
@@ -43,7 +42,6 @@ def test_mitsuba_is_not_hurt_where_there_is_no_llvm():
 
 
 def test_the_plugin_is_there():
-    """Expected: where LLVM is, the plugin is loaded without an import of its own."""
     path = os.environ["DRJIT_LIBLLVM_PATH"]  # which the package has chosen in this process
     assert answers("llvm_ad_rgb", DRJIT_LIBLLVM_PATH=path) == ["rendered", "BDPTIntegrator"]
 
@@ -59,9 +57,8 @@ def written(scene, transformed):
 
 @pytest.mark.parametrize("transformed", [False, True], ids=["parsed", "transformed"])
 def test_a_dictionary_is_written_as_a_scene_file(transformed):
-    """The parser writes an element's name by the type that its plugin has in scalar_rgb. Expected: the image
-    of the written file is that of the dictionary. The tolerance is for `to_world`, which the writer splits
-    into scale, rotations and translation in single precision."""
+    """The parser writes an element's name by the type that its plugin has in scalar_rgb. Tolerance: the
+    writer splits `to_world` into scale, rotations and translation in single precision."""
     scene = mi.cornell_box()
     scene["sensor"]["film"] |= {"width": 8, "height": 8}
     scene["integrator"] = {"type": "bdpt", "max_depth": 3, "light_paths": "1/4"}
@@ -99,8 +96,6 @@ PARAMETER_SETS = (
 
 @pytest.mark.parametrize("changed", PARAMETER_SETS, ids=["numbers and texts", "strategies"])
 def test_parameters_are_written(changed):
-    """Expected: an integrator read from the written file has the settings of the dictionary, none of which is
-    the default."""
     integrator = {"type": "bdpt", **changed}
     made, read = mi.load_dict(integrator), mi.load_string(written(integrator, False))
     assert read.settings == made.settings
@@ -109,13 +104,11 @@ def test_parameters_are_written(changed):
 
 
 def test_all_parameters_are_written():
-    """Expected: `test_parameters_are_written` tries every parameter."""
     assert set(PARAMETERS) == {name for changed in PARAMETER_SETS for name in changed}
 
 
 def test_none_is_the_default_of_texts():
-    """Rationale: the manual names it as the default. Expected: ``none`` is that of each parameter whose
-    default is no text; ``--denoise`` adds to it."""
+    """As the manual says; ``--denoise`` adds to it."""
     given = {name: "none" for name, parameter in PARAMETERS.items() if parameter.default == ""}
     assert set(given) == {"aovs", "layers", "light_groups"}
     assert mi.load_dict({"type": "bdpt"} | given).settings == mi.load_dict({"type": "bdpt"}).settings
@@ -124,7 +117,6 @@ def test_none_is_the_default_of_texts():
 
 
 def test_scalar_variants_are_refused():
-    """Expected: one sentence, also where the parser makes objects of a variant that was current before."""
     mi.set_variant("scalar_rgb")
     mi.set_variant("llvm_ad_rgb")
     config = mi.parser.ParserConfig("scalar_rgb")
