@@ -60,10 +60,3 @@ def test_what_a_pixel_takes_to_an_error():
     for method, variance in (("path", 1e-6), ("bdpt", 1e-6 / 12), ("alone", 1e-6)):
         shown[method] = shown[method] | {"variance": variance}
     assert scale.effort(shown, "bdpt") == pytest.approx(1 / 4)
-
-
-def test_goals_are_of_rows_that_are_measured():
-    for goal in scale.GOALS:
-        sizes = scale.KINDS[goal.kind].sizes
-        assert goal.size in sizes and goal.method in scale.METHODS and goal.figure in scale.FIGURES
-        assert goal.figure != "slope" or goal.size != sizes[0]

@@ -74,25 +74,25 @@ def by_user(monkeypatch, command, *arguments):
         ("equal-time room.xml -o a.jpg", "output='a.jpg' must end in .pdf, .svg, .png"),
         ("equal-time room.xml --reference words.toml", "'words.toml' is not an EXR"),
         ("equal-time words.toml --reference flat.exr", "Parsing of XML"),
-        ("equal-time room.xml --reference flat.exr -i nope bdpt", "nope"),
         ("equal-time room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
         ("scale.py nothing", "kind='nothing' is not known; use some of spheres, "),
-        ("scale.py --sizes 3", "--sizes needs kinds"),
-        ("scale.py lamps --sizes 0", "size='0': "),
         ("scale.py edits --sizes room", "size='room' is not known; use some of nothing, lamp, "),
         ("mutants.py nowhere", "no mutant has 'nowhere' in its name"),
-        ("page broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
         ("page . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page . -o words.toml/a.html", "words.toml"),
-        ("report.py nowhere", "nowhere: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
+        ("report.py broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
         ("pyramid room.xml -o words.toml/a", "words.toml"),
         ("pyramid room.xml --max-depth 1", "max_depth=1 has no strategies"),
         ("pyramid room.xml --heuristic some", "bdpt: heuristic='some' is not known"),
-        ("sweep.py nowhere.toml", "nowhere.toml"),
         ("sweep.py words.toml", "words.toml is not TOML"),
-        (f"sweep.py {SCRIPTS.parent / 'presets' / 'small.toml'} -o words.toml", "words.toml"),
         ("versus.py nowhere", "checkout=nowhere has no integrators/mitsuba_bdpt; give a clone or a worktree"),
-        (f"versus.py {SCRIPTS.parent} --parameters skip=some", "bdpt: skip='some' is not known"),
+        *(
+            (command, f"argument {command.split()[-2]}: got {command.split()[-1]!r}, which must be")
+            for command in (
+                "floor.py x --rounds 0",
+                *("reference x --seconds nan", "pyramid x --seed -1", "versus.py x --pairs 0.5"),
+            )
+        ),
     ],
 )
 def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, message):
@@ -100,29 +100,8 @@ def test_mistakes_are_answered_in_one_line(here, monkeypatch, capsys, command, m
     script, *words = shlex.split(command)
     assert by_user(monkeypatch, script, *words) == 2
     error = capsys.readouterr().err
-    (line,) = [line for line in error.splitlines() if line.startswith("error: ")]
+    (line,) = [line for line in error.splitlines() if "error: " in line]
     assert message in line and "Traceback" not in error
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "floor.py x --rounds 0",
-        "reference x --seconds nan",
-        "reference x --spp 0",
-        "pyramid x --spp 0",
-        "pyramid x --seed -1",
-        "pyramid x --resolution -8",
-        "pyramid x --exposure nan",
-        "versus.py x --spp 0",
-        "versus.py x --pairs 0.5",
-    ],
-)
-def test_numbers_of_command_lines_are_checked(here, monkeypatch, capsys, command):
-    script, *words = command.split()
-    assert by_user(monkeypatch, script, *words) == 2
-    error = capsys.readouterr().err
-    assert f"argument {words[-2]}: got {words[-1]!r}, which must be" in error
 
 
 @pytest.mark.parametrize(
@@ -225,24 +204,17 @@ def test_outcomes_of_mutants_are_judged(status, output, bug, fault):
 def test_bugs_are_not_taken_for_mistakes():
     """Only errors of this project's own types are about what a user gave."""
 
-    def plugin(error):
-        return RuntimeError(f"[parser.cpp:1] At x: Traceback (most recent call last):\n  File y\n{error}")
+    plugin = "[parser.cpp:1] At x: Traceback (most recent call last):\n  File y\nTypeError: z"
+    bugs = TypeError("x"), KeyError("x"), ValueError("x"), RuntimeError(plugin), RuntimeError("drjit: x")
+    own = CommandError("own"), UsageError("own"), UnsupportedError("own")
 
     def raised(error):
         raise error
 
-    for bug in (
-        lambda: np.zeros(2) + np.zeros(3),
-        lambda: int("x"),
-        lambda: {}["x"],
-        lambda: raised(plugin("TypeError: unsupported operand")),
-        lambda: raised(RuntimeError("drjit: something")),
-    ):
-        with pytest.raises((ValueError, KeyError, RuntimeError)):
-            mistakes.answered(bug)
-    with pytest.raises(ValueError, match="own"):
-        mistakes.answered(lambda: raised(ValueError("own")))
-    for error in (CommandError("own"), UsageError("own"), UnsupportedError("own")):
+    for bug in bugs:
+        with pytest.raises(type(bug)):
+            mistakes.answered(lambda bug=bug: raised(bug))
+    for error in own:
         assert mistakes.answered(lambda error=error: raised(error)) == mistakes.USAGE
 
 

@@ -3,7 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.settings import HEURISTICS
+from meshes import as_ply
 from scene_parts import T
 from warned import Warned
 
@@ -14,25 +14,7 @@ from .poisons import BAD_TEXELS, BSDFS, INF, NAN, brightness, painted, reflectin
 from .rooms import SIZE, area, down, filled, plate, room
 from .twins import DEFAULTS, EVERYTHING, PILOTED, RENDERS, SPP, compare_with_twin, decided, rendered
 
-# -- BSDFs ----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("way", RENDERS)
-@pytest.mark.parametrize("bad", [NAN, INF])
-@pytest.mark.parametrize("name", BSDFS)
-def test_bsdfs(name, bad, way):
-    """A user's BSDF: on half a plate the weight of sampled directions, these, the index of refraction beside
-    glass, the value or the density is NaN or infinite; all strategies, and by default with so many samples
-    that a pilot decides.
-
-    Expected: the image of its twin, in which that is 0, to 1e-5 of its maximum (same random numbers; only the
-    order of sums differs); counted; one warning; the pilot finds the same mean, and the twin renders by its
-    decision.
-    """
-    compare_with_twin(BSDFS[name], bad, *RENDERS[way])
-
-
-# -- lamps ----------------------------------------------------------------------------------------
+# -- compared with twins --------------------------------------------------------------------------
 
 
 def glowing(value):
@@ -46,106 +28,20 @@ def spot(value):
     return room(other=lamp | {"texture": texture(value)})
 
 
-LAMPS = {
-    "radiance NaN": (sky_of("eval"), NAN),
-    "radiance infinite": (sky_of("eval"), INF),
-    "densities NaN": (sky_of("pdf"), NAN),
-    # With an infinite density beside a finite weight, next-event estimation would be believed alone.
-    "densities infinite": (sky_of("pdf"), INF),
-    "point NaN": (lambda x: room(other={"type": "point", "intensity": brightness(x)}), NAN),
-    "point infinite": (lambda x: room(other={"type": "point", "intensity": brightness(x)}), INF),
-    "area NaN": (glowing, NAN),
-    "sky NaN": (lambda x: room(wall=None, sky={"type": "constant", "radiance": brightness(x)}), NAN),
-    "sun NaN": (
-        lambda x: room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": x}),
-        NAN,
-    ),
-    "spot NaN": (spot, NAN),
-}
-HIDDEN = {"hide_emitters": True}  # a sky seen directly is asked for no density
+def point(value):
+    return room(other={"type": "point", "intensity": brightness(value)})
 
 
-@pytest.mark.parametrize("way", RENDERS)
-@pytest.mark.parametrize("name", LAMPS)
-def test_lamps(name, way):
-    """Half of the radiance or the densities of a user's environment, Mitsuba's lamps and a spot's texture NaN
-    or infinite; all strategies, and by default with a pilot. A plate keeps a lamp that is sound.
-
-    Expected: as of BSDFs.
-    """
-    parameters, spp = RENDERS[way]
-    # A lamp of 0 has no table of emission.
-    compare_with_twin(*LAMPS[name], parameters | HIDDEN | {"guiding": "photons"}, spp)
+def sky(value):
+    return room(wall=None, sky={"type": "constant", "radiance": brightness(value)})
 
 
-@pytest.mark.parametrize("heuristic", HEURISTICS)
-@pytest.mark.parametrize("what", ["plate NaN", "plate infinite", "densities NaN", "densities infinite"])
-def test_heuristics(what, heuristic):
-    """Densities NaN or infinite, of half a plate or of half a user's environment, under both heuristics.
-
-    Expected: as of BSDFs.
-    """
-    plates = {"plate NaN": (BSDFS["pdf"], NAN), "plate infinite": (BSDFS["pdf"], INF)}
-    compare_with_twin(*(plates | LAMPS)[what], EVERYTHING | HIDDEN | {"heuristic": heuristic})
-
-
-# -- exact numbers --------------------------------------------------------------------------------
+def sun(value):
+    return room(wall=None, sun={"type": "directional", "direction": [0, -1, -1], "irradiance": value})
 
 
 def glowing_plate(value):
     return filled(None, plate={"type": "rectangle", "emitter": area(texture(value))}, lamp=None)
-
-
-BY_CAMERA = {"light_paths": 0, "max_depth": 2}
-
-# The scene by a value, parameters, and how many values of each camera sample of the bad texels count: of s =
-# 1 and of the subpath that would go on; of what is seen directly.
-COUNTED = {
-    "reflectance": (reflecting, BY_CAMERA, 2),
-    "red": (lambda x: filled(painted([x, 0, 0])), BY_CAMERA, 2),  # in part NaN is not black
-    "passes": (reflecting, BY_CAMERA | {"spp_per_pass": 3}, 2),
-    "variance": (reflecting, BY_CAMERA | {"layers": "variance"}, 2),
-    "radiance": (glowing_plate, {"light_paths": 0, "max_depth": 1}, 1),
-    "feature": (reflecting, {"aovs": "a:albedo", "max_depth": 0}, 1),
-}
-PIXELS = int(SIZE**2 * BAD_TEXELS)
-
-
-@pytest.mark.parametrize("name", COUNTED)
-def test_counted(name):
-    """Texels NaN: of a reflectance in all colours, or in one of black; in passes of 3 samples; with the
-    variance; of a lamp seen directly; of an albedo shown by `aovs`.
-
-    Expected: the number that follows from the scene, exactly; otherwise as of BSDFs.
-    """
-    make, parameters, each = COUNTED[name]
-    compare_with_twin(make, NAN, parameters, count=each * PIXELS * SPP)
-
-
-def test_strategy_images():
-    """Half a plate's BSDF has the value NaN: all layers of `layers=strategies`.
-
-    Expected: as of BSDFs.
-    """
-    compare_with_twin(BSDFS["eval"], NAN, EVERYTHING | {"layers": "strategies"})
-
-
-@pytest.mark.parametrize("variant", ["llvm_ad_rgb", "llvm_ad_spectral"])
-def test_only_light(variant):
-    """The only light, a point in a closed white sphere, of intensity NaN; all strategies.
-
-    Expected: black; three values of each sample are counted (its light subpath, s = 1 at two vertices), and
-    the intensity is named once.
-    """
-    mi.set_variant(variant)
-    wall = {"type": "sphere", "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
-    lamp = {"type": "point", "position": [0.2, 0, 0.1], "intensity": brightness(NAN)}
-    scene = room(wall=wall, plate=None, lamp=lamp)
-    image, statistics, warnings = rendered(scene, {"skip": "none", "max_depth": 3}, SPP)
-    assert not image.any()
-    assert statistics["non_finite"] == 3 * SIZE**2 * SPP
-    assert len(warnings) == 1
-    assert "intensity" in warnings[0]
 
 
 def spectrally_painted(value):
@@ -163,25 +59,79 @@ def spectrally_painted(value):
     return scene
 
 
+LAMPS = {
+    "radiance NaN": (sky_of("eval"), NAN),
+    "radiance infinite": (sky_of("eval"), INF),
+    "densities NaN": (sky_of("pdf"), NAN),
+    # With an infinite density beside a finite weight, next-event estimation would be believed alone.
+    "densities infinite": (sky_of("pdf"), INF),
+    "point NaN": (point, NAN),
+    "point infinite": (point, INF),
+    "area NaN": (glowing, NAN),
+    "sky NaN": (sky, NAN),
+    "sun NaN": (sun, NAN),
+    "spot NaN": (spot, NAN),
+}
+# A sky seen directly is asked for no density, and a lamp of 0 has no table of emission.
+UNSEEN = {"hide_emitters": True, "guiding": "photons"}
+BY_CAMERA = {"light_paths": 0, "max_depth": 2}
+POWER = EVERYTHING | UNSEEN | {"heuristic": "power"}
+
+# Values that count of the bad texels: of s = 1 and of the subpath that would go on; of what is seen directly.
+TEXELS = int(SIZE**2 * BAD_TEXELS) * SPP
+BOTH = {"count": 2 * TEXELS}
+
+# Names, arguments of `compare_with_twin`, and its ``count``.
+TWINS = [
+    *(
+        (f"{n} {bad}, {way}", BSDFS[n], bad, *RENDERS[way])
+        for n in BSDFS
+        for bad in (NAN, INF)
+        for way in RENDERS
+    ),
+    *(
+        (f"{n}, {way}", *LAMPS[n], RENDERS[way][0] | UNSEEN, RENDERS[way][1])
+        for n in LAMPS
+        for way in RENDERS
+    ),
+    *((f"pdf {bad}, power", BSDFS["pdf"], bad, POWER) for bad in (NAN, INF)),
+    *((f"densities {bad}, power", sky_of("pdf"), bad, POWER) for bad in (NAN, INF)),
+    ("strategies", BSDFS["eval"], NAN, EVERYTHING | {"layers": "strategies"}),
+    ("reflectance", reflecting, NAN, BY_CAMERA, BOTH),
+    ("red", lambda x: filled(painted([x, 0, 0])), NAN, BY_CAMERA, BOTH),  # in part NaN is not black
+    ("passes", reflecting, NAN, BY_CAMERA | {"spp_per_pass": 3}, BOTH),
+    ("variance", reflecting, NAN, BY_CAMERA | {"layers": "variance"}, BOTH),
+    ("radiance", glowing_plate, NAN, {"light_paths": 0, "max_depth": 1}, {"count": TEXELS}),
+    ("feature", reflecting, NAN, {"aovs": "a:albedo", "max_depth": 0}, {"count": TEXELS}),
+]
+SPECTRAL = [
+    *(
+        (n, *LAMPS[n], EVERYTHING | UNSEEN)
+        for n in ("radiance NaN", "densities infinite", "point NaN", "sky NaN")
+    ),
+    ("eval", BSDFS["eval"], NAN, EVERYTHING),
+    ("texels", spectrally_painted, NAN, BY_CAMERA, BOTH),
+]
+TWINS = [("llvm_ad_rgb", *case) for case in TWINS] + [("llvm_ad_spectral", *case) for case in SPECTRAL]
+
+
 @pytest.mark.parametrize(
-    "what", ["radiance NaN", "densities infinite", "point NaN", "sky NaN", "eval", "texels"]
+    "case", TWINS, ids=lambda case: f"{case[1]}" + ", spectral" * case[0].endswith("spectral")
 )
-def test_spectral(what):
-    """`llvm_ad_spectral`, where a poisoned value has as many wavelengths as a path: lamps, a texture and a
-    BSDF that are NaN, an infinite density; all strategies.
+def test_twins(case):
+    """NaN or infinity: of a user's BSDF on half a plate (weight of sampled directions, these, the index of
+    refraction beside glass, value, density), of half a user's environment, of Mitsuba's lamps, of texels of a
+    spot, a reflectance, a lamp, an albedo; all strategies, and by default with so many samples that a pilot
+    decides; the power heuristic; in passes; with layers; in `llvm_ad_spectral`.
 
-    Expected: as in colours.
+    Expected: the image of its twin, in which that is 0, to 1e-5 of its maximum (same random numbers; only the
+    order of sums differs); counted, of texels in the number that follows from the scene; one warning; the
+    pilot finds the same mean, and the twin renders by its decision.
     """
-    mi.set_variant("llvm_ad_spectral")
-    if what == "texels":
-        compare_with_twin(spectrally_painted, NAN, BY_CAMERA, count=2 * PIXELS * SPP)
-    elif what == "eval":
-        compare_with_twin(BSDFS["eval"], NAN, EVERYTHING)
-    else:
-        compare_with_twin(*LAMPS[what], EVERYTHING | HIDDEN)
-
-
-# -- decisions, interruptions ---------------------------------------------------------------------
+    variant, _, *arguments = case
+    mi.set_variant(variant)
+    count = arguments.pop() if isinstance(arguments[-1], dict) and "count" in arguments[-1] else {}
+    compare_with_twin(*arguments, **count)
 
 
 def test_pilot():
@@ -225,7 +175,7 @@ def test_interrupted_with_nan():
     assert len(warnings) == 1
 
 
-# -- Mitsuba's distributions ----------------------------------------------------------------------
+# -- light that is lost ---------------------------------------------------------------------------
 
 
 def envmap(value):
@@ -238,15 +188,31 @@ def projector(value):
     return {"type": "projector", "irradiance": texture(value), "fov": 50, "to_world": down()}
 
 
-@pytest.mark.parametrize("way", RENDERS)
-@pytest.mark.parametrize("lamp, parameter", [(envmap, "other.data"), (projector, "irradiance.data")])
-def test_distributions(lamp, parameter, way):
-    """Texels of an `envmap`, or of a `projector`, NaN, of which Mitsuba makes a distribution.
+def bulb(value):
+    return {"type": "point", "position": [0.2, 0, 0.1], "intensity": brightness(value)}
 
-    Expected: all light is lost, with a warning: black, counted, named; with a number in their place there is
-    light, and nothing to say.
+
+LOST = {
+    "envmap": (envmap, "other.data"),
+    "projector": (projector, "irradiance.data"),
+    "point": (bulb, "intensity"),
+}
+
+
+@pytest.mark.parametrize("way", RENDERS)
+@pytest.mark.parametrize(
+    "lamp, variant", [*((lamp, "llvm_ad_rgb") for lamp in LOST), ("point", "llvm_ad_spectral")]
+)
+def test_lost(lamp, way, variant):
+    """The only light NaN: a point; texels of an `envmap` or of a `projector`, of which Mitsuba makes a
+    distribution.
+
+    Expected: black, counted, named in one warning; with a number in their place there is light, and nothing
+    to say.
     """
-    scene, sound = (room(wall=None, lamp=None, other=lamp(value)) for value in (NAN, 1.0))
+    mi.set_variant(variant)
+    make, parameter = LOST[lamp]
+    scene, sound = (room(wall=None, lamp=None, other=make(value)) for value in (NAN, 1.0))
     image, statistics, warnings = rendered(scene, *RENDERS[way])
     assert not image.any()
     assert statistics["non_finite"] > 0
@@ -272,28 +238,19 @@ def test_area_texels(way):
 
 # -- meshes ---------------------------------------------------------------------------------------
 
-CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float32)
+CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+NORMALS, COORDINATES = CORNERS * 0 + [0, 0, 1], (CORNERS[:, :2] + 1) / 2
+FACES = np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def mesh(place, faces=((0, 1, 2), (0, 2, 3)), normals=True, spoilt=None, bad=NAN, **props):
-    """A square in its ``place``, with the ``spoilt`` data of its last corner ``bad``."""
-    found = mi.Properties()
-    for name, part in props.items():
-        found[name] = mi.load_dict(part)
-    normal = np.array(place @ mi.ScalarNormal3f(0, 0, 1))
-    data = {
-        "vertex_positions": np.array([list(place @ mi.ScalarPoint3f(*c)) for c in CORNERS]),
-        "vertex_texcoords": (CORNERS[:, :2] + 1) / 2,
-    } | ({"vertex_normals": np.tile(normal / np.linalg.norm(normal), (4, 1))} if normals else {})
-    if spoilt:
-        data[spoilt][3] = bad
-    made = mi.Mesh("mesh", 4, len(faces), has_vertex_normals=normals, has_vertex_texcoords=True, props=found)
-    parameters = mi.traverse(made)
-    for name, values in data.items():
-        parameters[name] = np.asarray(values, dtype=np.float32).ravel()
-    parameters["faces"] = np.array(faces, dtype=np.uint32).ravel()
+def spoil(scene, name, bad):
+    """Set the data ``name`` of the last corner of a scene's mesh, which files must not hold."""
+    parameters = mi.traverse(scene)
+    data = np.array(parameters[name])
+    data[-len(data) // 4 :] = bad
+    parameters[name] = mi.Float(data)
     parameters.update()
-    return made
+    return scene
 
 
 @pytest.mark.parametrize("bad", [NAN, INF])
@@ -304,9 +261,9 @@ def test_vertices(data, bad):
     Expected: as `path`: triangles of such positions meet no ray, of such normals reflect nothing (subpaths
     that end there count, and are warned of); Welch's test of tiles (1e-3), which sees errors of 2 %.
     """
-    scene = room(
-        plate=mesh(plate()["to_world"], spoilt=data, bad=bad, bsdf={"type": "twosided", "bsdf": painted(0.1)})
-    )
+    mesh = as_ply(CORNERS, FACES, NORMALS, COORDINATES) | {"to_world": plate()["to_world"]}
+    scene = room(plate=mesh | {"bsdf": {"type": "twosided", "bsdf": painted(0.1)}})
+    scene = spoil(scene, f"plate.{data}", bad)
     theirs = tiles(scene, {"type": "path", "max_depth": 4}, range(8), PILOTED)
     agree(tiles(scene, {"max_depth": 4}, range(8), PILOTED), theirs, 0.02)
     _, statistics, warnings = rendered(scene, DEFAULTS, 16)
@@ -322,13 +279,15 @@ def test_texture_coordinates_of_lamps(way):
     """
     texels = np.random.default_rng(1).random((4, 4, 3)).astype(np.float32)
     emits = {"emitter": area({"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True})}
-    place = T().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3)
-    bsdf = {"type": "diffuse", "reflectance": 0.5}
-    sound, spoilt = [0, 1, 2], [0, 2, 3]
-    lamp = mesh(place, [sound, spoilt], False, "vertex_texcoords", bsdf=bsdf, **emits)
-    scene = room(lamp=None, other=lamp)
-    halves = mesh(place, [sound], False, bsdf=bsdf, **emits), mesh(place, [spoilt], False, bsdf=bsdf)
-    dark = room(lamp=None, other=halves[0], more=halves[1])
+    place = {
+        "bsdf": {"type": "diffuse"},
+        "to_world": T().translate([-0.2, 0.6, -0.3]).rotate([1, 0, 0], 60).scale(0.3),
+    }
+    lamp, sound, spoilt = (
+        as_ply(CORNERS, faces, None, COORDINATES) | place for faces in (FACES, FACES[:1], FACES[1:])
+    )
+    scene = spoil(room(lamp=None, other=lamp | emits), "other.vertex_texcoords", NAN)
+    dark = room(lamp=None, other=sound | emits, more=spoilt)
     theirs = tiles(dark, {"type": "path", "max_depth": 4}, range(8), 4 * PILOTED)
     parameters, spp = RENDERS[way]
     agree(tiles(scene, parameters, range(8), max(spp, 256)), theirs, 0.02)

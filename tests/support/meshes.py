@@ -9,13 +9,15 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 
-def as_ply(vertices, faces, normals=None):
+def as_ply(vertices, faces, normals=None, texcoords=None):
     """The entry of a scene for a mesh."""
-    mesh = mi.Mesh("mesh", len(vertices), len(faces), has_vertex_normals=normals is not None)
+    optional = {"vertex_normals": normals, "vertex_texcoords": texcoords}
+    has = {f"has_{name}": data is not None for name, data in optional.items()}
+    mesh = mi.Mesh("mesh", len(vertices), len(faces), **has)
     params = mi.traverse(mesh)
-    params["vertex_positions"] = vertices.astype(np.float32).ravel()
-    if normals is not None:
-        params["vertex_normals"] = normals.astype(np.float32).ravel()
+    for name, data in {"vertex_positions": vertices, **optional}.items():
+        if data is not None:
+            params[name] = data.astype(np.float32).ravel()
     params["faces"] = faces.astype(np.uint32).ravel()
     params.update()
     path = folder() / f"{len(list(folder().iterdir()))}.ply"
