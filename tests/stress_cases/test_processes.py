@@ -1,23 +1,19 @@
-"""Many renders in one process, edits, interrupted renders, processes side by side, caches on disk."""
+"""Many renders in one process, edits, processes side by side, caches on disk."""
 
-import contextlib
 import gc
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import repository
 from mitsuba_bdpt.planning import budget
-from scene_parts import T, film
+from scene_parts import T
 
-from scenes import DOWNWARDS, area, floor, square
+from scenes import DOWNWARDS, area, camera, floor, square
 
 # Sums of the same numbers in another order, in single precision.
 ROUNDING = 1e-4
@@ -27,29 +23,21 @@ SIZE = 8
 PILOTED = budget.LEAST_SAMPLES // SIZE**2
 
 
-def rgb(value):
-    return {"type": "rgb", "value": value}
-
-
 def room(
-    lamp=(0, 0.9, 0), light=1.0, wall=0.5, eye=(0, 0, 2.5), size=SIZE, moved=0.0, texture=0.5, spark=1.0
+    lamp=(0, 0.9, 0), light=1.0, wall=0.4, eye=(0, 0, 2.5), size=SIZE, moved=0.0, texture=0.5, spark=1.0
 ):
     """A room of two textured walls, a ball, a mesh, a lamp with area and a point light."""
     bitmap = mi.Bitmap(np.full((2, 2, 3), texture, dtype=np.float32))
     return {
         "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "to_world": T().look_at(list(eye), [0, 0, 0], [0, 1, 0]),
-            "film": film(size),
-        },
-        "sky": {"type": "constant", "radiance": rgb(0.1 * light)},
+        "sensor": camera(origin=eye, target=(0, 0, 0), size=size),
+        "sky": {"type": "constant", "radiance": 0.1 * light},
         "floor": floor(-1, 1, {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap}}),
-        "wall": square((0, 0, -1), bsdf={"type": "diffuse", "reflectance": rgb(wall)}),
+        "wall": square((0, 0, -1), bsdf={"type": "diffuse", "reflectance": wall}),
         "ball": {"type": "sphere", "radius": 0.3, "center": [0.4, -0.6, 0], "bsdf": {"type": "dielectric"}},
         "block": {"type": "cube", "to_world": T().translate([-0.5 + moved, -0.7, 0]).scale(0.2)},
-        "lamp": square(lamp, DOWNWARDS, 0.2, emitter=area(rgb(5 * light))),
-        "spark": {"type": "point", "position": [0.5, 0.5, 0.5], "intensity": rgb(spark)},
+        "lamp": square(lamp, DOWNWARDS, 0.2, emitter=area(5 * light)),
+        "spark": {"type": "point", "position": [0.5, 0.5, 0.5], "intensity": spark},
     }
 
 
@@ -149,50 +137,17 @@ def test_scenes_400():
     check_growth(400, render, 0.01 * 400)
 
 
-# -- one after the other --------------------------------------------------------------------------
+# -- edited scenes --------------------------------------------------------------------------------
 
-
-def test_alternating_scenes_and_variants():
-    """Two scenes under `llvm_ad_rgb` and `llvm_ad_spectral` in turn, three times, each with a pilot.
-
-    Expected: the same image, up to the rounding of sums in another order (1e-4 of the mean), and the same
-    decision.
-    """
-    first, integrators = {}, {}
-    for _ in range(3):
-        for variant in ("llvm_ad_rgb", "llvm_ad_spectral"):
-            mi.set_variant(variant)
-            bdpt = integrators.setdefault(variant, mi.load_dict({"type": "bdpt", "max_depth": 5}))
-            # Loaded anew for each render, so that pilots are not remembered.
-            scenes = mi.load_dict(room()), repository.load_scene("glass_caustics", resolution=SIZE)
-            for index, scene in enumerate(scenes):
-                image = rendered(bdpt, scene, seed=3, spp=PILOTED)
-                made = bdpt.statistics["decisions"]
-                expected, decisions = first.setdefault((variant, index), (image, made))
-                assert off(image, expected) < ROUNDING
-                assert made == decisions
-                assert bdpt.statistics["pilots"]["rendered"] == 1
-
-
-# What is edited by its name in `mi.traverse`, its value of the one that is there, and the room that is made
-# so.
+# What is edited by its name in `mi.traverse`, and the room that is made so.
 EDITS = {
-    "spark.intensity.value": (lambda v: v * 3, {"spark": 3.0}),
-    "wall.bsdf.reflectance.value": (lambda v: type(v)(0.8), {"wall": 0.8}),
-    "floor.bsdf.reflectance.data": (lambda v: v * 0 + 0.9, {"texture": 0.9}),
-    "sensor.to_world": (
-        lambda v: mi.Transform4f().look_at([0.3, 0.2, 2.0], [0, 0, 0], [0, 1, 0]),
-        {"eye": (0.3, 0.2, 2.0)},
-    ),
-    "sensor.film.size": (lambda v: mi.ScalarPoint2u(11, 11), {"size": 11}),
-    "lamp.to_world": (
-        lambda v: mi.Transform4f().translate([0.2, 0.5, 0.3]).rotate([1, 0, 0], 90).scale(0.2),
-        {"lamp": (0.2, 0.5, 0.3)},
-    ),
-    "block.vertex_positions": (
-        lambda v: dr.ravel(dr.unravel(mi.Point3f, v) + mi.Vector3f(0.4, 0, 0)),
-        {"moved": 0.4},
-    ),
+    "spark.intensity.value": {"spark": 3.0},
+    "wall.bsdf.reflectance.value": {"wall": 0.8},
+    "floor.bsdf.reflectance.data": {"texture": 0.9},
+    "sensor.to_world": {"eye": (0.3, 0.2, 2.0)},
+    "sensor.film.size": {"size": 11},
+    "lamp.to_world": {"lamp": (0.2, 0.5, 0.3)},
+    "block.vertex_positions": {"moved": 0.4},
 }
 
 
@@ -206,16 +161,15 @@ def test_edited_scenes(name, parameters, spp):
     rounding (numbers made along another way differ in the last bits, and few paths take another turn); the
     decision that is made there.
     """
-    change, made = EDITS[name]
-    scene = mi.load_dict(room())
+    scene, made = mi.load_dict(room()), mi.load_dict(room(**EDITS[name]))
     bdpt, anew = (mi.load_dict({"type": "bdpt", "max_depth": 5} | parameters) for _ in range(2))
     before = rendered(bdpt, scene, seed=1, spp=spp)
-    params = mi.traverse(scene)
+    params, values = mi.traverse(scene), mi.traverse(made)
     (key,) = [key for key in params.keys() if key.endswith(name)]
-    params[key] = change(params[key])
+    params[key] = values[key]
     params.update()
     image = rendered(bdpt, scene, seed=2, spp=spp)
-    expected = rendered(anew, mi.load_dict(room(**made)), seed=2, spp=spp)
+    expected = rendered(anew, made, seed=2, spp=spp)
     ours, theirs = (
         [[decision[key] for key in ("light_paths", "connections", "coefficients")] for decision in decisions]
         for decisions in (bdpt.statistics["decisions"], anew.statistics["decisions"])
@@ -228,67 +182,6 @@ def test_edited_scenes(name, parameters, spp):
     print(f"{outliers:.1%} of values differ by more than rounding")
     assert outliers <= 0.05
     assert abs(image.mean() / expected.mean() - 1) < 0.01
-
-
-@contextlib.contextmanager
-def sigint_after(seconds: float):
-    """SIGINT to this process when it has used so many ``seconds`` of CPU time, if it is still in here.
-
-    On the clock a render takes longer where something else runs, and the moment would be another one.
-    """
-    armed = [True]
-
-    def interrupt(*_):
-        if armed:
-            signal.raise_signal(signal.SIGINT)
-
-    previous = {
-        signal.SIGINT: signal.signal(signal.SIGINT, signal.default_int_handler),
-        signal.SIGPROF: signal.signal(signal.SIGPROF, interrupt),
-    }
-    try:
-        signal.setitimer(signal.ITIMER_PROF, seconds)
-        yield
-    finally:
-        armed.clear()
-        signal.setitimer(signal.ITIMER_PROF, 0)
-        for number, handler in previous.items():
-            signal.signal(number, handler)
-
-
-def test_interrupted():
-    """SIGINT at 12 moments of a render with a pilot, by its CPU time, each time the render again.
-
-    Expected: `KeyboardInterrupt` at half of the moments at least (Python drops one that comes in a
-    destructor, and a render that takes less time than the first one has ended before the last), in the film
-    the passes that were done (mean within a factor of 2: of 8 samples per pixel); then the same image, up to
-    the rounding of sums in another order (1e-4 of the mean), by the same decision.
-    """
-
-    def load():  # anew: its pilot is not remembered
-        return repository.load_scene("cornell_box", resolution=32)
-
-    # Short passes: recording them takes as long as tracing them, and may be interrupted as well.
-    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 6, "spp_per_pass": 8})
-    keywords = {"seed": 5, "spp": 128}
-    whole = rendered(bdpt, load(), **keywords)
-    decisions, scene = bdpt.statistics["decisions"], load()
-    started = time.process_time()
-    rendered(bdpt, scene, **keywords)
-    seconds, kept = time.process_time() - started, []
-    for number in range(12):
-        scene = load()
-        try:
-            with sigint_after(seconds * (number + 0.5) / 12):
-                bdpt.render(scene, **keywords)
-        except KeyboardInterrupt:
-            kept.append(sum(bdpt.statistics["passes"]))
-            film = np.array(scene.sensors()[0].film().develop())
-            assert not kept[-1] or 0.5 < film.mean() / whole.mean() < 2
-        assert off(rendered(bdpt, scene, **keywords), whole) < ROUNDING
-        assert bdpt.statistics["decisions"] == decisions != []
-    print(f"{len(kept)} of 12 met it, after {min(kept)} to {max(kept)} of 128 samples")
-    assert len(kept) >= 6
 
 
 # -- kernel caches --------------------------------------------------------------------------------
