@@ -8,7 +8,6 @@ import json
 import re
 from contextlib import nullcontext
 from fractions import Fraction
-from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
@@ -633,11 +632,10 @@ def test_scenes_that_are_refused():
 
 
 @pytest.mark.parametrize("call", ["render", "explain", "decide"])
-def test_what_is_not_yet_a_scene_is_loaded_first(call):
-    unloaded = (("a.xml", "load_file"), (Path("a.xml"), "load_file"), ({"type": "scene"}, "load_dict"))
-    for scene, remedy in (*unloaded, (None, "must be a scene"), (mi.load_dict(diffuse()), "BSDF must")):
-        with pytest.raises(TypeError, match=remedy):
-            getattr(integrator(), call)(scene)
+@pytest.mark.parametrize("scene", ["a.xml", {"type": "scene"}, None])
+def test_what_is_not_yet_a_scene_is_loaded_first(call, scene):
+    with pytest.raises(TypeError, match="must be a scene, of mi.load_file or mi.load_dict"):
+        getattr(integrator(), call)(scene)
 
 
 def test_parameters_cannot_be_set_later():

@@ -14,6 +14,7 @@ import contextlib
 import sys
 import time
 from dataclasses import dataclass
+from datetime import timedelta
 from io import StringIO
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -155,8 +156,7 @@ class Lines(Display):
         if now - self._last < max(self._every, SHARE * report.seconds):
             return
         self._last = now
-        minutes, seconds = divmod(int(report.seconds), 60)
-        clock = f"{minutes // 60:02d}:{minutes % 60:02d}:{seconds:02d}"
+        clock = timedelta(seconds=int(report.seconds))
         done = share_done(report, self._limit)
         text = f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}"
         with contextlib.suppress(OSError, ValueError):  # a closed stream must not end the render

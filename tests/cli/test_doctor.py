@@ -57,13 +57,9 @@ def test_other_commands_report_the_failure_without_a_traceback():
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="signals that kill a child are POSIX's")
 def test_crash_of_the_child_is_put_into_words():
-    findings = doctor.render_in_child(
-        "llvm_ad_rgb",
-        child(-signal.SIGABRT, "", "LLVM ERROR: no\n"),
-    )
-    assert [finding.state for finding in findings] == ["FAIL"]
-    assert "killed by SIGABRT (LLVM ERROR: no)" in findings[0].text
-    assert "Mend it with" in findings[0].text or "Unset" in findings[0].text
+    (found,) = doctor.render_in_child("llvm_ad_rgb", child(-signal.SIGABRT, "", "LLVM ERROR: no\n"))
+    assert found.state == "FAIL" and "killed by SIGABRT (LLVM ERROR: no)" in found.text
+    assert "Mend it with" in found.text or "Unset" in found.text
 
 
 @pytest.mark.parametrize(
@@ -75,8 +71,8 @@ def test_crash_of_the_child_is_put_into_words():
 )
 def test_an_error_of_the_child_has_its_reason(backends, text):
     printed = f'{{"threads": 2, "variants": ["cuda_ad_rgb"], "backends": {backends}}}\n'
-    found = doctor.render_in_child("cuda_ad_rgb", child(1, printed, "Traceback\nImportError: no x\n"))
-    assert found[-1] == doctor.Finding("FAIL", "test image", text)
+    *_, found = doctor.render_in_child("cuda_ad_rgb", child(1, printed, "Traceback\nImportError: no x\n"))
+    assert found == doctor.Finding("FAIL", "test image", text)
 
 
 def test_what_fails_is_said(monkeypatch):
@@ -85,7 +81,7 @@ def test_what_fails_is_said(monkeypatch):
 
     monkeypatch.setattr(doctor, "PACKAGES", ("surely-not-installed",))
     wrong = [child(0, f'{{"llvm": "23", "mean": {mean}}}') for mean in ("0.0", "NaN", "1e9")]
-    found = [doctor.render_in_child("llvm_ad_rgb", process)[-1] for process in (*wrong, hang)]
+    found = [found for process in (*wrong, hang) for found in doctor.render_in_child("llvm_ad_rgb", process)]
     for finding, text in zip(
         (*found, doctor.versions()[-1]),
         (*["its mean is"] * 3, "not finished", "pip install surely-not-installed"),

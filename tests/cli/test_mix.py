@@ -1,6 +1,7 @@
 """The command `mix` and its function: new weights of light groups or path layers, from files."""
 
 import json
+import sys
 
 import mitsuba as mi
 import numpy as np
@@ -47,14 +48,6 @@ def test_the_command_scales_the_layers(tmp_path, alpha):
     assert np.array_equal(mixed[..., :3], expected)
     assert mixed.shape[-1] == 3 + alpha and (mixed[..., 3:] == 0.5).all()
     assert np.array(mi.Bitmap(str(output.with_suffix(".png")))).shape == (3, 4, 3)
-
-
-def test_a_png_lies_beside_the_image(tmp_path):
-    rendered(tmp_path / "a.exr")
-    assert main(["mix", str(tmp_path / "a.exr"), "key=0.1", "sky=0.2", "--exposure", "2"]) == 0
-    bright = np.array(mi.Bitmap(str(tmp_path / "a.mixed.png")))
-    assert main(["mix", str(tmp_path / "a.exr"), "key=0.4", "sky=0.8", "-o", str(tmp_path / "b.png")]) == 0
-    assert np.array_equal(bright, np.array(mi.Bitmap(str(tmp_path / "b.png"))))
 
 
 def test_path_layers_are_mixed_like_groups(tmp_path):
@@ -144,27 +137,35 @@ def test_what_cannot_be_mixed(tmp_path, weights, words):
         mix(tmp_path / "a.exr", weights)
 
 
-def test_images_that_cannot_be_mixed(tmp_path, capsys):
+def test_images_that_cannot_be_mixed(tmp_path):
     rendered(tmp_path / "a.exr", groups=())
-    with pytest.raises(CommandError, match="has no layers of light groups or paths; give the EXR"):
-        mix(tmp_path / "a.exr", {})
-    tensor = mi.TensorXf(np.zeros((3, 4, 9), dtype=np.float32))
-    with pytest.raises(CommandError, match=r"no layers .* film\(\).bitmap\(\) .* or a tensor"):
-        mix(mi.Bitmap(tensor), {"key": 1})
     (tmp_path / "b.exr").write_text("no image")
-    with pytest.raises(CommandError, match="is not an EXR"):
-        mix(tmp_path / "b.exr", {})
-    assert main(["mix", str(tmp_path / "c.exr"), "key=1"]) == 2
-    assert "c.exr': No such file or directory" in capsys.readouterr().err
-    rendered(tmp_path / "a.exr")
-    assert main(["mix", str(tmp_path / "a.exr"), "-m", "none"]) == 2
-    assert main(["mix", str(tmp_path / "a.exr"), "key=1", "key=2"]) == 2
-    assert "a layer of key has two weights; give it one" in capsys.readouterr().err
-    assert main(["mix", str(tmp_path / "a.exr"), "key=1", "-o", str(tmp_path / "b.jpg")]) == 2
-    assert "b.jpg' must end in .png" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main(["mix", str(tmp_path / "a.exr"), "key"])
-    assert "must have the form LAYER=X or LAYER=X,Y,Z" in capsys.readouterr().err
+    tensor = mi.TensorXf(np.zeros((3, 4, 9), dtype=np.float32))
+    for image, words in (
+        (tmp_path / "a.exr", "has no layers of light groups or paths; give the EXR"),
+        (mi.Bitmap(tensor), r"no layers .* film\(\).bitmap\(\) .* or a tensor"),
+        (tmp_path / "b.exr", "is not an EXR"),
+    ):
+        with pytest.raises(CommandError, match=words):
+            mix(image, {"key": 1})
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["none.exr", "key=1"], "none.exr': No such file or directory"),
+        (["a.exr", "-m", "none"], "variant='none' is not one of Mitsuba's"),
+        (["a.exr", "key=1", "key=2"], "a layer of key has two weights; give it one"),
+        (["a.exr", "key=1", "-o", "b.jpg"], "b.jpg' must end in .png"),
+        (["a.exr", "key"], "must have the form LAYER=X or LAYER=X,Y,Z"),
+    ],
+)
+def test_mistakes_of_the_command(tmp_path, arguments, words, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    rendered("a.exr")
+    with pytest.raises(SystemExit, match="2"):
+        sys.exit(main(["mix", *arguments]))
+    assert words in capsys.readouterr().err
 
 
 def test_features_are_no_layers(tmp_path):
@@ -173,9 +174,6 @@ def test_features_are_no_layers(tmp_path):
     assert np.array_equal(np.array(mix(tmp_path / "a.exr", {"key": 0})), layers["sky"])
     with pytest.raises(CommandError, match="no layer 'n'; there are groups.key, groups.sky$"):
         mix(tmp_path / "a.exr", {"n": 2})
-    rendered(tmp_path / "b.exr", groups=(), features=features)
-    with pytest.raises(CommandError, match="has no layers of light groups or paths"):
-        mix(tmp_path / "b.exr", {})
 
 
 @pytest.mark.parametrize("depth", ["", "Z"])
@@ -199,17 +197,13 @@ def test_a_layer_of_weight_0_is_left_out(tmp_path):
     assert (np.array(mix(image, {"key": 0, "sky": 0})) == 0).all()
 
 
-@pytest.mark.parametrize("output", ["a.exr", "A/../a.exr", "link.exr", "a.png", "linked.exr"])
+@pytest.mark.parametrize("output", ["a.exr", "A/../a.exr", "link.exr", "a.png"])
 def test_a_mix_does_not_replace_its_image(tmp_path, output, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "A").mkdir()
     rendered(tmp_path / "a.exr")
-    (tmp_path / "a.png").write_bytes(b"the PNG of the render")
     (tmp_path / "link.exr").symlink_to("a.exr")
-    (tmp_path / "linked.png").symlink_to("a.png")
     before = (tmp_path / "a.exr").read_bytes()
     assert main(["mix", "a.exr", "key=0.5", "-o", output]) == 2
-    error = capsys.readouterr().err
-    assert f"output={output!r}: the mix would replace" in error
-    assert (tmp_path / "a.exr").read_bytes() == before
-    assert (tmp_path / "a.png").read_bytes() == b"the PNG of the render"
+    assert f"output={output!r}: the mix would replace" in capsys.readouterr().err
+    assert (tmp_path / "a.exr").read_bytes() == before and not (tmp_path / "a.png").exists()

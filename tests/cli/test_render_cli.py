@@ -420,7 +420,6 @@ def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, 
         KeyError("bug"),
         RuntimeError("bug"),
         wrapped(RuntimeError("bug")),
-        RuntimeError("[ImageBlock] put(): bug"),
         RuntimeError("[Lamp] eval(): Traceback (most recent call last):\nKeyError: bug"),
     ],
 )

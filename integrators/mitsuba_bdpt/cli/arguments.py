@@ -8,12 +8,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import io
 import re
 import sys
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import ClassVar, NoReturn
 
@@ -91,7 +89,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Bidirectional path tracing for Mitsuba 3.",
         epilog=mistakes.STATUSES,
     )
-    parser.add_argument("--version", action="version", version=_versions())
+    parser.add_argument("--version", action="version", version=f"mitsuba-bdpt {mitsuba_bdpt.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add_command(name: str, text: str) -> Parser:
@@ -125,14 +123,6 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
     text = "brightness of the PNG in stops; default: %(default)s"
     add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)
-
-
-def _versions() -> str:
-    found = []
-    for name in ("mitsuba", "drjit"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found.append(f"{name} {metadata.version(name)}")
-    return f"mitsuba-bdpt {mitsuba_bdpt.__version__} ({', '.join(found) or 'no mitsuba'})"
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:

@@ -48,9 +48,7 @@ def start(options: Namespace) -> Snapshot | None:
         return None
     if not path.exists():
         if options.resume == "must":
-            raise CommandError(
-                f"resume: there is no checkpoint {str(path)!r}; leave out --resume to begin anew."
-            )
+            raise CommandError(f"resume: there is no checkpoint {str(path)!r}; leave out --resume.")
         return None
     try:
         kept = read(path)
@@ -58,9 +56,8 @@ def start(options: Namespace) -> Snapshot | None:
         raise CommandError(f"resume: {error}; {BEGIN_ANEW}.") from error
     if kept.progress.scene != digest(options):
         raise CommandError(
-            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that "
-            "it names, its definitions (-D) or the sensor have changed; go on with those it was begun with, "
-            f"or {BEGIN_ANEW}."
+            f"resume: {str(path)!r} is of another scene: {str(options.scene)!r}, a file that it names, its "
+            f"definitions (-D) or the sensor have changed; undo that, or {BEGIN_ANEW}."
         )
     return kept
 
@@ -69,11 +66,8 @@ class Checkpoints:
     """Checkpoints of one render: `after_pass` at intervals, `write` at once."""
 
     def __init__(self, options: Namespace, start: Snapshot | None = None):
-        self.path, self._seconds, self._scene = (
-            path_of(options.output),
-            60 * options.checkpoint,
-            digest(options),
-        )
+        self.path, self._seconds = path_of(options.output), 60 * options.checkpoint
+        self._scene = digest(options)
         self._kept = 0 if start is None else start.spp  # samples per pixel in the file
         self._last, self._report = time.monotonic(), None
 
@@ -110,12 +104,10 @@ class Checkpoints:
         """
         self.write()
         if self._kept < done:
-            holds = (
-                f"has {self._kept} of the image's {done} samples per pixel" if self._kept else "is missing"
-            )
+            holds = f"has {self._kept}" if self._kept else "is missing: it has none"
             print(
-                f"checkpoint {str(self.path)!r} {holds}: no later pass was over; the same command renders "
-                "the others again",
+                f"checkpoint {str(self.path)!r} {holds} of the image's {done} samples per pixel: no later "
+                "pass was over; the same command renders the others again",
                 file=sys.stderr,
             )
 

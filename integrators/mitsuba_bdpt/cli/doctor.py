@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,16 +58,20 @@ class Finding(NamedTuple):
 
 def run(variant: str) -> int:
     """Print the report for `variant`; returns 0 if bdpt works with it, else 1."""
-    findings = [*versions(), llvm_library(), kernel_cache()]
-    for finding in findings:
+    works = True
+    for finding in findings(variant):
         print(finding, flush=True)
-    if mitsuba_bdpt.failure is None:
-        found = render_in_child(variant)
-        print(*found, sep="\n", flush=True)
-        findings += found
-    works = all(finding.state != "FAIL" for finding in findings)
+        works = works and finding.state != "FAIL"
     print("mitsuba_bdpt works." if works else "mitsuba_bdpt does not work; see FAIL above.")
     return 0 if works else 1
+
+
+def findings(variant: str) -> Iterator[Finding]:
+    yield from versions()
+    yield llvm_library()
+    yield kernel_cache()
+    if mitsuba_bdpt.failure is None:
+        yield from render_in_child(variant)
 
 
 def versions() -> list[Finding]:
@@ -112,26 +116,22 @@ def kernel_cache() -> Finding:
 
 def render_in_child(
     variant: str, start: Callable[..., subprocess.CompletedProcess] = subprocess.run
-) -> list[Finding]:
+) -> Iterator[Finding]:
     """Render 16x16 pixels of the Cornell box in a child process; report its outcome."""
     command = [sys.executable, "-c", PROBE, variant]
     try:
         child = start(command, capture_output=True, text=True, errors="replace", timeout=TIME_LIMIT)
     except subprocess.TimeoutExpired:
-        return [Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")]
+        yield Finding("FAIL", "test image", f"not finished after {TIME_LIMIT} seconds")
+        return
     report: dict = {}
     for line in child.stdout.splitlines():
         report |= json.loads(line) if line.startswith("{") else {}
-    findings = [judge(child, report, variant)]
     if "threads" in report:
-        text = f"{report['threads']}; processors: {os.cpu_count()}"
         here = [name for name in report["variants"] if not why_not(name, report["backends"])]
-        findings = [
-            Finding("ok", "threads", text),
-            Finding("ok" if here else "note", "variants", f"here: {', '.join(here) or 'none'}"),
-            *findings,
-        ]
-    return findings
+        yield Finding("ok", "threads", f"{report['threads']}; processors: {os.cpu_count()}")
+        yield Finding("ok" if here else "note", "variants", f"here: {', '.join(here) or 'none'}")
+    yield judge(child, report, variant)
 
 
 def why_not(variant: str, backends: list[str]) -> str:

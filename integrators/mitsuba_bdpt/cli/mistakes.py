@@ -6,9 +6,8 @@ Usage errors, `USAGE`, concern the user's input; the same command would fail aga
   Mitsuba or Dr.Jit.
 * ``argparse.ArgumentTypeError``: words of the command line that are parsed later.
 * ``OSError`` about a path that is missing or cannot be written (`PATHS`).
-* ``RuntimeError`` of Mitsuba's parser; with the traceback of a Python plugin, only if that ends in one of
-  the first.
-* ``RuntimeError`` of a plugin of the scene while rendering (`OF_PLUGIN`), such as a texture without spectra.
+* ``RuntimeError`` of Mitsuba's (`_is_mitsubas`): about a scene file, an unknown plugin or its parameters, or
+  of a plugin while rendering, such as a texture without spectra.
 
 Failures, `FAILURE`, may be transient: `errors.FailureError`, other ``OSError``, ``MemoryError`` and Dr.Jit's
 ``RuntimeError`` about memory.
@@ -50,16 +49,6 @@ STATUSES = (
 
 IN_WORDS = re.compile(r"[\w.]*(UsageError|UsageTypeError|UnsupportedError): bdpt: ")
 
-OF_PLUGIN = re.compile(
-    r"\[(?!\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct|Stream|Pool|Thread|Parser)\])"
-    r"[A-Z]\w*(\[\w+\])?\] (?!.*Traceback)",
-    re.DOTALL,
-)
-"""What an error of a plugin in C++ begins with: its class in brackets.
-
-Without classes that `bdpt` calls with data of its own: their errors may be bugs.
-"""
-
 
 def answered(main: Callable[[], int | None], interrupted: str = "interrupted") -> int | None:
     """Return the exit status of ``main``; prints its error, if any, or ``interrupted``."""
@@ -88,38 +77,41 @@ OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNOREC
 
 def in_words(error: BaseException) -> str:
     """Describe the error; for system errors, with the file."""
-    if (lacking := _behind(error, OUT_OF_MEMORY.search, MemoryError)) is not None:
+    if (lacking := _of_memory(error)) is not None:
         why = message(lacking) or "no more was given"
         return f"not enough memory ({why}); render a smaller --size, or parts of the image by --crop"
     if isinstance(error, OSError) and error.strerror and error.filename:
         return f"{str(error.filename)!r}: {error.strerror}"
-    return message(_behind(error, OF_PLUGIN.match) or error)
+    return message(next(filter(_is_mitsubas, chain(error)), error))
 
 
-def _behind(
-    error: BaseException, matches: Callable[[str], object], *kinds: type[BaseException]
-) -> BaseException | None:
-    """Like `errors.behind`, also of a ``RuntimeError`` whose text ``matches``."""
-    texts = (found for found in chain(error) if isinstance(found, RuntimeError) and matches(str(found)))
-    return behind(error, *kinds) or next(texts, None)
+def _of_memory(error: BaseException) -> BaseException | None:
+    return behind(error, MemoryError) or next(filter(_is_drjits_memory, chain(error)), None)
+
+
+def _is_drjits_memory(error: BaseException) -> bool:
+    return isinstance(error, RuntimeError) and bool(OUT_OF_MEMORY.search(str(error)))
+
+
+def _is_mitsubas(error: BaseException) -> bool:
+    """Return whether an error is one of Mitsuba's, ``[parser.cpp:9] …`` or ``[BitmapTexture] …``.
+
+    With the traceback of a Python plugin, only if that ends in a usage error.
+    """
+    before, traceback, rest = str(error).partition("Traceback (most recent call last):")
+    of_user = not traceback or IN_WORDS.match(rest.strip().splitlines()[-1])
+    return isinstance(error, RuntimeError) and before.startswith("[") and bool(of_user)
 
 
 def status_of(error: BaseException) -> int | None:
     """Return the exit status after an ``error``, see above; None for a bug."""
     if isinstance(error, OSError):
         return USAGE if error.errno in PATHS else FAILURE
-    of_user = behind(error, UsageError, UnsupportedError, argparse.ArgumentTypeError)
-    if of_user or _behind(error, OF_PLUGIN.match) or _is_of_parser(error):
+    if behind(error, UsageError, UnsupportedError, argparse.ArgumentTypeError):
         return USAGE
-    failed = isinstance(error, FailureError) or _behind(error, OUT_OF_MEMORY.search, MemoryError)
-    return FAILURE if failed else None
-
-
-def _is_of_parser(error: BaseException) -> bool:
-    if not isinstance(error, RuntimeError) or not str(error).startswith("[parser.cpp"):
-        return False
-    _, traceback, rest = str(error).partition("Traceback (most recent call last):")
-    return not traceback or bool(IN_WORDS.match(rest.strip().splitlines()[-1]))
+    if any(map(_is_mitsubas, chain(error))):
+        return USAGE
+    return FAILURE if isinstance(error, FailureError) or _of_memory(error) else None
 
 
 @dataclass

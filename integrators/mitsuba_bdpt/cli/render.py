@@ -44,9 +44,6 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
-SETS = {"time": "timeout", "target_error": "target_error"}
-"""The integrator's parameter that an option sets, see `loading.load`."""
-
 
 @dataclass
 class Outcome:
@@ -187,24 +184,16 @@ def explain(options: Namespace) -> int | None:
 
 
 def check_options(options: Namespace) -> None:
-    if options.resume and options.checkpoint is None:
-        raise CommandError("resume needs --checkpoint MINUTES: how often to write them.")
-    if options.parts is not None and options.scheduler is None:
-        raise CommandError("parts needs --scheduler: without one, a render is made in one piece.")
+    given = {name for name, value in vars(options).items() if value is not None}
+    for name, other in (("resume", "checkpoint"), ("parts", "scheduler")):
+        if name in given and other not in given:
+            raise CommandError(f"{name} needs --{other}; give it too, or leave out --{name}.")
     for name in ("checkpoint", "target_error", "time", "threads", "memory"):
-        if options.scheduler is not None and getattr(options, name) is not None:
-            raise CommandError(
-                f"scheduler together with {name} is not possible: parts are rendered elsewhere, all of them; "
-                "leave out one or the other."
-            )
-    properties = dict(options.properties)
-    for option, name in SETS.items():
-        value = getattr(options, option)
-        if value is not None and name in properties:
-            raise CommandError(
-                f"-P {name}={properties[name]} together with --{option.replace('_', '-')} {value:g} is not "
-                f"possible: the option sets {name} itself; leave out one or the other."
-            )
+        if {"scheduler", name} <= given:
+            raise CommandError(f"scheduler together with {name} is not possible; leave out one or the other.")
+    for option, name in (("time", "timeout"), ("target_error", "target_error")):  # see `loading.load`
+        if option in given and name in dict(options.properties):
+            raise CommandError(f"-P {name}=X sets what --{option.replace('_', '-')} sets; leave out one.")
     if options.checkpoint is not None:
         check_writable(checkpoints.path_of(options.output))
 
@@ -225,7 +214,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
     film = choose_sensor(scene, options.sensor).film()
     if not is_ours(integrator):
         return render_foreign(scene, integrator, options, spp)
-    watchers = [] if options.preview is None else [Preview(options, film)]
+    watchers = [] if options.preview is None else [preview(options, film)]
     if options.scheduler is None:
         return render_here(scene, integrator, options, spp, watchers)
     started = time.perf_counter()
@@ -237,25 +226,25 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
     return Outcome(seconds, done, ended is not None, statistics=statistics, error=error)
 
 
-class Preview:
-    """Rewrites the PNG with the image so far, after the first pass and then at intervals.
+def preview(options: Namespace, film: mi.Film) -> Callable[[PassReport], None]:
+    """Return a watcher that rewrites the PNG with the image so far, first after the first pass.
 
     A full disk does not end the render.
     """
+    path, last = options.output.with_suffix(".png"), -math.inf
 
-    def __init__(self, options: Namespace, film: mi.Film):
-        self._options, self._film, self._last = options, film, -math.inf
-
-    def __call__(self, report: PassReport) -> None:
-        if time.monotonic() - self._last < self._options.preview:
+    def shown(report: PassReport) -> None:
+        nonlocal last
+        if time.monotonic() - last < options.preview:
             return
         report.image()
-        path = self._options.output.with_suffix(".png")
         try:
-            write_png(self._film, self._film.bitmap(), path, self._options.exposure)
+            write_png(film, film.bitmap(), path, options.exposure)
         except OSError as error:
             print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
-        self._last = time.monotonic()
+        last = time.monotonic()
+
+    return shown
 
 
 def _call_all(watchers: Iterable[Callable], report: PassReport) -> None:
@@ -390,8 +379,5 @@ def summary(options: Namespace, outcome: Outcome, film: mi.Film, parameters, spp
             parts[-1] += f", not the {target:g} asked for: that takes more samples (--spp, --time)"
     if statistics.get("no_pilot"):
         parts.append(f"no pilot: {statistics['no_pilot']}")
-    if invalid := statistics.get("non_finite"):
-        parts.append(f"{invalid} invalid samples (NaN or infinite) count as zero")
-    parts.append(", ".join(f"{name} {version}" for name, version in versions().items()))
     parts.append("interrupted" if outcome.interrupted else "")
     return "; ".join(filter(None, parts))

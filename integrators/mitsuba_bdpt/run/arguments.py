@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from os import PathLike
-
 import mitsuba as mi
 
 from ..errors import UsageError, UsageTypeError
@@ -16,10 +13,6 @@ from .snapshot import Snapshot
 
 def check_made_for(integrator, scene):
     """Raise ``UsageTypeError`` unless ``scene`` is a scene, and both are of the present variant."""
-    if isinstance(scene, (str, PathLike)):
-        raise UsageTypeError(f"scene={scene!r} is a path, not a scene; load it by mi.load_file")
-    if isinstance(scene, Mapping):
-        raise UsageTypeError("scene is a dictionary, which is not yet a scene; load it by mi.load_dict")
     if type(scene).__name__ != mi.Scene.__name__:
         raise UsageTypeError(f"scene={type(scene).__name__} must be a scene, of mi.load_file or mi.load_dict")
     for name, thing, kind in (("integrator", integrator, mi.Integrator), ("scene", scene, mi.Scene)):

@@ -7,7 +7,6 @@ import math
 
 import mitsuba as mi
 
-from ..emitters.light_groups import LightGroups
 from ..errors import listed
 from ..host.notices import warn_once
 from ..planning.possible import unsampled_at_sensor
@@ -18,28 +17,13 @@ from ..sensors.checks import called
 
 def log(statistics: dict):
     """Log the statistics of a render, and warn if its error is unknown."""
-    seconds, rays, no_pilot = (statistics[name] for name in ("seconds", "rays", "no_pilot"))
-    times = f"{seconds['total']:.2f} s (compile {seconds['compile']:.2f} s)"
-    lines = [f"{sum(statistics['passes'])} spp in {times}; {json.dumps(rays)}"]
-    if not statistics["unbiased"]:
-        lines.append(f"merging (consistent, not unbiased): {json.dumps(statistics['merging'])}")
-    lines += [f"no pilot: {no_pilot}"] if no_pilot else []
-    lines += [f"decided: {json.dumps(made)}" for made in statistics["decisions"]]
-    lines += [f"skipped: {json.dumps(left_out)}" for left_out in statistics["skipped"]]
-    for line in lines:
-        mi.Log(mi.LogLevel.Info, f"bdpt: {line}")
+    mi.Log(mi.LogLevel.Info, f"bdpt: {json.dumps(statistics)}")
     if statistics.get("error") == math.inf:
         mi.Log(
             mi.LogLevel.Warn,
             "bdpt: the error is not known, since the render ended before four of its eight replicates were "
             "whole; ask for no more samples per pixel than timeout allows",
         )
-
-
-def warn_of_light_groups(scene, sensor, groups: LightGroups | None):
-    """Warn once about patterns of light ``groups`` that match no emitter."""
-    for text in groups.warnings if groups is not None else ():
-        warn_once(scene, sensor, text)
 
 
 def warn_of_scene(prepared, sensor, settings):

@@ -18,6 +18,7 @@ from ..emitters.light_groups import LightGroups
 from ..errors import UnsupportedError, UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
+from ..host.notices import warn_once
 from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
@@ -97,7 +98,8 @@ class Render:
         self.why_merged = "merging=true" if settings.merging else ""
         self.sensor, self.settings, self.spp = sensor, settings, spp
         self.prepared = like.prepared if like else PreparedScene(scene, sensor)
-        messages.warn_of_light_groups(scene, sensor, self.light_groups)
+        for text in self.light_groups.warnings if self.light_groups else ():
+            warn_once(scene, sensor, text)
         if settings.merging and (why := components.merging.why_not(sensor, self.prepared.space is not None)):
             raise UnsupportedError(f"{why}; leave out merging")
         self.findings = like.findings if like else SceneCache(self.prepared, sensor)
