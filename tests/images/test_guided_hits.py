@@ -151,23 +151,6 @@ def test_the_variance_without_guiding_is_predicted():
     assert light.second.sum() == pytest.approx(found.var(axis=0, ddof=1).mean() * 64, rel=0.15)
 
 
-def test_light_of_several_diffuse_vertices_is_predicted():
-    """A pilot leaves out indirect light beyond panes of glass too. A bright roof instead of a black one
-    brings 1.78 times the light, as in guided renders, within 20 % (noise of the photons)."""
-    flip, shell = transform().translate([0, 0, 4]).rotate([1, 0, 0], 180).scale(4), [3.5, 0, 2]
-    pane = {"type": "rectangle", "to_world": transform().translate([0, 0, 3.5]).scale(4)}
-    more = {"pane": pane | {"bsdf": {"type": "thindielectric"}}}
-    more["shell"] = {"type": "sphere", "radius": 0.3, "center": shell, "bsdf": glass()}
-    lamp, roof, found = ball(0.05) | {"center": shell}, {"type": "rectangle", "to_world": flip}, []
-    for albedo in (0.0, 0.9):
-        more["roof"] = roof | {"bsdf": matte(albedo)}
-        scene = mi.load_dict(under_glass(lamp, floor=matte(0.8), **more))
-        render = Render(scene, scene.sensors()[0], internals.bdpt(max_depth=16).settings, 1, 256)
-        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256, 0)
-        found.append(light.light.sum())
-    assert found[1] == pytest.approx(1.78 * found[0], rel=0.2)
-
-
 def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
     """Their outliers hide how candidates differ. At most half as many of a pilot's parts find light (of five
     seeds 1 to 6 of 16, and 10 to 14)."""

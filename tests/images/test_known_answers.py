@@ -156,6 +156,16 @@ def borders_of_a_sphere(rfilter):
     return Row(scene, 0.75, 1e-3, 256, {"max_depth": 2}, ((border, 5e-3), (inner, 1e-3)))
 
 
+@known("all", of=("box", "gaussian"))
+def crop_window(rfilter):
+    """pbrt-v4 #347, #456: crop windows changed the number of light paths per pixel, in the image but not in
+    the weights."""
+    window = {"crop_offset_x": 7, "crop_offset_y": 3, "crop_width": 16, "crop_height": 14}
+    scene = sphere_lit_by("emission", camera(**EYE, size=24, rfilter=rfilter, film=window))
+    alone = {f"s{s}t{k + 1 - s}": (0.5**k, 0.05) for k in (1, 2, 3) for s in range(k + 1)}
+    return Row(scene, 0.875, 5e-3, 256, {"max_depth": 3}, layers=alone)
+
+
 @known("all", of=((1, 1), (0.1, 5), (30, 1)))
 def unequal_sampling_weights(one, other):
     """LuxCore #671, #687: next-event estimation and emission picked lights with unequal probabilities."""
@@ -245,6 +255,18 @@ def disk_before_the_near_plane():
     scene = sphere_lit_by("emission", lens) | {"wall": sphere(0.0, flip_normals=True, emitter=area(0.5))}
     scene["black"] = {"type": "disk", "bsdf": both_sides(0), "to_world": to_world}
     return Row(scene, 0.5, 2e-3, 1024, {"max_depth": 1})
+
+
+@known("all")
+def plate_before_a_lens():
+    """The lens is no shape, so that light subpaths that cross it (t = 0) have to be told what is in
+    between."""
+    scene = {
+        "lamp": square((0, 0, -3), bsdf=matte(0), emitter=area(5.0)),
+        "plate": square((0, 0, -1), size=5, bsdf=matte(0)),
+        "sensor": thinlens(origin=(0, 0, 2), target=(0, 0, 0), aperture_radius=0.5, focus_distance=3.0),
+    }
+    return Row(scene, 0.0, 0, 64, {"max_depth": 3}, seeds=2)
 
 
 # -- under an even sky --------------------------------------------------------------------------

@@ -5,17 +5,14 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy connects two neighbours of that path; point lamps are found by merging alone.
 """
 
-from functools import cache
 from types import SimpleNamespace
 
-import internals
 import mitsuba as mi
 import numpy as np
 import pytest
 import welch as st
-from mitsuba_bdpt.emitters.disks import BoundingSphere
-from mitsuba_bdpt.merging import merging, passes, wavelength_sets
-from mitsuba_bdpt.merging.radius import Footprints, after
+from mitsuba_bdpt.merging import merging, passes
+from mitsuba_bdpt.merging.radius import Footprints
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import mis
@@ -32,11 +29,9 @@ from sds_scenes import (
     THICKNESS,
     ball,
     glass,
-    guided,
     images,
     matte,
     point,
-    rendered,
     strategy_images,
     sun,
     transform,
@@ -160,76 +155,6 @@ def test_far_from_the_origin(monkeypatch):
     assert far / near == pytest.approx(1, abs=0.03)
 
 
-# -- against guided s = 0 ------------------------------------------------------------------------------
-
-
-def test_wavelengths_lie_evenly():
-    """In each pass; neighbouring sets begin in different quarters; later passes have others between."""
-    number = dr.arange(mi.UInt32, wavelength_sets.SETS)
-    starts = []
-    for done in range(8):
-        u = np.array(wavelength_sets.WavelengthSets.of(mi.Float(0.9), done).u(number), dtype=np.float64)
-        assert (u >= 0).all() and (u < 1).all()
-        assert (np.diff(np.floor((u - u[0]) % 1 * 4 + 1e-3)) != 0).all()
-        every = np.sort((u[:, None] + np.arange(4) / 4).ravel() % 1)
-        np.testing.assert_allclose(np.diff(every), 1 / len(every), atol=1e-5)
-        starts.append(every[0] * len(every))
-    assert np.diff(np.sort(starts)).min() > 1 / 16
-
-
-# -- what is smaller than a disc --------------------------------------------------------------------------
-
-# Half of the width of the sheet and of the box, which is an eighth as thick; radius of the ball.
-HALF, BALL = 0.8, 0.35
-SMALL = {
-    "sheet": {"type": "rectangle", "to_world": transform().scale(HALF)},
-    "box": {"type": "cube", "to_world": transform().scale([HALF, HALF, HALF / 8])},
-    "ball": {"type": "sphere", "radius": BALL},
-}
-
-
-@cache
-def small(shape):
-    """A scene in which all light has met this shape under the glass, and its brightness without merging."""
-    scene = under_glass(ball(1.0) | {"center": [6.0, 0.0, 4.5]})
-    scene["floor"] = SMALL[shape] | {"bsdf": matte()}
-    scene["sensor"]["fov"] = 36
-    scene = mi.load_dict(scene)
-    return scene, images(scene, 1024, 8, first=100).mean()
-
-
-def of_a_square(share):
-    """1 - 2 mean|x| / a + mean|x y| / a^2 over a disc, whose radius is ``share`` of half of the width a."""
-    return 1 - 4 / (3 * np.pi) * share + share**2 / (8 * np.pi)
-
-
-@pytest.mark.parametrize(
-    "shape, radius, least, most",
-    [
-        ("sheet", HALF / 4, of_a_square(1 / 4) - 0.04, of_a_square(1 / 4) + 0.04),
-        ("sheet", HALF, of_a_square(1) - 0.03, of_a_square(1) + 0.07),
-        ("box", HALF / 4, of_a_square(1 / 4) - 0.05, 0.97),
-        ("ball", BALL / 2, 0.75, 1.0),
-        ("ball", BALL, 0.25, 0.6),
-    ],
-    ids=["sheet, a quarter", "sheet", "box, a quarter", "ball, half", "ball"],
-)
-def test_small_shapes_lose_light(shape, radius, least, most, monkeypatch):
-    """A disc that is larger than what it lies on has fewer photons than its area says. Expected, over the
-    image without merging: of a sheet what a disc leaves of a square, 0.90 and 0.62; of a thin box as much,
-    and not all; of a ball most at half of its radius, and at its radius a quarter to 0.6. Tolerance: three
-    standard errors of 0.013 (ball: 0.03), beside 0.02 for the perspective."""
-    monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1e-3)  # 2^18 photons
-    monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
-    scene, expected = small(shape)
-    pixel = Footprints.of(scene, scene.sensors()[0]).angle * np.linalg.norm(CAMERA)
-    # The parameter is the radius after 64 samples.
-    radius /= pixel * after(1.0, 16)
-    found = images(scene, 16, 8, merging=True, merging_radius=radius).mean()
-    assert least < found / expected < most
-
-
 # -- what merging leaves alone ----------------------------------------------------------------------------
 
 
@@ -239,65 +164,6 @@ def test_nothing_leaks_through_a_thin_wall():
     scene["below"] = {"type": "cube", "to_world": below, "bsdf": glass()}
     scene["floor"]["bsdf"] = {"type": "twosided", "bsdf": matte()}
     assert not images(scene, 64, 2, merges=False, merging=True, merging_radius=2.0).any()
-
-
-CHANGES = {
-    "crop window": {"film": {"crop_width": 8, "crop_height": 4, "crop_offset_x": 4, "crop_offset_y": 6}},
-    "border": {"film": {"sample_border": True, "rfilter": {"type": "gaussian"}}},
-    "features": {"bdpt": {"aovs": "dd:depth"}},
-    "instance": {},
-    "hidden lamp": {"bdpt": {"hide_emitters": True}},
-}
-# The lamp, samples, how the change is rendered, and what it is beside.
-UNCHANGED = {
-    "merged": (point, 256, {"merging": True}, {"merging": True}),
-    "guided": (ball, 128, {"decisions": guided(4)}, {"guiding": "emission"}),
-}
-
-
-@cache
-def unchanged(way):
-    light, spp, _, beside = UNCHANGED[way]
-    return images(under_glass(light()), spp, 8, **beside)
-
-
-@pytest.mark.parametrize(
-    "change, way",
-    [(change, way) for way in UNCHANGED for change in CHANGES if (change, way) != ("hidden lamp", "guided")],
-)
-def test_what_makes_no_difference(change, way):
-    """In the pixels that both have; the instance is of the plate."""
-    light, spp, parameters, _ = UNCHANGED[way]
-    more, scene, expected = CHANGES[change], under_glass(light()), unchanged(way)
-    scene["sensor"]["film"] |= more.get("film", {})
-    if change == "instance":
-        plate = scene.pop("plate") | {"to_world": transform().scale([4, 4, 0.1])}
-        again = {"type": "instance", "to_world": transform().translate([0, 0, 0.5])}
-        scene["group"] = {"type": "shapegroup", "plate": plate}
-        scene["again"] = again | {"group": {"type": "ref", "id": "group"}}
-    if change == "crop window":
-        expected = expected[:, 6:10, 4:12]
-    found = images(scene, spp, first=100, **parameters, **more.get("bdpt", {}))
-    st.assert_agree(st.compare_images(st.tiles(found), st.tiles(expected)), at_least=2)
-
-
-def test_sensors_without_pixels():
-    """Without light subpaths merging finds what t = 1 finds with them, below the plate, in several passes."""
-    scene = under_glass(point())
-    del scene["sensor"]
-    film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    film |= {"pixel_format": "rgb", "component_format": "float32"}
-    meter = {"type": "irradiancemeter", "film": film}
-    to_world = transform().translate([0.5, 0, 0.2]).rotate([1, 0, 0], 180).scale(0.2)
-    scene["paper"] = {"type": "rectangle", "to_world": to_world, "bsdf": matte(), "sensor": meter}
-    scene = mi.load_dict(scene)
-    merging = internals.bdpt(max_depth=4, merging=True, light_paths=0)
-    a = rendered(merging, scene, 1 << 14, 8)[..., 0]
-    assert merging.statistics["passes"] == 4 * [1 << 12]
-    assert merging.statistics["merging"]["photons"] > 1000
-    b = images(scene, 1 << 14, 8, first=100, max_depth=4)
-    assert b.mean() > 0.01
-    st.assert_agree(st.compare_images(a.reshape(8, 1), b.reshape(8, 1)))
 
 
 def test_meters_of_one_ray_find_photons():
@@ -515,41 +381,6 @@ def test_photons_are_aimed(monkeypatch):
     assert a.var(0, ddof=1).mean() < 0.2 * b.var(0, ddof=1).mean()
     bright = st.tiles(a).mean(0) > 0.1 * st.tiles(a).mean(0).max()
     st.assert_agree(st.compare_images(st.tiles(a)[:, bright], st.tiles(b)[:, bright]), at_least=5)
-
-
-def test_a_lens_where_photons_are_aimed(monkeypatch):
-    """t = 0, which shares the light with merging, is not aimed."""
-    scene = under_glass(point(), kind="thinlens")
-    scene["plate"]["to_world"] = transform().translate([0, 0, 0.5]).scale([1, 1, THICKNESS / 2])
-    scene["sensor"] |= {"aperture_radius": 0.8}
-    scene = mi.load_dict(scene)
-    a = images(scene, 512, 8, merging=True, merging_radius=0.5, skip="none")
-    monkeypatch.setattr(aim, "_specular_boxes", lambda *_: [])
-    b = images(scene, 512, 8, first=100, merging=True, merging_radius=0.5, skip="none")
-    st.assert_agree(st.compare_images(st.tiles(a, 8), st.tiles(b, 8)), at_least=4)
-
-
-def test_density_of_aimed_directions():
-    """Integrals over 2^20 uniform directions of the density, and of its product with each coordinate, are 1
-    and the means of 2^20 samples, within six standard errors; from inside of one of two spheres, and from
-    outside of both."""
-    count = 1 << 20
-    rng = np.random.default_rng(3)
-    balls = ((0, 0, 1), 0.5), ((2, 1, 0), 1)
-    spheres = tuple(BoundingSphere(mi.Point3f(centre), mi.Float(radius)) for centre, radius in balls)
-    two = aim.Aim(spheres, False)
-    square = mi.Point2f(*rng.random((2, count)).tolist())
-    uniform = mi.warp.square_to_uniform_sphere(square)
-    for p in (mi.Point3f(0, 0, 0), mi.Point3f(2, 0.5, 0.2)):
-        # In place of the emitter's own density none: the other half.
-        si, no = SimpleNamespace(p=p), mi.Bool(False)
-        e = SimpleNamespace(si=si, d=uniform, pdf_second=mi.Float(0), infinite=no, beam=no, delta=no)
-        density = 2 * two.density(e).numpy() * 4 * np.pi
-        _, d = two._sample(p, square)
-        for f in (lambda d: np.ones(count), *(lambda d, i=i: d.numpy()[i] for i in range(3))):
-            over, sampled = density * f(uniform), f(d)
-            error = np.hypot(over.std(), sampled.std()) / np.sqrt(count)
-            assert abs(over.mean() - sampled.mean()) < 6 * error
 
 
 def test_what_needs_no_merging():

@@ -5,14 +5,11 @@ from pathlib import Path
 
 import internals
 import mitsuba as mi
-import numpy as np
 import pytest
 import welch as st
 from mitsuba_bdpt.planning import choice, unsampled_light
 from mitsuba_bdpt.planning.planner import Planner
 from mitsuba_bdpt.run.rendering import Render
-from mitsuba_bdpt.transport import sds
-from mitsuba_bdpt.transport.photons import guided_hits
 from sds_scenes import (
     ASIDE,
     ball,
@@ -105,17 +102,6 @@ def test_an_unrelated_ball_changes_no_variance():
     st.assert_agree(st.compare_images(st.tiles(a), st.tiles(b)), at_least=12)
 
 
-def test_an_unrelated_ball_changes_no_prediction():
-    """Photons predict the same light and second moment of s = 0, to 25 % (a few are aimed at the ball)."""
-    found = []
-    for more in ({}, {"ball": polished()}):
-        scene = mi.load_dict(lit_metal(**more))
-        render = Render(scene, scene.sensors()[0], internals.bdpt(max_depth=8).settings, 0, 256)
-        light = unsampled_light.guidable(render.prepared, render.planner.full, render.settings, 256, 0)
-        found.append([light.light.sum(), light.second.sum()])
-    np.testing.assert_allclose(*found, rtol=0.25)
-
-
 def test_guided_light_is_not_undersampled():
     """Of a small lamp's light through nearly smooth glass some is undersampled unless photons guide to it."""
     described = mi.load_dict(under_glass(ball(0.2) | {"center": ASIDE}, plate=rough(0.001)))
@@ -150,13 +136,3 @@ def test_light_that_is_not_guided_is_in_a_second_pilot(monkeypatch):
     auto, never = (internals.bdpt(max_depth=8, guiding=guiding).settings for guiding in ("auto", "emission"))
     found = [Render(scene, scene.sensors()[0], each, 0, 64).planner.run_pilot() for each in (auto, never)]
     assert not found[0][0].candidate.guided and found[0][0].variance == found[1][0].variance
-
-
-def test_scenes_without_near_specular_lobes_test_no_event(monkeypatch):
-
-    def never(*_):
-        raise AssertionError
-
-    for module in (sds, guided_hits):
-        monkeypatch.setattr(module, "is_specular", never)
-    images(mi.load_dict(under_glass(ball())), 4, 1, guiding="always")

@@ -15,10 +15,7 @@ from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport import light_path, mis, sds
-from mitsuba_bdpt.transport.photons import photon_pass
 from sds_scenes import (
-    SIZE,
-    images,
     matte,
     point,
     rough,
@@ -26,7 +23,6 @@ from sds_scenes import (
     transform,
     under_glass,
 )
-from snapshots import ROUNDING
 from warned import Warned
 
 import drjit as dr  # isort: skip
@@ -73,23 +69,6 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
         found.append(layers["weighted.merged"].mean())
     assert found[0] == pytest.approx(found[1], rel=0.08)
     assert found[1] > 0
-
-
-def test_few_photons_far_from_what_is_sharp(monkeypatch):
-    """Where rough glass lies behind a room of matte walls, 1 % of photon subpaths leave a photon (corners,
-    where connections are few), and no vertex is merged."""
-    described = mi.cornell_box() | {
-        "far": {"type": "sphere", "center": [0, 0, -8], "radius": 0.2, "bsdf": rough(0.01)}
-    }
-    described["sensor"]["film"] |= {"width": SIZE, "height": SIZE}
-    described = mi.load_dict(described)
-    method = internals.bdpt(max_depth=6, merging=True, skip="none")
-    mi.render(described, integrator=method, spp=16)
-    found = method.statistics["merging"]
-    assert found["merges"] == 0
-    assert found["photons"] < 0.02 * photon_pass.FEWEST_PHOTONS
-    a, b = (images(described, 16, 1, merges=False, merging=m, skip="none") for m in (True, False))
-    np.testing.assert_allclose(a, b, **ROUNDING)
 
 
 def test_undersampled_lamps_that_are_not_finite_are_named():

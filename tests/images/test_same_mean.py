@@ -18,7 +18,7 @@ import scene_parts as parts
 import sds_scenes as sds
 import variants
 import welch as st
-from meshes import ball_mesh, folder
+from meshes import as_ply, ball_mesh, folder
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.transport import mis
 from sds_scenes import guided, under_glass
@@ -26,7 +26,19 @@ from tables import Table
 from test_strategies import SURFACES
 
 import scenes
-from scenes import area, both_sides, camera, floor, integrator, matte, renders, square, thinlens, transform
+from scenes import (
+    DOWNWARDS,
+    area,
+    both_sides,
+    camera,
+    floor,
+    integrator,
+    matte,
+    renders,
+    square,
+    thinlens,
+    transform,
+)
 
 ROOT = Path(__file__).resolve().parents[2] / "scenes"
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
@@ -241,6 +253,75 @@ def coarse_mesh():
     """pbrt-v4 #385, #526, #13: without the adjoint factor interpolated normals are too shiny on the light
     side."""
     return Row(coarse_ball(), PATH, 4, 256, 512, 16)
+
+
+def under_a_disk(origin=(0, 2, 3), **more):
+    """A bright disk that looks down, and a camera."""
+    down = transform().translate([0, 2.5, 0]).rotate(*DOWNWARDS).scale(0.5)
+    lamp = {"type": "disk", "to_world": down, "bsdf": matte(0), "emitter": area(5.0)}
+    return {"lamp": lamp, "sensor": camera(origin=origin, target=(0, 0, 0), fov=50), **more}
+
+
+@same("all")
+def light_on_a_hidden_lamp():
+    """Camera rays pass through a lamp under ``hide_emitters``: what its surface reflects is not seen."""
+    screen = floor(0.3, 0.6, matte(0.8), emitter=area(0.5))
+    scene = under_a_disk(screen=screen, floor=floor(0, 2, matte(0.8)))
+    return Row(scene, WAYS["camera"], 4, 64, 64, 16, WAYS["hidden"])
+
+
+@same("all", "camera")
+def ball_behind_a_hidden_lamp():
+    """`path` shades what lies behind a hidden lamp at a wrong point of spheres (a ninth of it). The pole of a
+    matte ball is seen through the lamp above it as from below the lamp."""
+
+    def pole(height):
+        view = camera(origin=(0, height, 0), target=(0, 0, 0), up=(0, 0, 1), size=4, fov=0.3 / height)
+        lamp = square((0, 2, 0), DOWNWARDS, 0.8, emitter=area(4.0))
+        return {"lamp": lamp, "ball": scenes.ball(matte()), "sensor": view}
+
+    return Row(pole(6.0), WAYS["camera"], 4, 256, 256, 16, WAYS["hidden"], other=pole(1.5), error=0.01)
+
+
+@same("default", of=[(3, 1), (5, 3)])
+def splats_on_a_film_of(width, height):
+    """Where S does not divide the samples, there are more light subpaths than 1/S of them: of three pixels
+    with S = 16, one for each three samples."""
+    scene = {
+        "ball": scenes.ball({"type": "dielectric"}, 0.2, (0, 1, 0)),
+        "lamp": {"type": "point", "position": [0, 1.05, 0]},
+        "floor": floor(0, 2, matte(0.8)),
+        "sensor": camera(origin=(0, 2, 3), target=(0, 0, 0), fov=50, film={"width": width, "height": height}),
+    }
+    few = {"light_paths": 1 / 16}
+    return Row(scene, {"light_paths": 1}, 4, 63, 63, 16, {"connections": "one"}, few, error=0.1)
+
+
+@same("all")
+def point_light_in_a_cornell_box():
+    """Mitsuba 0.6 #132: a point light seen by a pinhole made one pixel above 80,000."""
+    scene = mi.cornell_box() | {"sensor": mi.cornell_box()["sensor"] | {"film": scenes.film()}}
+    scene["light"] = {"type": "point", "position": [0.1, 0.5, 0.1], "intensity": 1.0}
+    return Row(scene, PATH, 5, 64, 128)
+
+
+@same("all")
+def lamp_of_many_triangles():
+    """pbrt-v4 #183: one light for each of a million triangles took nine kilobytes each. As one rectangle."""
+    x, y = np.meshgrid(*[np.linspace(-1, 1, 101)] * 2)
+    first = (np.arange(100)[:, None] * 101 + np.arange(100)).ravel()
+    corner, above = first + 1, first + 101
+    faces = np.concatenate([np.stack([first, above, corner], 1), np.stack([corner, above, above + 1], 1)])
+    mesh = as_ply(np.stack([x, y, 0 * x], -1).reshape(-1, 3), faces)
+
+    def under(lamp):
+        return {
+            "lamp": lamp | {"emitter": area(2.0), "bsdf": both_sides(0)},
+            "floor": square((0, 0, -2), size=2, bsdf=both_sides(0.5)),
+            "sensor": camera(origin=(0, -5, -0.7), target=(0, 0, -1), fov=45, size=8, up=(0, 0, 1)),
+        }
+
+    return Row(under(mesh), EVERYTHING, 2, 64, 64, other=under(square(turn=([1, 0, 0], 180))))
 
 
 @same("all", of=range(3))
@@ -673,6 +754,40 @@ def lens_and_point_lamp():
     return Row(
         wide(under_glass(sds.point(), **LENS)), EVERYTHING, 6, 512, 512, 8, EVERYTHING, tile=8, error=0.03
     )
+
+
+@same("default")
+def lens_and_photons_without_aim():
+    """Photons are aimed at specular shapes; t = 0, which shares the light with merging, is not."""
+    scene = wide(under_glass(sds.point(), **LENS))
+    scene["plate"]["to_world"] = transform().translate([0, 0, 0.5]).scale([1, 1, sds.THICKNESS / 2])
+    patched = (("mitsuba_bdpt.transport.photons.aim._specular_boxes", lambda *_: []),)
+    more = WAYS["wide discs"] | EVERYTHING
+    return Row(scene, {}, 6, 512, 512, 8, more, tile=8, error=0.1, patched=patched)
+
+
+@same("merged", "guided 4", of=("instance", "border"))
+def small_lamp_and_an(change):
+    """An instance in place of the plate; pixels around the film."""
+    scene = under_glass(sds.spark())
+    if change == "border":
+        scene["sensor"]["film"] |= {"sample_border": True, "rfilter": {"type": "gaussian"}}
+    else:
+        plate = scene.pop("plate") | {"to_world": transform().scale([4, 4, 0.1])}
+        again = {"type": "instance", "to_world": transform().translate([0, 0, 0.5])}
+        scene["group"] = {"type": "shapegroup", "plate": plate}
+        scene["again"] = again | {"group": {"type": "ref", "id": "group"}}
+    return Row(scene, GUIDED, 6, 256, 256, 8, other=under_glass(sds.spark()), error=0.15)
+
+
+@same("default")
+def meter_below_the_plate():
+    """Without light subpaths merging finds what t = 1 finds with them, in several passes."""
+    scene = under_glass(sds.point())
+    del scene["sensor"]
+    paper = square((0.5, 0, 0.2), ([1, 0, 0], 180), 0.2, sensor=scenes.meter())
+    merged = {"light_paths": 0, "merging": True}
+    return Row(scene | {"paper": paper}, {}, 4, 1 << 14, 1 << 14, 8, ours=merged, error=0.1)
 
 
 @same("merged, camera")

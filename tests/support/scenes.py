@@ -16,7 +16,8 @@ def rgb(*value):
 
 
 def matte(*value):
-    """A diffuse BSDF of one value or three."""
+    """A diffuse BSDF of one value (by default 0.5) or three."""
+    value = value or (0.5,)
     return {"type": "diffuse", "reflectance": rgb(*value) if len(value) > 1 else float(value[0])}
 
 
@@ -29,7 +30,11 @@ def square(at=(0, 0, 0), turn=None, size=1.0, bsdf=None, **more):
     """A rectangle of half-width ``size``, turned by an axis and an angle; by default it looks to +z."""
     to_world = transform().translate(list(at))
     to_world = (to_world.rotate(*turn) if turn else to_world).scale(size)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf or matte(0.5), **more}
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf or matte(), **more}
+
+
+def ball(bsdf, radius=1.0, center=(0, 0, 0), **more):
+    return {"type": "sphere", "center": list(center), "radius": radius, "bsdf": bsdf, **more}
 
 
 UPWARDS, DOWNWARDS = ([1, 0, 0], -90), ([1, 0, 0], 90)  # turns of a `square` whose normal is +y or -y
@@ -41,6 +46,20 @@ def floor(height=0.0, size=2.0, bsdf=None, **more):
 
 def area(radiance):
     return {"type": "area", "radiance": radiance}
+
+
+def film(size=16, rfilter="box", **keys):
+    return {
+        "type": "hdrfilm",
+        "width": size,
+        "height": size,
+        "pixel_format": "rgb",
+        "component_format": "float32",
+        "rfilter": {"type": rfilter},
+    } | keys
+
+
+_film = film  # beside the parameter of `camera`
 
 
 def camera(
@@ -64,15 +83,7 @@ def camera(
         "far_clip": 50,
         "to_world": transform().look_at(list(origin), list(target), list(up)),
         "sampler": {"type": "independent"},
-        "film": {
-            "type": "hdrfilm",
-            "width": size,
-            "height": size,
-            "rfilter": {"type": rfilter},
-            "pixel_format": pixel_format,
-            "component_format": "float32",
-            **(film or {}),
-        },
+        "film": _film(size, rfilter, pixel_format=pixel_format) | (film or {}),
         **more,
     }
 
@@ -84,7 +95,7 @@ def thinlens(**more):
 
 def meter(**more):
     """An irradiance meter, for the shape that holds it."""
-    return {"type": "irradiancemeter", "film": camera(size=1)["film"], **more}
+    return {"type": "irradiancemeter", "film": film(1), **more}
 
 
 def load(**parts):

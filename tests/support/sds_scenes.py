@@ -6,7 +6,8 @@ import internals
 import mitsuba as mi
 import numpy as np
 
-from scenes import camera, transform
+import scenes
+from scenes import area, camera, matte, square, transform
 
 LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 
@@ -14,10 +15,6 @@ LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 ASIDE = [5.0, 0.0, 4.5]
 
 IOR, THICKNESS, ALBEDO, INTENSITY = 1.5, 0.2, 0.5, 10.0
-
-
-def matte(value=ALBEDO):
-    return {"type": "diffuse", "reflectance": value}
 
 
 def point():
@@ -29,18 +26,12 @@ def sun():
 
 
 def ball(radius=0.5):
-    return {
-        "type": "sphere",
-        "center": list(LAMP),
-        "radius": radius,
-        "bsdf": matte(0.0),
-        "emitter": {"type": "area", "radiance": 10.0},
-    }
+    return scenes.ball(matte(0.0), radius, LAMP, emitter=area(10.0))
 
 
 def spark():
     """A lamp with the flux of `ball`, so small that paths from it through the plate are merged."""
-    return ball(0.05) | {"emitter": {"type": "area", "radiance": 1000.0}}
+    return ball(0.05) | {"emitter": area(1000.0)}
 
 
 def glass():
@@ -55,7 +46,7 @@ def under_glass(light, floor=None, plate=None, kind="perspective", **more):
     return {
         "type": "scene",
         "sensor": eye,
-        "floor": {"type": "rectangle", "to_world": transform().scale(4), "bsdf": floor or matte()},
+        "floor": square(size=4, bsdf=floor),
         "plate": {"type": "cube", "to_world": to_world, "bsdf": plate or glass()},
         "light": light,
         **more,
@@ -93,10 +84,9 @@ def bumpy(bsdf):
     return {"type": "bumpmap", "arbitrary": texture, "bsdf": bsdf}
 
 
-def mirror():
+def mirror(**bsdf):
     """Beside the floor, so that the camera sees it there too."""
-    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "conductor"}}
+    return square((-1.5, 0, 1), ([0, 1, 0], 90), bsdf={"type": "conductor", **bsdf})
 
 
 CASES = {
@@ -135,13 +125,12 @@ def ramp():
     """Glass whose alpha grows along the plate from .002 to .4, by a factor in each texel."""
     row = np.geomspace(0.002, 0.4, 16, dtype=np.float32)
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(np.tile(row, (2, 1))[..., None]), "raw": True}
-    return {"type": "roughdielectric", "alpha": texture, "int_ior": IOR, "ext_ior": 1.0}
+    return rough(texture)
 
 
 def steel(alpha):
-    """A mirror of rough metal beside the floor, in which the camera sees it."""
-    to_world = transform().translate([-1.5, 0, 1]).rotate([0, 1, 0], 90).scale(1)
-    return {"type": "rectangle", "to_world": to_world, "bsdf": {"type": "roughconductor", "alpha": alpha}}
+    """A mirror of rough metal."""
+    return mirror(type="roughconductor", alpha=alpha)
 
 
 # Near-specular lobes, between what is a delta lobe and what is none.
@@ -153,7 +142,7 @@ NEAR_SPECULAR = {
     "principled": {"plate": principled(0.1)},
     "blend": {"plate": {"type": "blendbsdf", "weight": 0.4, "a": rough(0.01), "b": rough(0.3)}},
     "bumpy": {"plate": bumpy(rough(0.02))},
-    "steel": {"plate": {"type": "dielectric", "int_ior": IOR, "ext_ior": 1.0}, "mirror": steel(0.02)},
+    "steel": {"plate": glass(), "mirror": steel(0.02)},
     "coated floor": {"plate": rough(0.02), "floor": {"type": "roughplastic", "alpha": 0.02}},
     "lens": {"plate": rough(0.02), "kind": "thinlens"},
 }
