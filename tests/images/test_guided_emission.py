@@ -234,28 +234,6 @@ def test_it_gains_and_says_so():
     assert "skipped (by hand): guided emission: guiding=photons" in never[0][1].explain(scene, spp=64)
 
 
-def room_on_the_ground():
-    """`window_room` on ground of 16 by 16: what the sky emits towards it rarely enters the window."""
-    text = (SCENES / "window_room.xml").read_text().replace("textures/", f"{SCENES}/textures/")
-    ground = """<shape type="rectangle"><ref id="wood"/><transform name="to_world">
-        <scale value="8"/><rotate x="1" angle="-90"/><translate y="-0.01"/></transform></shape>"""
-    return mi.load_string(text.replace("</scene>", ground + "</scene>"), resolution=128)
-
-
-def test_light_that_path_tracing_would_find_alone(monkeypatch):
-    """In a room with a window light subpaths are chosen with tables of emission, and path tracing alone
-    without (their kernel counts three times as much as usual, to be above the noise of predictions)."""
-    scene = room_on_the_ground()
-    monkeypatch.setitem(choice.FIXED, "light", 3 * choice.FIXED["light"])
-    ways = {}
-    for guiding in ("photons", "auto"):
-        _, method = rendered(scene, spp=16, guiding=guiding)
-        decision = method.statistics["decisions"][0]
-        ways[guiding] = decision["light_paths"], decision["emission"] is not None
-    assert ways["photons"] == (0.0, False)
-    assert ways["auto"][0] > 0 and ways["auto"][1]
-
-
 def test_where_nothing_is_gained_nothing_changes():
     light = {"type": "point", "position": [0, 0, 0], "intensity": 1.0}
     ball = {"type": "sphere", "radius": 2.0, "flip_normals": True, "bsdf": parts.grey(0.7)}

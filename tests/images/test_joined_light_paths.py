@@ -1,7 +1,6 @@
 """Camera subpaths that are joined with several light subpaths, drawn by guesses: unbiased; when."""
 
 import json
-from types import SimpleNamespace
 
 import internals
 import mitsuba as mi
@@ -115,37 +114,6 @@ def test_short_renders_are_not_joined():
         assert all(d["joined"] == 1 for d in method.statistics["decisions"])
         assert "joined" not in method.explain(scene, spp=spp)
     assert 8 * 64**2 < planner.JOINED_SAMPLES
-
-
-@pytest.mark.parametrize(
-    "change, joined",
-    [
-        ({}, True),
-        ({"samples": (1 << 16) - 1}, False),
-        ({"pixels": (1 << 10) - 1}, False),
-        ({"transmits": True}, False),
-        ({"many": True}, False),
-        ({"many": True, "samples": (1 << 16) + 40 * (1 << 11)}, True),
-        ({"space": "media"}, False),
-    ],
-    ids=str,
-)
-def test_what_is_joined(change, joined):
-    """In a long render of many pixels, longer with many BSDFs (40), where guesses know the BSDFs."""
-    given = {"samples": 1 << 16, "pixels": 1 << 10, "transmits": False, "space": None, "many": False} | change
-    asked = SimpleNamespace(
-        prepared=SimpleNamespace(
-            traits=SimpleNamespace(
-                transmits=given["transmits"], dispatch=SimpleNamespace(many=given["many"], count=40)
-            ),
-            space=given["space"],
-            emitters=SimpleNamespace(shape_errors=SimpleNamespace(small=False)),
-        ),
-        full=SimpleNamespace(merging=False),
-        _pixels=given["pixels"],
-        _samples=given["samples"],
-    )
-    assert planner.Planner._is_worth_joining(asked) == joined
 
 
 def test_what_is_counted():

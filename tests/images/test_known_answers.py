@@ -863,61 +863,6 @@ def test_white_slab_reflects_what_it_does_not_transmit():
     check(sum(found).mean(1) / (1 - 5e-4), 1.0, 0.01)
 
 
-def lit_ball(sigma, albedo, n=4_000_000):
-    """Radiance by one scattering in a null ball that a spherical lamp lights, image mean over the lamp's
-    radiance.
-
-    Monte Carlo in float64: rays of the film, distances evenly along chords, directions evenly in the lamp's
-    cone. Also its standard error.
-    """
-    rng = np.random.default_rng(1)
-    o, target = np.array([0.1, -0.05, 0.5]), np.array([0, 0, -1.0])
-    c, r, lc, lr = np.array([-0.35, -0.25, -0.25]), 0.3, np.array([0.25, 0.3, -0.2]), 0.2
-    forward = (target - o) / np.linalg.norm(target - o)
-    right = np.cross(forward, [0, 1, 0])
-    right /= np.linalg.norm(right)
-    x, y = rng.uniform(-1, 1, (2, n, 1)) * np.tan(np.deg2rad(30))
-    d = forward + x * right + y * np.cross(right, forward)
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-
-    def chord(p, d, c, r):
-        b = ((c - p) * d).sum(1)
-        q = b * b - ((c - p) ** 2).sum(-1) + r * r
-        return b - np.sqrt(np.maximum(q, 0)), b + np.sqrt(np.maximum(q, 0)), q > 0
-
-    near, far, meets = chord(o, d, c, r)
-    before, _, blocked = chord(o, d, lc, lr)
-    meets &= ~(blocked & (before < near))
-    t = near + (far - near) * rng.random(n)
-    p = o + t[:, None] * d
-    w = lc - p
-    distance = np.linalg.norm(w, axis=1)
-    w /= distance[:, None]
-    cone = np.sqrt(1 - (lr / distance) ** 2)
-    cos = 1 - rng.random(n) * (1 - cone)
-    u = np.cross(np.where(np.abs(w[:, :1]) > 0.5, [[0.0, 1, 0]], [[1.0, 0, 0]]), w)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    phi = 2 * np.pi * rng.random((n, 1))
-    sin = np.sqrt(1 - cos * cos)[:, None]
-    wo = cos[:, None] * w + sin * (np.cos(phi) * u + np.sin(phi) * np.cross(w, u))
-    _, out, _ = chord(p, wo, c, r)
-    value = meets * sigma * albedo * np.exp(-sigma * (t - near + out)) * (far - near) * (1 - cone) / 2
-    return value.mean(), value.std() / np.sqrt(n)
-
-
-def test_fog_lit_by_a_lamp():
-    """`volpath` of Mitsuba 3.9.1 is .6 % too dark in a null ball of fog under a lamp with an area (1.2 % with
-    a grid), so that it cannot judge. Tolerance: 4.5 standard errors of both, 1 % at most (3 % by default)."""
-    ball = fogs.ball(interior=fogs.fog(4, 0.9, 0.0))
-    scene = mi.load_dict(fogs.room(camera(), ball=ball) | {"wall": fogs.wall(bsdf=matte(0))})
-    expected, error = lit_ball(4, 0.9)
-    for way in MEDIA:
-        two, one = (renders(scene, integrator(max_depth=k, **WAYS[way]), 512, 12)[..., 0] for k in (2, 1))
-        found = (two - one).mean((1, 2)) / 5
-        reach = 4.5 * np.hypot(error, found.std(ddof=1) / 12**0.5)
-        assert abs(found.mean() - expected) < reach < (0.03 if way == "default" else 0.01) * expected, way
-
-
 # -- each strategy ------------------------------------------------------------------------------
 
 # Parameters, and what error the weighted sums can show.

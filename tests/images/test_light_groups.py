@@ -8,12 +8,9 @@ import variants
 from internals import bdpt
 from layered import JOINED, LAMPS, check_sum, layers, scene
 from mitsuba_bdpt import mix
-from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.light_groups import LightGroups
 from mitsuba_bdpt.emitters.order import in_order
-from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.accumulator import reduce_mode
-from mitsuba_bdpt.transport import path_layers
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 from warned import Warned
@@ -89,31 +86,6 @@ def test_mixed_light_is_that_of_other_lamps():
     lamps = {name: tuple(np.array(LAMPS[name]) * weights.get(name, 1)) for name in LAMPS}
     expected, _ = layers(bdpt(max_depth=4, skip="none"), scene(lamps))
     np.testing.assert_allclose(mixed, expected, rtol=1e-4, atol=2e-5 * expected.max())
-
-
-def test_without_layers_nothing_is_recorded_for_them(monkeypatch):
-    """Such a render records the same kernels; samples of next-event estimation carry no index."""
-
-    def refuse(*_, **__):
-        raise AssertionError("recorded for light groups")
-
-    def no_layer(layer=0, *_, **__):
-        assert layer is None, "recorded for path layers"
-
-    monkeypatch.setattr(LightGroups, "at", refuse)
-    monkeypatch.setattr(Emitters, "index_of_hit", refuse)
-    monkeypatch.setattr(sink._Total, "begin", refuse)
-    for name in ("sampled", "evaluated"):
-        monkeypatch.setattr(path_layers, name, no_layer)
-    rough = {
-        "ball": {"type": "roughdielectric", "alpha": 0.1},
-        "wall": {"type": "roughconductor", "alpha": 0.05},
-    }
-    for target, parameters in ((scene(), {}), (scene(**rough), {"merging": True})):
-        image, groups = layers(bdpt(max_depth=4, skip="none", **parameters), target, spp=1)
-        assert image.max() > 0 and not groups
-    direct = Emitters(target).sample_direct(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.3), mi.Bool(True))
-    assert direct.index is None
 
 
 @pytest.mark.skipif(variants.BACKEND != "llvm", reason="threads are those of a CPU")
@@ -199,23 +171,6 @@ def test_an_id_wins_over_a_made_name():
         "Screen A",
     }
     assert _ids_of(target, made, "rest_3") == {"rest"}
-
-
-def test_brackets_in_ids_are_themselves():
-    """Only * and ? stand for other characters."""
-    ids = ("lamp[1]", "lamp1", "lamp[!x]", "lamp*", "lamp?")
-    target = mi.load_dict(
-        {"type": "scene"} | {i: {"type": "point", "position": [n, 0, 0]} for n, i in enumerate(ids)}
-    )
-
-    def matched(pattern):
-        groups = LightGroups.of(target, f"a: {pattern}").of_emitters
-        return {e.id() for e, group in zip(target.emitters(), groups, strict=True) if group == 0}
-
-    for own in ids:
-        assert matched(own) == {own}
-    assert matched("lamp[*") == {"lamp[1]", "lamp[!x]"}
-    assert matched("lamp[?]") == {"lamp[1]"}
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """Path layers: layers of the image by the events between emitter and camera."""
 
-import re
 from functools import cache
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -203,24 +201,6 @@ def test_layers_are_those_of_paths_by_bsdf_sampling(surfaces, parameters):
     expected, found = expected_layers(surfaces), means(target, 32, **parameters)
     welch.assert_agree(welch.welch(found, expected, labels=LABELS), at_least=8)
     assert found.mean(0).sum() == pytest.approx(expected.mean(0).sum(), rel=0.01)
-
-
-@pytest.mark.parametrize("kind", ["roughconductor", "roughdielectric"])
-def test_roughness_of_near_specular_lobes(kind):
-    """At normal incidence the alpha of the manual divides events with a density of `NARROW` from others.
-    Tolerance: the manual's two digits, and the 4 % of light that glass reflects."""
-    page = Path(__file__).parents[2] / "docs/user/light_groups.md"
-    manual = float(re.search(rf"`{kind}`[^;]*?below (0\.\d+)", page.read_text())[1])
-    side = -1 if kind == "roughdielectric" else 1
-    for alpha, narrow in ((0.97 * manual, True), (1.03 * manual, False)):
-        glass = {"int_ior": 1.5, "ext_ior": 1.0} if side < 0 else {}
-        bsdf = mi.load_dict({"type": kind, "alpha": alpha} | glass)
-        si = dr.zeros(mi.SurfaceInteraction3f)
-        densities = []
-        for z in (1, side):
-            si.wi = mi.Vector3f(0, 0, z)
-            densities.append(bsdf.pdf(mi.BSDFContext(), si, mi.Vector3f(0, 0, side * z))[0])
-        assert (min(densities) >= NARROW) == narrow
 
 
 def test_other_objects_do_not_change_layers():

@@ -10,7 +10,6 @@ import media_parts as parts
 import mitsuba as mi
 import numpy as np
 import pytest
-import scene_parts
 import variants
 import welch as st
 from mitsuba_bdpt.geometry import polarization
@@ -18,8 +17,8 @@ from mitsuba_bdpt.image import sink
 from mitsuba_bdpt.image.colour import STOKES_NAMES
 from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.run import rendering
-from snapshots import ROUNDING, stopped
 
+import scenes
 from scenes import area, camera, load, matte, renders, square, transform
 
 RUNS, TILES = 16, 4
@@ -84,16 +83,25 @@ def thrown_through(*bsdfs):
     return with_ / without
 
 
-@pytest.mark.parametrize("angle", [0, 30, 90])
-def test_two_polarizers(angle):
-    """Malus' law: half of cos^2 of the angle passes, from either side, polarized. To 2e-3 on the camera's
-    side, where directions are within a degree of the axis; the light's side has noise of 1 % and directions
-    within four."""
-    expected = 0.5 * np.cos(np.radians(angle)) ** 2
-    seen = seen_through(polarizer(20), polarizer(20 + angle))
+@pytest.mark.parametrize(
+    "bsdfs, expected",
+    [
+        *(((polarizer(20), polarizer(20 + a)), np.cos(np.radians(a)) ** 2 / 2) for a in (0, 30, 90)),
+        *(
+            ((polarizer(0), retarder(45, delta), polarizer(90)), np.sin(np.radians(delta) / 2) ** 2 / 2)
+            for delta in (90, 180, 250)
+        ),
+    ],
+)
+def test_light_through_filters(bsdfs, expected):
+    """Malus' law: half of cos^2 of the angle passes two polarizers; sin^2(delta / 2) of what the first of two
+    crossed ones passes if a retarder is between them, at 45 degrees. From either side, and polarized. To 2e-3
+    on the camera's side, where directions are within a degree of the axis; the light's side has noise of 1 %
+    and directions within four."""
+    seen = seen_through(*bsdfs)
     assert seen[0] == pytest.approx(expected, abs=2e-3)
     assert np.hypot(seen[1], seen[2]) == pytest.approx(expected, abs=2e-3) and abs(seen[3]) < 1e-4
-    assert thrown_through(polarizer(20), polarizer(20 + angle)) == pytest.approx(expected, abs=0.012)
+    assert thrown_through(*bsdfs) == pytest.approx(expected, abs=0.012)
 
 
 def test_angles_of_polarization_are_the_polarizers():
@@ -101,15 +109,6 @@ def test_angles_of_polarization_are_the_polarizers():
     one, other = seen_through(polarizer(10)), seen_through(polarizer(40))
     turned = np.degrees(np.arctan2(other[2], other[1]) - np.arctan2(one[2], one[1]))
     assert abs((turned + 180) % 360 - 180) == pytest.approx(60, abs=0.3)
-
-
-@pytest.mark.parametrize("delta", [90, 180, 250])
-def test_retarder_between_crossed_polarizers(delta):
-    """At 45 degrees sin^2(delta / 2) of the light that the first polarizer passes, from either side."""
-    between = polarizer(0), retarder(45, delta), polarizer(90)
-    expected = 0.5 * np.sin(np.radians(delta) / 2) ** 2
-    assert seen_through(*between)[0] == pytest.approx(expected, abs=2e-3)
-    assert thrown_through(*between) == pytest.approx(expected, abs=0.012)
 
 
 @pytest.mark.parametrize("left", [False, True])
@@ -190,7 +189,7 @@ def test_total_internal_reflection():
 
 
 def wall(reflectance):
-    return {"type": "sphere", "radius": 3.0, "flip_normals": True, "bsdf": matte(reflectance)}
+    return scenes.ball(matte(reflectance), 3.0, flip_normals=True)
 
 
 def room(*objects, **more):
@@ -211,7 +210,7 @@ def floor(bsdf, lift=0.0):
 
 
 def ball(bsdf):
-    return {"type": "sphere", "center": [-0.5, -0.3, 0.3], "radius": 0.45, "bsdf": bsdf}
+    return scenes.ball(bsdf, 0.45, (-0.5, -0.3, 0.3))
 
 
 def sheet(bsdf, z):
@@ -226,7 +225,7 @@ def foggy():
 
 def polarized_sky():
     """Of the user's, seen directly, mirrored in rough metal and through glass."""
-    scene_parts.register_plugins()
+    parts.register_plugins()
     other = ball(PLASTIC) | {"center": [0.5, -0.3, 0.3]}
     eye, sky = camera(origin=(0, 0.5, 3), target=(0, -0.1, 0)), {"type": "rayleigh_sky"}
     return load(sensor=eye, sky=sky, floor=floor(ROUGH), ball=ball(GLASS), other=other)
@@ -234,7 +233,7 @@ def polarized_sky():
 
 def seen_through_glass(radius):
     """Rough metal under a polarizing foil, lit by a lamp in glass, seen through a pane: isolated paths."""
-    lamp = {"type": "sphere", "center": [-0.5, -0.3, 0.3], "radius": radius, "bsdf": matte(0)}
+    lamp = ball(matte(0)) | {"radius": radius}
     to_world = transform().translate([0, -0.2, 2]).scale([0.8, 0.8, 0.03])
     return load(
         sensor=camera(origin=(0, -0.2, 2.6), target=(0, -0.3, 0)),
@@ -247,21 +246,18 @@ def seen_through_glass(radius):
     )
 
 
-ALL, ONE = {"skip": "none"}, {"light_paths": 1, "connections": "one"}
+ALL = {"skip": "none"}
+WAYS = ALL, {"light_paths": 1, "connections": "one"}, {}
 GOLD = {"type": "roughconductor", "alpha": 0.3, "material": "Au"}
 FILTERS = sheet(retarder(20, 70), 1.2), sheet(polarizer(30), 0.9)
+TWO_SIDES = floor({"type": "twosided", "nested": ROUGH})
 MASK = {"type": "mask", "opacity": 0.6, "nested": PLASTIC}
-# Scene, its integrator by Mitsuba, longest paths, our ways, and the variant.
+# Scene, its integrator by Mitsuba, longest paths, our ways.
 SCENES = {
-    "rough metal and plastic": (lambda: room(floor(ROUGH), ball(PLASTIC)), "path", 5, (ALL, ONE, {})),
-    "glass": (lambda: room(floor(PLASTIC), ball(GLASS)), "path", 5, (ALL, ONE, {})),
-    "mirror and filters": (lambda: room(floor(ROUGH), ball(MIRROR), *FILTERS), "path", 5, (ALL, ONE, {})),
-    "two sides, mask": (
-        lambda: room(floor({"type": "twosided", "nested": ROUGH}), ball(MASK)),
-        "path",
-        5,
-        (ALL, ONE, {}),
-    ),
+    "rough metal and plastic": (lambda: room(floor(ROUGH), ball(PLASTIC)), "path", 5, WAYS),
+    "glass": (lambda: room(floor(PLASTIC), ball(GLASS)), "path", 5, WAYS),
+    "mirror and filters": (lambda: room(floor(ROUGH), ball(MIRROR), *FILTERS), "path", 5, WAYS),
+    "two sides, mask": (lambda: room(TWO_SIDES, ball(MASK)), "path", 5, WAYS),
     "gold in four wavelengths": (lambda: room(floor(GOLD), ball(GLASS)), "path", 4, (ALL,)),
     "fog": (foggy, "volpath", 5, (ALL,)),
     "a sky of the user's": (polarized_sky, "path", 4, (ALL,)),
@@ -370,15 +366,6 @@ def test_the_first_layer_is_the_image(rfilter):
     # Physical: no vector is longer than its intensity.
     vector = image[..., colours : colours + 12][..., FIRST]
     assert (np.linalg.norm(vector[..., 1:], axis=-1) <= vector[..., 0] * (1 + 1e-4) + 1e-6).all()
-
-
-def test_a_stopped_render_goes_on():
-    scene = room(floor(ROUGH))
-    whole = np.array(bdpt(max_depth=4, spp_per_pass=8).render(scene, spp=32, seed=1))
-    other = bdpt(max_depth=4, spp_per_pass=8)
-    snapshot = stopped(other, scene, 2, seed=1, spp=32)
-    rest = np.array(other.render(scene, spp=32, seed=1, start=snapshot))
-    np.testing.assert_allclose(rest, whole, **ROUNDING | {"atol": 1e-5})
 
 
 def test_isolated_paths_are_polarized():

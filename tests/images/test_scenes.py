@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import drjit as dr
 import make_meshes
 import make_textures
 import make_volumes
@@ -131,28 +130,6 @@ def test_what_only_merging_finds(name, share):
     ways = [mi.load_dict(ours | {"merging": merging}) for merging in (False, True)]
     mean = [np.mean(mi.render(scene, integrator=way, spp=64, seed=1)) for way in ways]
     assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
-
-
-def test_projector_shows_its_slide_upside_down():
-    """The ball turns the picture: at the middles of the quarters on the wall blue or green above, red or
-    orange below (the channels differ by 2 and more)."""
-    scene = load("projector_through_glass", integrator="bdpt", max_depth=4, resolution=64)
-    image = np.array(mi.render(scene, spp=64))
-    sensor = scene.sensors()[0]
-    above, below = [], []
-    for y, found in ((1.25, above), (0.75, below)):
-        for x in (-0.25, 0.25):
-            ds, _ = sensor.sample_direction(_point(x, y, -2.5), mi.Point2f(0.5))
-            column, row = (int(v) for v in (ds.uv.x[0], ds.uv.y[0]))
-            found.append(image[row - 1 : row + 2, column - 1 : column + 2].mean((0, 1)))
-    assert all(rgb[0] < 0.7 * rgb[1:].max() for rgb in above)
-    assert all(rgb[0] > 1.3 * rgb[2] for rgb in below)
-
-
-def _point(x, y, z):
-    it = dr.zeros(mi.Interaction3f)
-    it.p = mi.Point3f(x, y, z)
-    return it
 
 
 @pytest.mark.parametrize("name", ["furnace_point", "furnace_emission", "furnace_white"])

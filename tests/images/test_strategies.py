@@ -191,8 +191,8 @@ def in_fog(parts, alone=0, judge="volpath"):
 
 
 # Balls and boxes with a boundary of plugin null are lit by a point: `volpath` is .6 % too dark behind them
-# under a lamp of some area, see `test_known_answers.test_fog_lit_by_a_lamp`. Mitsuba samples microflakes by
-# another distribution than their density, see `test_media`.
+# under a lamp of some area. Mitsuba samples microflakes by another distribution than their density, see
+# `test_media`.
 MEDIA = {
     "fog": in_fog(fogs.foggy, 4),
     "fog, lens": in_fog(lambda: fogs.foggy(camera=fogs.thinlens), 4),
