@@ -197,28 +197,6 @@ def test_places_on_a_surface(name):
     agree(*bins, density, float(shape.surface_area()[0]))
 
 
-@pytest.mark.parametrize("name", ["spot", "projector", "textured projector"])
-def test_power_of_cones(name):
-    """The mean weight is the integral of Mitsuba's own intensity over directions. Tolerance: five standard
-    errors of both sides."""
-    scene, _, e = emission(name)
-    lamp = scene.emitters()[0]
-    d = column(e.d)
-    axis = d.mean(1) / np.linalg.norm(d.mean(1))
-    cos_least = (axis @ d).min() - 1e-3
-    u = numbers(2, 12)
-    local = mi.warp.square_to_uniform_cone(mi.Point2f(u[0], u[1]), mi.Float(float(cos_least)))
-    it = dr.zeros(mi.Interaction3f, COUNT)
-    middle = mi.Point3f(e.anchor.p)
-    it.p = middle + mi.Frame3f(mi.Vector3f(*axis.tolist())).to_world(local)
-    _, intensity = lamp.sample_direction(it, mi.Point2f(0.5))
-    power = column(intensity)[0] * 2 * np.pi * (1 - cos_least)
-    weight = column(e.weight)[0]
-    error = np.hypot(power.std(), weight.std()) / np.sqrt(COUNT)
-    assert error < 0.02 * power.mean()
-    assert abs(power.mean() - weight.mean()) < 5 * error + 1e-4 * power.mean()
-
-
 def test_selection_beside_what_cannot_be_traced():
     """Half of the emissions carry light, and their mean is the point light's power. Tolerance: five standard
     errors."""

@@ -346,18 +346,3 @@ def test_a_sky_seen_from_the_origin_beside_a_lamp_that_shines_inwards():
     image = np.array(integrator.render(mi.load_dict(scene | {"sensor": sensor}), spp=256))
     assert integrator.statistics["non_finite"] == 0
     assert image[..., :3].mean() == pytest.approx(1, rel=0.05)
-
-
-def test_a_textured_lamp_beside_a_group_of_two_kinds_of_shapes():
-    """``Shape.ray_intersect`` of Mitsuba reads out of bounds there."""
-    group = {"type": "shapegroup", "ball": {"type": "sphere", "radius": 0.2}, "box": {"type": "cube"}}
-    one = {"type": "instance", "group": {"type": "ref", "id": "group"}}
-    scene = {
-        "type": "scene",
-        "sensor": perspective((0, 0, 4), (0, 0, 0)),
-        "lamp": {"type": "rectangle", "emitter": {"type": "area", "radiance": peaked(2)}},
-        "group": group,
-        "instance": one | {"to_world": T().translate([0, 0, 2]).scale(0.1)},
-    }
-    image = np.array(mi.load_dict({"type": "bdpt"}).render(mi.load_dict(scene), spp=4))
-    assert 0.1 < image.mean() < 1 and np.isfinite(image).all()

@@ -83,8 +83,7 @@ def check(scene, ray):
 
 
 def test_instances_are_mitsubas():
-    """Expected: all that Mitsuba's own call says of 20,000 hits, on instances of two groups, other shapes and
-    nothing."""
+    """On instances of two groups, other shapes and nothing."""
     pi = check(forest(20), rays(20000))
     inside = np.array(pi.instance != dr.zeros(mi.ShapePtr))
     assert 1000 < inside.sum() < np.array(pi.is_valid()).sum() - 1000
@@ -92,8 +91,7 @@ def test_instances_are_mitsubas():
 
 @pytest.mark.parametrize("others", [0, 1, 2])
 def test_spheres_are_mitsubas(others):
-    """Expected: the same of spheres, beside other shapes or none, and at the pole, where directions along the
-    surface are arbitrary."""
+    """Beside other shapes or none, and at the pole, where directions along the surface are arbitrary."""
     scene, ray = balls(14, others), rays(20000)
     poles = np.array(
         [shape.bbox().center() for shape in scene.shapes() if shape.shape_type() == mi.ShapeType.Sphere.value]
@@ -111,9 +109,8 @@ def test_spheres_are_mitsubas(others):
     ids=["copies", "balls", "others"],
 )
 def test_kernels_do_not_grow(made, called):
-    """Expected: with 10 and with 30 the same number of shapes is called one by one, and kernels are as long
-    (a few lines are about how tables lie in memory), also with more of other shapes, which share their
-    function."""
+    """With 10 and with 30 as many shapes are called one by one, and kernels are as long (a few lines are
+    about how tables lie in memory), also with more of other shapes, which share their function."""
     other, counts = balls(3), []  # else shapes might have the numbers by which Dr.Jit merges functions
     for count in (10, 30):
         scene, ray = made(count), rays(16)
@@ -131,8 +128,6 @@ def test_kernels_do_not_grow(made, called):
 
 @pytest.mark.parametrize("why", ["few", "unnamed", "alike", "few spheres", "other shapes"])
 def test_mitsubas_call_is_used_otherwise(why, monkeypatch):
-    """Expected: no table for few instances or spheres, nor where the description of an instance does not name
-    its group, groups are named alike, or other shapes are many more."""
     scene = forest(hits.MANY - (why == "few"))
     if why == "few spheres":
         scene = balls(hits.MANY - 1)
@@ -151,8 +146,7 @@ MOVED = {forest: ("copy3.to_world", "tree.cube.to_world", "bush.knob.to_world"),
 
 @pytest.mark.parametrize("made", [forest, balls])
 def test_images_are_the_same(made, monkeypatch):
-    """Expected: the same image by the tables and by Mitsuba's call, also after a shape was moved, be it an
-    instance or in a group. Tolerance: kernels of their own may round otherwise, `same`."""
+    """By the tables and by Mitsuba's call, also after a shape was moved, be it an instance or in a group."""
     scene = made(9)
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 4, "light_paths": 1, "connections": "one"})
 

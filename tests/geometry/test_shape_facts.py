@@ -46,8 +46,7 @@ def image(scene, seed=0, **parameters):
 
 
 def test_shapes_are_asked_once(found):
-    """Rationale: it is a tenth of a small render. Expected: renders by several integrators ask them once (and
-    the ball once more, since the first moves its numbers into memory)."""
+    """A tenth of a small render. (The ball once more: the first render moves its numbers into memory.)"""
     scene = room()
     for number in range(4):
         image(scene, number, light_paths=number % 2)
@@ -65,8 +64,8 @@ EDITS = {
 
 @pytest.mark.parametrize("name", EDITS)
 def test_edited_shapes_are_asked_again(name, found):
-    """Expected: after an edit of a shape, be it in a group, it is asked again, other shapes are not, and the
-    image is that of a scene that was never rendered before (up to the order of sums)."""
+    """Other shapes are not, and the image is that of a scene that was never rendered before, up to the order
+    of sums."""
     scene, fresh = room(), room()
     for number in range(3):
         image(scene, number)
@@ -83,8 +82,7 @@ def test_edited_shapes_are_asked_again(name, found):
 
 
 def test_what_cannot_be_rendered_is_said_each_time():
-    """Expected: a lamp whose matrix Mitsuba samples wrongly is refused in every render, and no longer when
-    it is mended."""
+    """A lamp whose matrix Mitsuba samples wrongly, until it is mended."""
     scene = room()
     image(scene)
     parameters = mi.traverse(scene)
@@ -101,9 +99,8 @@ def test_what_cannot_be_rendered_is_said_each_time():
 
 
 def test_facts_are_not_those_of_another_scene(found, monkeypatch):
-    """Rationale: a scene may lie in memory where one was that is gone, and be rendered by the same sensor.
-    Expected: what is remembered for the one is not taken for the other, though all parameters are alike, if
-    Dr.Jit has given other numbers to its shapes, or normals are flipped."""
+    """A scene may lie in memory where one was that is gone, and be rendered by the same sensor: all
+    parameters are alike, but Dr.Jit has given other numbers to its shapes, or normals are flipped."""
     sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}})
     monkeypatch.setattr(notices, "id", lambda scene: 0, raising=False)
     kept = []
@@ -116,8 +113,7 @@ def test_facts_are_not_those_of_another_scene(found, monkeypatch):
 
 
 def test_no_scene_is_kept_alive():
-    """Rationale: lamps of a scene that is gone would take part in the calls of others. Expected: none is left
-    of a scene that was rendered and deleted."""
+    """Lamps of a scene that is gone would take part in the calls of others."""
     gc.collect()
     before = len(registered_emitters())
     scene = room()

@@ -124,10 +124,9 @@ def bdpt(**parameters):
     ids=["plain", "hidden emitters", "thin lens, border", "crop, passes", "all layers", "depth 0"],
 )
 def test_features_are_those_of_aov(film_keys, sensor_keys, parameters, monkeypatch):
-    """Features are Mitsuba's own, at our camera samples. Expected: all kinds of layers equal `aov`'s in every
-    pixel for any film, sensor and parameter, except where its uv derivatives are NaN, as its misses are; they
-    follow the image and come before other layers. Tolerance: 1e-4 of a layer's largest value (rays are set up
-    in another order; sums in single precision)."""
+    """All kinds equal `aov`'s in every pixel for any film, sensor and parameter, but where its uv derivatives
+    are NaN; they follow the image and come before other layers. Tolerance: 1e-4 of a layer's largest value
+    (rays are set up in another order)."""
     mi.register_sampler("fixed", Fixed)
     monkeypatch.setattr(Points, "_draw", fixed(Points._draw))
     target = scene(sensor(film(**film_keys), sampler={"type": "fixed"}, **sensor_keys))
@@ -159,8 +158,7 @@ def region(target):
 
 
 def test_uv_derivatives_of_misses_are_zero():
-    """Rationale: sums lose NaN or keep it by chance, so the samples themselves are looked at. Expected: 0 in
-    the upper left corner, which sees nothing, and not in the lower right one, on the floor."""
+    """Sums lose NaN or keep it by chance, so samples are looked at: one sees nothing, the other the floor."""
     target = scene(sensor(film()))
     features = FeatureLayers(target, target.sensors()[0], "dx:duv_dx,dy:duv_dy", 4)
     position, lens = mi.Point2f([0.5, 11.5], [0.5, 9.5]), mi.Point2f(0.5)
@@ -172,9 +170,7 @@ def test_uv_derivatives_of_misses_are_zero():
 
 @pytest.mark.parametrize("kind", ["bumpmap", "normalmap"])
 def test_denoisers_are_told_normals_of_the_world(kind):
-    """Mitsuba's `aov` has normals of bump maps in the shading frame. Expected: a map without any effect on a
-    wall that is turned by 40 degrees has the wall's normal; `sh_normal` of the bump map is still that of
-    `aov`."""
+    """Mitsuba's `aov` has normals of bump maps in the shading frame. A map without effect, on a wall."""
     flat = {"type": "normalmap", "normalmap": {"type": "rgb", "value": [0.5, 0.5, 1]}}
     maps = {"bumpmap": {"type": "bumpmap", "texture": textured(), "scale": 0.0}, "normalmap": flat}
     wall = {"type": "rectangle", "to_world": T().rotate([0, 1, 0], 40).scale(9)}
@@ -189,7 +185,6 @@ def test_denoisers_are_told_normals_of_the_world(kind):
 
 
 def test_the_image_is_the_same_with_features():
-    """Expected: the image of a render without `aovs`, sample by sample (1e-4: atomic sums)."""
     target = scene(sensor(film(rfilter="gaussian")))
     plain = np.array(bdpt(aovs="", skip="none").render(target, spp=8, seed=3))
     result = np.array(bdpt(skip="none").render(target, spp=8, seed=3))
@@ -198,7 +193,6 @@ def test_the_image_is_the_same_with_features():
 
 
 def test_an_interrupted_render_keeps_features():
-    """Expected: after two of five passes the layers show the plane z = 1 (1e-5)."""
 
     def interrupt(report):
         if report.spp_done >= 2:
@@ -219,9 +213,7 @@ def test_an_interrupted_render_keeps_features():
 
 
 def test_spectral_albedo():
-    """A spectral film's wavelengths follow its bands, which says nothing about RGB. Expected: the albedo on a
-    `specfilm`, between its bands and its weight, and on an `hdrfilm` is `aov`'s on an `hdrfilm`. Statistic:
-    Welch over tiles of 5x6 pixels, 12 seeds a side."""
+    """A spectral film's wavelengths follow its bands, which says nothing about RGB. Welch over tiles."""
     mi.set_variant("llvm_ad_spectral")
     bands = {"near": {"type": "spectrum", "value": [(600, 0.0), (700, 1.0), (800, 0.0)]}}
     aovs = "albedo:albedo,dd:depth"
@@ -258,15 +250,13 @@ def test_spectral_albedo():
     ],
 )
 def test_bad_features_are_named(aovs, message):
-    """Expected: ValueError before anything is rendered, with parameter, value and remedy. (Mitsuba puts
-    what a constructor raises into a RuntimeError.)"""
+    """Mitsuba puts what a constructor raises into a RuntimeError."""
     with pytest.raises((ValueError, RuntimeError), match=f"(?s)UsageError.*bdpt: aovs='{aovs}'.*{message}"):
         bdpt(aovs=aovs, layers="variance,strategies")
 
 
 @pytest.mark.parametrize("aovs", ["", " , "])
 def test_no_features(aovs):
-    """Expected: no layer, no rays of theirs."""
     integrator = bdpt(aovs=aovs)
     assert integrator.aov_names() == []
     integrator.render(scene(sensor(film())), spp=1)
@@ -274,7 +264,7 @@ def test_no_features(aovs):
 
 
 def test_features_in_a_scene_file():
-    """Rationale: the plugin `aov` is loaded while a scene is, on the loader's threads. Expected: it works."""
+    """Scenes are loaded on several threads."""
     text = """
         <scene version="3.0.0">
             <integrator type="bdpt"><string name="aovs" value="dd:depth, nn:sh_normal"/></integrator>
@@ -286,7 +276,6 @@ def test_features_in_a_scene_file():
 
 
 def test_features_leave_the_sampler_alone():
-    """Expected: the sensor's sampler gives after the render what it would have given without."""
     target = scene(sensor(film(), sampler={"type": "stratified", "sample_count": 9}))
     sampler = target.sensors()[0].sampler()
     sampler.seed(3, 64)
@@ -298,7 +287,7 @@ def test_features_leave_the_sampler_alone():
 
 
 def test_another_sample_count_does_not_recompile():
-    """Expected: the spread of ray differentials, which follows the samples per pixel, is no literal."""
+    """The spread of ray differentials, which follows the samples per pixel, is no literal."""
     target, integrator = scene(sensor(film())), bdpt(spp_per_pass=1)
     integrator.render(target, spp=4)
     dr.sync_thread()

@@ -31,11 +31,8 @@ def guides(scene) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_what_it_does_to_the_error(name):
-    """Previews are to look finished, whoever has rendered them. Expected: in six scenes of 16 samples per
-    pixel the relMSE of the denoised image is at most three quarters of the raw one's, of `path` as of bdpt;
-    the colours are those of a render without the parameter. (In `veach_mis` the denoiser makes halos about a
-    lamp whose radiance is a thousand times the image's mean: docs/development/experiments.md,
-    "Denoising".)"""
+    """At most three quarters of the raw relMSE, of `path` as of bdpt; the colours are those without the
+    parameter. (Not in `veach_mis`: docs/development/experiments.md, "Denoising".)"""
     scene, depth = repository.load_scene(name, resolution=SIZE), repository.benchmark_depth(name)
     expected = repository.load_reference(name, SIZE, depth).image
     common = {"type": "bdpt", "max_depth": depth}
@@ -53,8 +50,6 @@ def test_what_it_does_to_the_error(name):
 
 
 def test_other_layers_are_untouched():
-    """Expected: features, variance and strategies are where they were, with the same numbers; the layers come
-    after the features."""
     scene = repository.load_scene("cornell_box", resolution=16)
     more = {"aovs": "albedo:albedo,dd:depth", "max_depth": 3}
     images = {}
@@ -69,9 +64,8 @@ def test_other_layers_are_untouched():
 
 
 def test_a_film_that_keeps_alpha_or_luminance():
-    """Expected: three denoised channels, whatever the film makes of the colours; alpha is no colour. The mean
-    of the denoised channels is that of the colours within a tenth, though the denoiser blurs: a 1 of alpha
-    among them would move it by half and more."""
+    """Alpha is no colour: among them it would move the mean by half and more; the denoiser blurs by less than
+    a tenth."""
     for pixel_format, channels in (("rgba", 4), ("luminance", 1)):
         described = mi.cornell_box()
         described["sensor"]["film"] |= {"width": 16, "height": 16, "pixel_format": pixel_format}
@@ -83,7 +77,6 @@ def test_a_film_that_keeps_alpha_or_luminance():
 
 
 def test_what_is_refused(monkeypatch):
-    """Expected: films of bands, and a package that is missing, are said before anything is rendered."""
     mi.set_variant("llvm_ad_spectral")
     described = mi.cornell_box()
     described["sensor"]["film"] = {
@@ -103,8 +96,7 @@ def test_what_is_refused(monkeypatch):
 
 
 def test_the_command(tmp_path, capsys):
-    """Expected: the EXR has the raw image and the denoised one, the PNG shows the latter; contradictions and
-    other integrators are refused."""
+    """The PNG shows the denoised image."""
     scene = str(Path(repository.SCENES) / "cornell_box.xml")
     arguments = ["render", scene, "--size", "32x32", "--spp", "4", "-o", str(tmp_path / "a.exr")]
     assert main([*arguments, "--denoise"]) == 0

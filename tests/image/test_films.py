@@ -88,9 +88,8 @@ def layer_names(scene):
     ids=["default", "gaussian crop", "mitchell border", "camera side, lanczos crop border"],
 )
 def test_bands_are_known(parameters, film):
-    """Expected: 50 and 100, the responses' integrals, times r + r^2 + r^3 in every tile and along the border.
-    Statistic: Student's t over 12 seeds with Sidak's correction; standard errors below 0.3 % of a tile and
-    0.06 % of the image."""
+    """The responses' integrals times r + r^2 + r^3, in every tile and along the border. Student's t over 12
+    seeds with Sidak's correction."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(**film))
     images = renders(scene, integrator(max_depth=4, **parameters), range(12), 64)
@@ -115,8 +114,7 @@ COLOURFUL = {
     "film", [{}, {"rfilter": "gaussian", "sample_border": True, **CROP}], ids=["box", "gaussian crop border"]
 )
 def test_overlapping_bands_equal_path(film):
-    """Bands may overlap and differ in scale. Expected: equal to `path` in every tile and band. Statistic:
-    Welch over tiles, 12 seeds a side; the image's mean is compared to some 1 %."""
+    """Bands may overlap and differ in scale. Welch over tiles; the image's mean is compared to some 1 %."""
     mi.set_variant(SPECTRAL)
     lamp = {"type": "area", "radiance": spectrum([(400, 3), (550, 8), (700, 2)])}
     floor = T().translate([0, -0.7, -2]).rotate([1, 0, 0], -90).scale(2)
@@ -141,9 +139,8 @@ def test_overlapping_bands_equal_path(film):
 
 
 def test_unit_of_a_response_does_not_matter():
-    """Expected: responses x 1000 give 1000 times the image (1e-3: the threshold is rounded to powers of two)
-    with the same rays, and roulette ends as many of the connections as on an RGB film (a factor of two: the
-    RGB of a spectrum of 1 is 0.9 to 1.2, and powers of two)."""
+    """Responses x 1000 give 1000 times the image (1e-3: the threshold is rounded to powers of two) with the
+    same rays; roulette ends as many connections as on an RGB film, within a factor of two."""
     mi.set_variant(SPECTRAL)
     loud = {name: [(x, 1000 * y) for x, y in values] for name, values in BANDS.items()}
     flat = {"type": "uniform", "value": 0.5}
@@ -159,10 +156,9 @@ def test_unit_of_a_response_does_not_matter():
 
 
 def test_variance_of_bands():
-    """Expected: layers named after the bands, whose mean over 12 seeds is the spread of the pixels over
-    these; and `statistics["error"]` is the relMSE of bands in units of their responses. Tolerance: 20 %: 12
-    seeds give each pixel's variance to 43 %, 256 pixels, correlated by the filter, the mean to 4 %; the error
-    pairs the variance of one half of the replicates with the mean of the other. Statistic: ratio of means."""
+    """The mean of the layers is the spread over 12 seeds. Tolerance: 20 %: 12 seeds give each pixel's
+    variance to 43 %, 256 correlated pixels the mean to 4 %; the error pairs the variance of one half of the
+    replicates with the mean of the other."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(rfilter="gaussian"))
     bdpt = integrator(max_depth=3, layers="variance")
@@ -177,8 +173,8 @@ def test_variance_of_bands():
 
 
 def test_one_band_without_noise():
-    """Rationale: one band's wavelengths are drawn in proportion to its response. Expected: light of
-    radiance 0.7 gives exactly 0.7 times the response's integral (1e-4: a hundred additions), and no alpha."""
+    """One band's wavelengths are drawn in proportion to its response: exactly its integral (1e-4: a hundred
+    additions)."""
     mi.set_variant(SPECTRAL)
     sky = {"type": "constant", "radiance": {"type": "uniform", "value": 0.7}}
     film = spectral_film({"only": BANDS["infrared"]}, rfilter="gaussian")
@@ -189,8 +185,7 @@ def test_one_band_without_noise():
 
 
 def test_strategy_images_of_bands_are_refused():
-    """Rationale: they are RGB in every variant, and the RGB of a film that samples its bands only would be
-    wrong. Expected: the parameter and the remedy are named, by render and by explain."""
+    """They are RGB in every variant, and the RGB of a film that samples its bands only would be wrong."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film())
     bdpt = integrator(max_depth=3, layers="strategies")
@@ -208,7 +203,6 @@ class OtherFilm(mi.Film):
 
 
 def test_other_special_films_are_refused():
-    """Expected: the class is named, and what can be used."""
     mi.register_film("other", OtherFilm)
     eye = camera({"type": "other", "width": 4, "height": 4})
     scene = mi.load_dict({"type": "scene", "sensor": eye, "l": {"type": "point"}})
@@ -246,9 +240,8 @@ FORMATS = [
 
 @pytest.mark.parametrize(("pixel_format", "rfilter", "border", "hide", "sky"), FORMATS)
 def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
-    """Expected: each channel, alpha included, equals `path` in tiles of 2x2 pixels of an 8x12 crop, which
-    splats reach from outside. Statistic: Welch with Sidak, 24 seeds a side; the mean of each channel is
-    compared to 2 %."""
+    """Each channel, alpha included, in tiles of an 8x12 crop, which splats reach from outside. Welch with
+    Sidak; the mean of each channel is compared to 2 %."""
     keys = {"pixel_format": pixel_format, "rfilter": rfilter, "sample_border": border, **CROP}
     scene = lamps_and_sky(rgb_film(**keys), sky)
     a = renders(scene, integrator(max_depth=3, hide_emitters=hide, skip="none"), range(24), 64)
@@ -265,7 +258,6 @@ def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
 
 @pytest.mark.parametrize("hide", [False, True])
 def test_depth_zero_is_black_and_clear(hide):
-    """Expected: as with `path`, nothing is seen at max_depth=0, and alpha is 0 under a sky too."""
     scene = lamps_and_sky(rgb_film(pixel_format="rgba"), True)
     for kind in ("bdpt", "path"):
         image = renders(scene, integrator(kind, max_depth=0, hide_emitters=hide), [0], 4)

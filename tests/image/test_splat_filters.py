@@ -66,9 +66,8 @@ def drawn(rfilter, numbers=NUMBERS, shift=0.5):
 
 @pytest.mark.parametrize("rfilter", FILTERS)
 def test_the_mean_over_all_numbers_is_the_filter(rfilter):
-    """Expected: over a grid of all random numbers, the mean of a splat is the splat to every pixel of the
-    filter's support, in a crop window too. Tolerance: a pixel's share of a grid of n cells per axis is exact
-    to 1 / n per axis; times what the drawn pixels receive, at most 0.6 (lanczos)."""
+    """Tolerance: a pixel's share of a grid of n cells per axis is exact to 1 / n per axis; times what the
+    drawn pixels receive, at most 0.6 (lanczos)."""
     expected = exact(rfilter)
     assert np.abs(expected).max() > 0.1
     rounding = 1e-5
@@ -78,9 +77,8 @@ def test_the_mean_over_all_numbers_is_the_filter(rfilter):
 
 @pytest.mark.parametrize("rfilter", ["tent", "gaussian", "between", "lanczos"])
 def test_weights_add_up_to_those_of_all_pixels(rfilter):
-    """Rationale: a radius rounded down loses 0.1 % of the light. Expected: for whatever random numbers the
-    absolute weights add up to those of all pixels as far as the radius, rounded up. Tolerance: sums of a
-    hundred numbers in single precision."""
+    """A radius rounded down loses 0.1 % of the light. Tolerance: sums of a hundred numbers in single
+    precision."""
     loaded = mi.load_dict(FILTERS[rfilter])
     u = [mi.Float(x) for x in np.random.default_rng(2).random((4, 1000), np.float32)]
     taps = Taps(loaded, mi.Point2f(u[0], u[1]), mi.Point2f(u[2], u[3]))
@@ -92,17 +90,15 @@ def test_weights_add_up_to_those_of_all_pixels(rfilter):
 
 @pytest.mark.parametrize("rfilter, most", [("tent", 4), ("gaussian", 4), ("lanczos", 7)])
 def test_a_splat_adds_to_few_pixels(rfilter, most):
-    """Rationale: additions are the cost of a splat. Expected: at most ``most`` pixels, for whatever random
-    numbers, where the support has 4, 16 and 36."""
+    """Additions are the cost of a splat; the supports have 4, 16 and 36 pixels."""
     for shift in (0.01, 0.5, 0.99):
         assert 3 <= np.count_nonzero(drawn(rfilter, 1, shift)[2]) <= most
 
 
 @pytest.mark.parametrize("rfilter, most", [("tent", 1.001), ("gaussian", 1.07), ("lanczos", 1.15)])
 def test_what_drawing_adds_to_the_variance(rfilter, most):
-    """Rationale: one pixel drawn of all would have 2 to 16 times the variance. Expected: the second moment of
-    a splat at random positions, over that with all pixels, is at most ``most``. Statistic: the same grid of
-    positions for both, of random numbers too; the ratio is exact to some 1e-2."""
+    """One pixel drawn of all would have 2 to 16 times the variance. The same grid of positions and random
+    numbers for both; the ratio is exact to some 1e-2."""
     numbers = 16
     loaded, lanes = mi.load_dict(FILTERS[rfilter]), dr.arange(mi.UInt32, numbers**4)
     grid = [(mi.Float(lanes // numbers**k % numbers) + 0.5) / numbers for k in range(4)]
@@ -123,9 +119,8 @@ def test_what_drawing_adds_to_the_variance(rfilter, most):
     ],
 )
 def test_wide_filters_are_added_to_all_pixels(wide, narrower):
-    """Rationale: hundreds of pixels were drawn, in operations that grew with the third power of the radius:
-    23 s for a first image. Expected: f(x) f(y) in each pixel, of either sign, in a kernel with as many
-    operations for every radius. Tolerance: some roundings of values of at most 1."""
+    """Operations grew with the third power of the radius: 23 s for a first image. Tolerance: some roundings
+    of values of at most 1."""
     at, operations = (31.3, 33.8), []
     for rfilter in map(mi.load_dict, (narrower, wide)):
         block = Block((64, 64), (0, 0), 2, rfilter, dr.ReduceMode.Expand, mi.ArrayXd)
@@ -144,8 +139,7 @@ def test_wide_filters_are_added_to_all_pixels(wide, narrower):
 @pytest.mark.skipif(variants.BACKEND != "llvm", reason="threads are those of a CPU")
 @pytest.mark.parametrize(("stddev", "is_wide"), [(0.5, False), (5, True)])
 def test_sums_of_wide_filters_are_copied_for_each_thread(stddev, is_wide):
-    """Rationale: atomic additions to 1600 pixels took three to five times as long. Expected: copies of the
-    sums of camera samples and of splats with a wide filter alone."""
+    """Atomic additions to 1600 pixels took three to five times as long."""
     target = scene(rfilter={"type": "gaussian", "stddev": stddev})
     made = Render(target, target.sensors()[0], mi.load_dict({"type": "bdpt"}).settings, 0, 16).accumulator
     modes = made.camera._mode, made.light._mode
@@ -170,8 +164,8 @@ def scene(**film):
 
 
 def test_strips_of_camera_samples_are_apart(monkeypatch):
-    """Expected: with a sum for each sample of a pixel, the image is that of a single sum. Tolerance: sums of
-    some hundred numbers in single precision, relative to the brightest pixel."""
+    """The image is that of a single sum. Tolerance: sums of some hundred numbers, relative to the brightest
+    pixel."""
     target = scene(rfilter={"type": "gaussian"}, crop_width=3, crop_height=2)
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 3, "light_paths": 0})
     expected = np.array(bdpt.render(target, seed=1, spp=4))
@@ -181,8 +175,8 @@ def test_strips_of_camera_samples_are_apart(monkeypatch):
 
 
 def test_numbers_of_the_filter_are_uniform_and_independent(monkeypatch):
-    """Expected: wherever in a pixel splats fall, their numbers are uniform in the square. Statistic:
-    chi-squared of 4 x 4 cells of the numbers in each of 4 x 4 cells of the pixel."""
+    """Wherever in a pixel splats fall: chi-squared of 4 x 4 cells of the numbers in each of 4 x 4 cells of
+    the pixel."""
     found = dr.zeros(mi.UInt32, 4**4)
     dr.make_opaque(found)
     original = Accumulator.put_light
@@ -203,8 +197,7 @@ def test_numbers_of_the_filter_are_uniform_and_independent(monkeypatch):
 
 
 def test_images_of_strategies_add_up():
-    """Rationale: a strategy's image that drew other pixels for its splats would only agree on average.
-    Expected: the sum of the weighted images is the image, to rounding, in a crop window with borders."""
+    """A strategy's image that drew other pixels for its splats would only agree on average."""
     film = {"rfilter": {"type": "lanczos"}, "sample_border": True, "pixel_format": "rgb"}
     film |= {"crop_offset_x": 3, "crop_offset_y": 2, "crop_width": 6, "crop_height": 8}
     bdpt = mi.load_dict({"type": "bdpt", "skip": "none", "max_depth": 3, "layers": "strategies"})

@@ -25,9 +25,8 @@ def renders(integrator, target, seeds, spp):
 
 
 def test_weighted_variance_of_a_mean():
-    """Replicates may differ in size. Expected: images 1, 2, 4 of 1, 1, 2 samples have the weighted mean 11/4
-    and sum n (x - mean)^2 = 49/16 + 9/16 + 2 * 25/16 = 27/4, hence the variance 27/4 / (4 * 2) of four
-    samples, and 27/4 / (5 * 2) if a fifth belongs to no replicate."""
+    """Images 1, 2, 4 of 1, 1, 2 samples have the weighted mean 11/4 and sum n (x - mean)^2 = 27/4, hence the
+    variance 27/4 / (4 * 2) of four samples, and 27/4 / (5 * 2) if a fifth belongs to no replicate."""
     replicates, total, spp = Replicates(), 0.0, 0
     for x, n in ((1.0, 1), (2.0, 1), (4.0, 2)):
         total, spp = total + x * n, spp + n
@@ -47,8 +46,8 @@ def replicates(images, n):
 
 
 def test_the_estimated_error_sees_fireflies():
-    """Expected: relMSE about 125^2 / 100, of which the estimate sees half, in the half that has it, times 8 /
-    4 for its mean; within 2 % (epsilon moves)."""
+    """relMSE is about 125^2 / 100, of which the estimate sees half, in the half that has it, times 8 / 4 for
+    its mean; within 2 % (epsilon moves)."""
     images = np.ones((8, 100))
     images[3, 7] = 1000
     error = replicates(images, 4).error(32, 1.0)
@@ -57,15 +56,15 @@ def test_the_estimated_error_sees_fireflies():
 
 
 def test_the_estimated_error_of_a_black_image():
-    """Expected: 0, so that `target_error` stops, not 0 / 0."""
+    """0, so that `target_error` stops, not 0 / 0."""
     assert replicates(np.zeros((8, 4)), 4).error(32, 1.0) == 0
 
 
 @pytest.mark.parametrize(("shape", "most"), [(4.0, 1.03), (0.5, 2.0)])
 def test_the_estimated_error_is_that_of_skewed_images(shape, most):
-    """Expected: for images whose pixels have a gamma distribution (mean 1, variance 1 / (2 ``shape``) of each
-    of 8 replicates) the estimate is the relMSE in the mean where that is 1.6 % (what is left, of the second
-    order in the 3 % variance of a half, is below 3 %), and above it, up to twice, where it is 12 %."""
+    """Pixels have a gamma distribution (mean 1, variance 1 / (2 ``shape``) of each of 8 replicates). The
+    estimate is the relMSE in the mean where that is 1.6 % (second order: below 3 %), and up to twice where it
+    is 12 %."""
     images = np.random.default_rng(1).gamma(2 * shape, 1 / (2 * shape), (8, 100_000))
     truth = ((images.mean(0) - 1) ** 2).mean() / 1.01
     assert 0.97 * truth < replicates(images, 4).error(32, 1.0) < most * truth
@@ -80,11 +79,9 @@ def test_the_estimated_error_is_that_of_skewed_images(shape, most):
     ],
 )
 def test_variance_is_the_spread_over_seeds(rfilter, parameters):
-    """Error bars are worth what they predict. Expected: the estimate, averaged over 32 seeds and the pixels,
-    is the variance of the pixels over these seeds, splats included; both relative to the pixels' squared
-    mean, so that the few at the lamp's rim do not decide alone. Tolerance: 10 %: 32 seeds give each pixel's
-    variance to 25 %, 144 pixels of three partly correlated channels give the mean to 3 %. Statistic: ratio of
-    means."""
+    """Splats included; relative to the pixels' squared mean, so that the few at the lamp's rim do not decide.
+    Tolerance: 10 %: 32 seeds give each pixel's variance to 25 %, 144 pixels of correlated channels the mean
+    to 3 %."""
     target = scene(rfilter)
     integrator = bdpt(**parameters)
     assert integrator.aov_names() == ["variance.R", "variance.G", "variance.B"]
@@ -96,8 +93,7 @@ def test_variance_is_the_spread_over_seeds(rfilter, parameters):
 
 
 def test_error_is_the_relative_error_of_the_image():
-    """Expected: statistics["error"], averaged over 32 seeds, is the relMSE against a long render. Tolerance:
-    15 %: the estimate divides by the noisy mean (some 5 % at this error), the rest as above."""
+    """Tolerance: 15 %: the estimate divides by the noisy mean (some 5 % at this error), the rest as above."""
     target, integrator = scene(), bdpt()
     errors, images = [], []
     for seed in range(32):
@@ -109,8 +105,8 @@ def test_error_is_the_relative_error_of_the_image():
 
 
 def test_the_image_is_as_good_with_it():
-    """Eight short point sequences instead of one. Expected: the mean is that of a render without `variance`
-    (2 %, four standard errors), and all samples count."""
+    """Eight short point sequences instead of one: the same mean (2 %, four standard errors), and all samples
+    count."""
     target = scene()
     integrator = bdpt()
     a = renders(integrator, target, range(8), 100)[..., :3]
@@ -121,8 +117,8 @@ def test_the_image_is_as_good_with_it():
 
 
 def test_schedule_of_replicates():
-    """Expected: eight parts that differ by one sample at most, each counted from 0, the first pass of all
-    with one sample for the scale of roulette; without `variance` one part."""
+    """Eight parts that differ by one sample at most, the first pass of all with one sample for the scale of
+    roulette."""
     settings = bdpt().settings
     steps = schedule.schedule(19, 19, settings, True)
     assert sum(s.size for s in steps) == 19 and [s.of for s in steps if s.last] == [3, 3, 3, 2, 2, 2, 2, 2]
@@ -132,7 +128,6 @@ def test_schedule_of_replicates():
 
 
 def test_interrupted_before_there_is_a_spread():
-    """Expected: with fewer than two replicates the variance is infinite, not a small number."""
     target, integrator = scene(), bdpt(timeout=0.0)
     result = np.array(integrator.render(target, spp=16))
     assert np.isinf(result[..., 3:]).all() and np.isfinite(result[..., :3]).all()
@@ -145,7 +140,6 @@ def test_too_few_samples_are_refused():
 
 
 def test_beside_strategy_images():
-    """Expected: layers of both, the variance first; technique images still add up to the image."""
     target, integrator = scene(), bdpt(layers="strategies,variance")
     names = integrator.aov_names()
     result = np.array(integrator.render(target, spp=32))

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1333,  # top files
 }
-OUTSIDE = {"scripts": 2932, "tests": 29385}
+OUTSIDE = {"scripts": 2932, "tests": 29117}
 MOST_WORDS = 28804
 
 

@@ -43,9 +43,8 @@ def drawn(side, draws, samples: int, seeds: int) -> np.ndarray:
     ],
 )
 def test_draws_of_one_contribution_are_joint(side, first, second):
-    """Expected: n Var of the mean of z z' over n = 64 samples, z one coordinate of each draw, averaged over
-    the coordinates, below 0.4 (independent draws have 1, own shuffles 1.58). Over 2,000 seeds one has a
-    relative deviation of 3 %."""
+    """n Var of the mean of z z' over n = 64 samples, averaged over the coordinates, below 0.4 (independent
+    draws have 1, own shuffles 1.58). Over 2,000 seeds one has a relative deviation of 3 %."""
     a, b = drawn(side, [first, second], 64, 2000)
     products = [((a[..., i] * b[..., j]).mean(axis=1) ** 2).mean() * 64 for i in (0, 1) for j in (0, 1)]
     assert np.mean(products) < 0.4, products
@@ -53,8 +52,7 @@ def test_draws_of_one_contribution_are_joint(side, first, second):
 
 @pytest.mark.parametrize("side", ["camera", "light"])
 def test_draws_of_one_sample_are_independent(side):
-    """Rationale: joint draws share digits. Expected: coordinates of all draws and their signs about 1/2 are
-    uncorrelated. Tolerance: 5 / sqrt(40,000), with 2,016 pairs a chance of 1e-3."""
+    """Joint draws share digits. Tolerance: 5 / sqrt(40,000), with 2,016 pairs a chance of 1e-3."""
     draws = [(purpose, vertex) for purpose in STRATIFIED[side] for vertex in (0, 1, 2, 3)]
     z = drawn(side, draws, 1, 40000)[:, :, 0].transpose(0, 2, 1).reshape(2 * len(draws), -1)
     for values in (z, np.sign(z)):
@@ -64,9 +62,8 @@ def test_draws_of_one_sample_are_independent(side):
 
 
 def test_samples_beyond_the_range_of_32_bits():
-    """1920x1080 pixels at 4,096 samples are 2^33 (mitsuba3 #1353, #1335, #432). Expected: the last pixel's
-    samples have their numbers in the sequence, none is drawn again 2^32 samples before, one in each cell of
-    64 x 64."""
+    """1920x1080 pixels at 4,096 samples are 2^33 (mitsuba3 #1353, #1335, #432): none is drawn again 2^32
+    samples before, one in each cell of 64 x 64."""
     pixels, spp = 1920 * 1080, 4096
     place = batch.Places(SimpleNamespace(camera=None), batch.Batch(pixels - 1, 1, 0, spp), spp)
     slot = dr.arange(mi.UInt32, spp)

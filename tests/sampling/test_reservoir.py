@@ -9,8 +9,8 @@ SIZES = (0.0, 1.0, 0.0, 2.0, 5.0, 0.0)
 
 
 def test_candidates_are_drawn_in_proportion_to_their_size():
-    """Expected: shares of 2^16 evenly spaced numbers, and what is left of these is evenly spaced: in 16 bins.
-    To 1e-3: most pass four decisions in single precision."""
+    """And what is left of the numbers is uniform, in 16 bins. To 1e-3: most pass four decisions in single
+    precision."""
     count = 1 << 16
     u = (dr.arange(mi.Float, count) + 0.5) / count
     total, chosen = mi.Float(0), dr.full(mi.UInt32, len(SIZES), count)

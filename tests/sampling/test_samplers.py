@@ -11,8 +11,8 @@ ROUNDED = {"independent": 5, "stratified": 9, "multijitter": 6, "orthogonal": 9,
 
 @pytest.mark.parametrize("points", ["sobol", "independent"])
 def test_the_sampler_gives_the_number_of_samples_alone(points):
-    """Expected: the same image up to rounding (1e-4: atomic sums have no order), and the sampler's own number
-    with spp=0."""
+    """The same image up to rounding (1e-4: atomic sums have no order), and the sampler's own number with
+    spp=0."""
     images = []
     for kind, rounded in ROUNDED.items():
         scene = mi.cornell_box()

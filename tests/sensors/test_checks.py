@@ -31,12 +31,10 @@ def batch(*views):
 
 
 def distant(**parameters):
-    """A distant sensor."""
     return {"type": "distant", "film": PIXEL, **parameters}
 
 
 def meter(sensor="eye"):
-    """The error about a meter that is on no shape."""
     return rf"irradiance meter '{sensor}' is on no shape; nest it in the shape"
 
 
@@ -91,8 +89,7 @@ LACKING = {
 
 @pytest.mark.parametrize("name", LACKING)
 def test_what_a_sensor_lacks_is_said(name):
-    """With such sensors Mitsuba ends the process, or renders black, NaN or what is not asked for. Expected:
-    an error that names the sensor, what it lacks and what to do."""
+    """With such sensors Mitsuba ends the process, or renders black, NaN or what is not asked for."""
     make, message = LACKING[name]
     scene = mi.load_dict(
         {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}, "eye": make()}
@@ -102,9 +99,8 @@ def test_what_a_sensor_lacks_is_said(name):
 
 
 def test_a_distant_sensor_beside_the_scene_is_refused():
-    """Mitsuba tells the sensors of a scene where it is. Expected: said in words; as a sensor of the scene,
-    also in a batch, it sees the scene from outside: the ball, of reflectance 1/2 under a sky of radiance 1,
-    in both pixels."""
+    """Mitsuba tells the sensors of a scene where it is. As a sensor of the scene, also in a batch, it sees
+    the ball, of reflectance 1/2 under a sky of radiance 1, in both pixels."""
     parts = {"type": "scene", "ball": {"type": "sphere"}, "sky": {"type": "constant"}}
     loose = mi.load_dict(distant(target=[0, 0, 0]))
     with pytest.raises(UnsupportedError, match="not one of the scene's own sensors"):

@@ -22,6 +22,7 @@ T = parts.T
 SPHERE = {"type": "sphere", "center": [0.3, 1.0, 0.5], "radius": 0.3}
 LENSES = {
     "thinlens": lambda: parts.thinlens(0.3, 3.0),
+    "thinlens, default focus": lambda: parts.perspective() | {"type": "thinlens", "aperture_radius": 0.02},
     "thinlens, crop": lambda: parts.thinlens(
         0.3, 3.0, size=32, crop_offset_x=10, crop_offset_y=3, crop_width=16, crop_height=16
     ),
@@ -69,9 +70,8 @@ def column(x):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_rays_are_those_of_mitsuba(name):
-    """Camera rays are made here. Expected: origin, direction and weight of Mitsuba's for the same film
-    position and aperture sample, within 1e-5 of the scene's scale (float32, some ten operations; 2e-4 for
-    meters, from whose shapes its offsets and ours differ), and a camera's length."""
+    """For the same film position and aperture sample, within 1e-5 of the scene's scale (float32, some ten
+    operations; 2e-4 for meters, from whose shapes its offsets and ours differ)."""
     _, sensor, camera, u = prepared(name)
     start = start_of(camera, u)
     uv = camera.region.to_uv(start.position)
@@ -86,10 +86,8 @@ def test_rays_are_those_of_mitsuba(name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_a_join_is_the_ray_back(name):
-    """T = 1 makes the paths that camera subpaths make, with what these state. Expected: a point on a camera
-    ray, joined with the sensor point of that ray, has its film position (where the film has positions) within
-    1e-3 pixels (cameras: 1e-4, float32 at some 30 pixels, times ten), its direction and density within
-    1e-3."""
+    """A point on a camera ray, joined with the sensor point of that ray, has its film position within 1e-3
+    pixels (cameras: 1e-4, float32 at some 30 pixels, times ten), its direction and density within 1e-3."""
     _, _, camera, u = prepared(name)
     start = start_of(camera, u)
     p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
@@ -111,9 +109,7 @@ def test_a_join_is_the_ray_back(name):
 
 @pytest.mark.parametrize("name", [name for name in CAMERAS if "orthographic" not in name])
 def test_splats_do_not_depend_on_where_the_camera_stands(name):
-    """Where a light vertex is seen follows from its direction from the lens point. Expected: the direction of
-    a camera ray, joined with the same point of the lens, gives back the ray's film position within 1e-4
-    pixels, as at the origin. Eight places, since in some of them rounding errors cancel."""
+    """Within 1e-4 pixels, as at the origin. Eight places, since in some of them rounding errors cancel."""
     rng = np.random.default_rng(6)
     for shift in rng.uniform(-1e4, 1e4, (8, 3)):
         part = CAMERAS[name]()
@@ -130,8 +126,7 @@ def test_splats_do_not_depend_on_where_the_camera_stands(name):
 
 @pytest.mark.parametrize("name", [name for name in SENSORS if not name.startswith(("distant", "irrad"))])
 def test_nothing_is_joined_beyond_the_far_plane(name):
-    """Rationale: camera rays end at the far clip plane, and so must what light subpaths add. Expected: a
-    point on a camera ray is joined before its end, at 0.999 of its length, and not at 1.001 of it."""
+    """Points at 0.999 of a camera ray's length are joined, those at 1.001 are not."""
     _, _, camera, u = prepared(name)
     start = start_of(camera, u)
     u_film = camera.region.to_uv(start.position)
@@ -146,10 +141,9 @@ def test_nothing_is_joined_beyond_the_far_plane(name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_importance_integrates_to_the_weight(name):
-    """What a sensor makes of uniform radiance 1 does not depend on the strategy. Expected: the integral of
-    the importance is 1, for a meter pi: over directions, the points being far away and uniform about the
-    sensor; of parallel sensors over a square across their direction. Tolerance: five standard errors, which
-    are below 3 %, plus 2e-3 for points that are not at infinity."""
+    """Uniform radiance 1 gives 1, for a meter pi: over directions, the points being far away and uniform
+    about the sensor; of parallel sensors over a square across their direction. Tolerance: five standard
+    errors, below 3 %, plus 2e-3 for points that are not at infinity."""
     _, sensor, camera, u = prepared(name)
     lens, choice = mi.Point2f(u[2], u[3]), mi.Point2f(u[6], u[7])
     if name in PARALLEL:
@@ -181,11 +175,9 @@ def test_importance_integrates_to_the_weight(name):
 
 @pytest.mark.parametrize("name", AREA)
 def test_an_arrival_is_a_start_in_reverse(name):
-    """T = 0 makes the paths that camera subpaths make, from the other end. Expected: light that comes along a
-    camera ray arrives at its film position (a meter: anywhere on its pixel), and importance times cosine over
-    both densities is the camera subpath's weight; the densities are those of the start, which also states cos
-    / (both densities), and of the join, which states cos / (squared distance, density of z_0). Tolerance:
-    1e-2, twice what offsets from a meter's shape (2e-4) are of a cosine of 0.05."""
+    """Light that comes along a camera ray arrives at its film position, with the densities of the start and
+    of the join, and importance times cosine over both is the start's weight. Tolerance: 1e-2, twice what
+    offsets from a meter's shape (2e-4) are of a cosine of 0.05."""
     scene, _, camera, u = prepared(name)
     start = start_of(camera, u)
     p = start.ray.o + start.ray.d * mi.Float(0.5 + 5 * u[5])
@@ -217,8 +209,7 @@ def test_an_arrival_is_a_start_in_reverse(name):
 
 @pytest.mark.parametrize("name", ["distant, point", "distant, shape", "radiancemeter", "own fisheye"])
 def test_sensors_by_their_rays_alone(name):
-    """Of these nothing but Mitsuba's camera rays is used. Expected: the start is that ray with its weight,
-    the sensor says that it cannot be joined and that it has no area, and why."""
+    """Nothing but Mitsuba's camera rays is used."""
     parts.register_plugins()
     scene = mi.load_dict(parts.open_scene(parts.SENSORS[name]()))
     sensor = scene.sensors()[0]
