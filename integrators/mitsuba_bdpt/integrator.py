@@ -296,10 +296,8 @@ _classes = {}
 def _class_of_variant():
     """Return the plugin's class for the current variant, whose base class allows no second one."""
     apart = ("__dict__", "__weakref__", "__abstractmethods__", "_abc_impl")
-    own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in apart}
-    made = type(mi.SamplingIntegrator)(
-        "BDPTIntegrator", (mi.SamplingIntegrator,), own | {"__doc__": DOCUMENTATION}
-    )
+    own = {k: v for k, v in vars(BDPTIntegrator).items() if k not in apart} | {"__doc__": DOCUMENTATION}
+    made = type(mi.SamplingIntegrator)("BDPTIntegrator", (mi.SamplingIntegrator,), own)
     return BDPTIntegrator.register(made)
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import timedelta
 from io import StringIO
 from typing import TYPE_CHECKING, Any, TextIO
@@ -68,11 +68,12 @@ def readable(number: float) -> str:
     return f"{number:.3g}"
 
 
+@dataclass
 class Display:
     """Shows nothing. ``open_ended``: time or an error ends the render, not its samples."""
 
-    def __init__(self, limit: float | None = None, open_ended: bool = False):
-        self._limit, self._open_ended = limit, open_ended
+    limit: float | None = None
+    open_ended: bool = False
 
     def __call__(self, report: Report) -> None:
         """Show the ``report`` of a pass."""
@@ -81,20 +82,20 @@ class Display:
         """Remove the display."""
 
 
+@dataclass
 class Bar(Display):
     """A bar on a terminal's standard error, or in a notebook; shows nothing elsewhere.
 
     ``console``: another output. The bar disappears after the last pass, and by `close`.
     """
 
-    def __init__(
-        self, limit: float | None = None, open_ended: bool = False, *, console: Console | None = None
-    ):
+    console: Console | None = field(default=None, kw_only=True)
+
+    def __post_init__(self):
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
-        super().__init__(limit, open_ended)
-        console = console or Console(stderr=True)
+        console = self.console or Console(stderr=True)
         columns = BarColumn(), TextColumn("{task.description}")
         # rich draws in notebooks with ipywidgets, which plain Jupyter lacks; `_show_in_cell` replaces it.
         self._in_cell, self._output = console.is_jupyter, None
@@ -108,8 +109,8 @@ class Bar(Display):
         if not self._begun:
             self._bar.start()
             self._begun = True
-        done = share_done(report, self._limit)
-        text = in_words(report, self._limit, self._open_ended)
+        done = share_done(report, self.limit)
+        text = in_words(report, self.limit, self.open_ended)
         self._bar.update(self._task, completed=done, description=text)
         self._bar.refresh()
         if self._in_cell:
@@ -132,35 +133,30 @@ class Bar(Display):
             self._output.update(shown)
 
 
+@dataclass
 class Lines(Display):
     """Lines for a log: elapsed time, samples, share, remaining time.
 
-    The first after `EVERY` seconds, so that short renders print nothing; then after `SHARE` of the elapsed
-    time.
+    The first after ``every`` seconds, so that short renders print nothing; then after `SHARE` of the elapsed
+    time. ``stream``: another output than standard error.
     """
 
-    def __init__(
-        self,
-        limit: float | None = None,
-        open_ended: bool = False,
-        *,
-        stream: TextIO | None = None,
-        every: float = EVERY,
-    ):
-        super().__init__(limit, open_ended)
-        self._stream, self._every = stream or sys.stderr or StringIO(), every  # None without a console
+    stream: TextIO | None = field(default=None, kw_only=True)
+    every: float = field(default=EVERY, kw_only=True)
+
+    def __post_init__(self):
         self._last = time.monotonic()
 
     def __call__(self, report: Report) -> None:
         now = time.monotonic()
-        if now - self._last < max(self._every, SHARE * report.seconds):
+        if now - self._last < max(self.every, SHARE * report.seconds):
             return
         self._last = now
         clock = timedelta(seconds=int(report.seconds))
-        done = share_done(report, self._limit)
-        text = f"{clock} {done:4.0%} {in_words(report, self._limit, self._open_ended)}"
+        done = share_done(report, self.limit)
+        text = f"{clock} {done:4.0%} {in_words(report, self.limit, self.open_ended)}"
         with contextlib.suppress(OSError, ValueError):  # a closed stream must not end the render
-            print(text, file=self._stream, flush=True)
+            print(text, file=self.stream or sys.stderr or StringIO(), flush=True)
 
 
 _DISPLAYS: dict[str, type[Display]] = {"bar": Bar, "lines": Lines, "none": Display}

@@ -192,17 +192,12 @@ def _check_together(settings: Settings):
 
 
 def check_variant(variant: str | None = None):
-    """Raise ``UnsupportedError`` for a scalar or untested variant (default: current)."""
+    """Raise ``UnsupportedError`` for variants (default: current) of other backends than LLVM and CUDA."""
     variant = variant or mi.variant() or "none"
-    if variant.startswith("scalar"):
-        raise UnsupportedError(
-            f"the variant {variant} is scalar; use a vectorised one, for example "
-            "mi.set_variant('llvm_ad_rgb')"
-        )
     if not variant.startswith(("llvm", "cuda")):
         raise UnsupportedError(
-            f"the variant {variant} runs on {variant.partition('_')[0]}, where this method was never "
-            "tried; use a variant of LLVM or CUDA, for example mi.set_variant('llvm_ad_rgb')"
+            f"the variant {variant} is not supported; use one of LLVM or CUDA, for example "
+            "mi.set_variant('llvm_ad_rgb')"
         )
 
 

@@ -69,9 +69,7 @@ class Step:
 
 def schedule(spp: int, longest: int, settings: Settings, small_first: bool) -> list[Step]:
     """Return all passes of a render; ``longest``, ``small_first``: see `pass_sizes`."""
-    parts = [spp]
-    if settings.variance:
-        parts = _replicates(spp, bool(settings.target_error))
+    parts = _replicates(spp, bool(settings.target_error)) if settings.variance else [spp]
     steps = []
     for replicate, part in enumerate(parts):
         done = 0
@@ -107,14 +105,11 @@ def batches(camera: Sensor, first_sample: int, samples: int, settings: Settings)
     """Split a pass into bands of rows, one kernel launch each."""
     limit = _most_samples()
     width, height = (int(x) for x in camera.region.size)
-    rows = (
-        height
-        if settings.spp_per_pass == 0 and width * height * samples <= limit
-        else max(1, min(height, 4 * limit // max(width * samples, 1)))
-    )
-    return [
-        Batch(y * width, min(rows, height - y) * width, first_sample, samples) for y in range(0, height, rows)
-    ]
+    rows = height
+    if settings.spp_per_pass or width * height * samples > limit:
+        rows = max(1, min(height, 4 * limit // max(width * samples, 1)))
+    bands = ((y, min(rows, height - y)) for y in range(0, height, rows))
+    return [Batch(y * width, count * width, first_sample, samples) for y, count in bands]
 
 
 class PassPoints:

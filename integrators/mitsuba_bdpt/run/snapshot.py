@@ -39,18 +39,16 @@ class Progress:
 
     def stored(self) -> dict:
         """Return the fields of all parts as JSON values."""
-        values = {}
-        for part in (self, self.decided, self.work):
-            values |= {f.name: getattr(part, f.name) for f in fields(part)}
-        del values["decided"], values["work"]
-        return values | {"decisions": [decision.record() for decision in self.decided.decisions]}
+        parts = (self, self.decided, self.work)
+        values = {f.name: getattr(part, f.name) for part in parts for f in fields(part)}
+        values["decisions"] = [decision.record() for decision in self.decided.decisions]
+        return {name: value for name, value in values.items() if name not in ("decided", "work")}
 
     @classmethod
     def restored(cls, values: dict) -> Progress:
         """Inverse of `stored`."""
-        values = dict(values)
-        values["decisions"] = tuple(map(Decision.read, values["decisions"]))
-        values["left_out"] = tuple(values["left_out"])
+        decisions = tuple(map(Decision.read, values["decisions"]))
+        values = values | {"decisions": decisions, "left_out": tuple(values["left_out"])}
         for name, part in (("decided", PlannerState), ("work", Work)):
             values[name] = part(**{f.name: values.pop(f.name) for f in fields(part)})
         return cls(**values)
@@ -125,15 +123,11 @@ class Snapshot:
             raise UsageError(
                 f"seed={min(common)} is in both snapshots; joined renders need seeds of their own"
             )
-        spp, work = (
-            self.identity["spp"] + other.identity["spp"],
-            self.progress.work.joined(other.progress.work),
-        )
-        arrays = {
-            name: self.arrays[name] + other.arrays[name]
-            for name in ("camera", "light", "strategies")
-            if name in self.arrays
-        } | {"inverse_threshold": self.arrays["inverse_threshold"]}
+        spp = self.identity["spp"] + other.identity["spp"]
+        work = self.progress.work.joined(other.progress.work)
+        sums = [name for name in ("camera", "light", "strategies") if name in self.arrays]
+        arrays = {name: self.arrays[name] + other.arrays[name] for name in sums}
+        arrays["inverse_threshold"] = self.arrays["inverse_threshold"]
         pairs = zip(halves_of(self.arrays), halves_of(other.arrays), strict=True)
         arrays |= stored(tuple(mine.joined(others) for mine, others in pairs))
         return Snapshot(

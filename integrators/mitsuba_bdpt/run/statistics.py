@@ -35,10 +35,9 @@ class Work:
 
     def joined(self, other: Work) -> Work:
         """Return the work of two merged renders."""
-        counts = {name: n + other.counts[name] for name, n in self.counts.items()}
         names = [f.name for f in fields(self) if f.name != "counts"]
         sums = {name: getattr(self, name) + getattr(other, name) for name in names}
-        return Work(counts, **sums)
+        return Work({name: n + other.counts[name] for name, n in self.counts.items()}, **sums)
 
 
 class Meter:
@@ -80,14 +79,14 @@ class Meter:
             counts = {name: counts[name] + n for name, n in zip(counts, batch, strict=True)}
             self._noted = replace(self._noted, counts=counts)
         for entry in dr.kernel_history():
+            work = self._noted
             if entry["type"] != dr.KernelType.JIT:
                 continue
-            work = self._noted
             if entry["cache_hit"]:  # it is still assembled, which is not counted as compilation
                 self._noted = replace(work, cached=work.cached + 1)
-                continue
-            seconds = work.compile_seconds + (entry["codegen_time"] + entry["backend_time"]) / 1000
-            self._noted = replace(work, compiled=work.compiled + 1, compile_seconds=seconds)
+            else:
+                seconds = work.compile_seconds + (entry["codegen_time"] + entry["backend_time"]) / 1000
+                self._noted = replace(work, compiled=work.compiled + 1, compile_seconds=seconds)
 
     @contextmanager
     def pilot(self):
