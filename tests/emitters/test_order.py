@@ -6,7 +6,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.emitters.order import in_order
+from mitsuba_bdpt.emitters.tables import in_order
 from mitsuba_bdpt.planning.unsampled_light import UnsampledLight
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.transport.photons.aim import Aim

@@ -9,7 +9,7 @@ from internals import bdpt
 from layered import JOINED, LAMPS, check_sum, layers, scene
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.light_groups import LightGroups
-from mitsuba_bdpt.emitters.order import in_order
+from mitsuba_bdpt.emitters.tables import in_order
 from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped

@@ -12,8 +12,7 @@ import numpy as np
 from mitsuba_bdpt.emitters.area import PLAIN
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.infinite import SKY_BINS
-from mitsuba_bdpt.emitters.order import in_order
-from mitsuba_bdpt.emitters.tables import cell_at
+from mitsuba_bdpt.emitters.tables import cell_at, in_order
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.geometry.smooth_meshes import is_flat
 from mitsuba_bdpt.host.jit import evaluated_mode, gc_paused

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from mitsuba_bdpt.emitters.order import in_order
+from mitsuba_bdpt.emitters.tables import in_order
 from mitsuba_bdpt.host.introspection import matrix_of, world_matrix
 
 from .oracle import AREA, DIRECTIONAL, ENVIRONMENT, POSITION

@@ -12,19 +12,19 @@ MOST = {
     "measure": 5588,
     "transport merging guided_emission": 5726,
     "planning": 1731,
-    "emitters": 2230,
+    "emitters": 2209,
     "cli": 1473,
     "media": 1347,
-    "geometry": 1439,
+    "geometry": 1433,
     "image": 1304,
     "files": 872,
     "run": 1101,
     "scene sampling": 775,
-    "host": 706,
+    "host": 713,
     "sensors": 883,
     "": 1322,  # top files
 }
-OUTSIDE = {"scripts": 2932, "tests": 29046}
+OUTSIDE = {"scripts": 2932, "tests": 29045}
 MOST_WORDS = 28804
 
 

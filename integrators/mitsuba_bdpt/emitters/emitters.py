@@ -22,10 +22,9 @@ from ..host.jit import make_parameters_opaque, registered_emitters
 from .group import Context, Group
 from .infinite import contrast
 from .kinds import GROUPS, MITSUBAS, group_of
-from .order import in_order
 from .radiance import BlackEmitters
 from .records import Chosen, Direct, Emission, Factor, Place
-from .tables import Mask, inverse_table
+from .tables import Mask, in_order, inverse_table
 
 
 class Emitters:
@@ -34,7 +33,7 @@ class Emitters:
     Built for each render. Raises ``UsageError`` and ``UnsupportedError`` for emitters for which Mitsuba's own
     sampling and evaluation disagree.
 
-    Properties of the scene's ``count`` emitters, ``objects`` by index (see `order.in_order`):
+    Properties of the scene's ``count`` emitters, ``objects`` by index (see `tables.in_order`):
 
     * ``hittable``, ``unhittable``: camera subpaths can hit one; cannot hit one.
     * ``direct``, ``traced``: next-event estimation, light subpaths can choose one.

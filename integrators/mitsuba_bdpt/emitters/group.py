@@ -27,7 +27,7 @@ class Context:
 class Group:
     """The emitters of a scene that share formulas; made for each render.
 
-    Constructed from ``emitters``, in the order of `order.in_order` with None for those of other groups, and a
+    Constructed from ``emitters``, ordered by `tables.in_order`, with None for those of other groups, and a
     `Context`. A group has the methods of the strategies that its emitters support:
 
     * ``hit_densities(chosen, si, previous, ds)``: camera subpaths hit them (`is_hittable`: each one). ``ds``:

@@ -11,21 +11,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import UsageError, did_you_mean, listed
-from .order import in_order
-
-# Names of the plugins of Mitsuba's emitters, by class.
-PLUGINS = {
-    "AreaLight": "area",
-    "DirectionalArea": "directionalarea",
-    "PointLight": "point",
-    "SpotLight": "spot",
-    "Projector": "projector",
-    "DirectionalEmitter": "directional",
-    "ConstantBackgroundEmitter": "constant",
-    "EnvironmentMapEmitter": "envmap",
-    "SunskyEmitter": "sunsky",
-    "TimedSunskyEmitter": "timed_sunsky",
-}
+from ..host.introspection import plugin_name
+from .tables import in_order
 
 # Value of the parameter that gives each emitter a group, up to this number of emitters.
 AUTO, MOST_OWN = "auto", 8
@@ -116,8 +103,7 @@ def _layer_names(emitters: Sequence[mi.Emitter]) -> list[str]:
     found = {i: name for name, i in own.items()}
     last = Counter({REST: 1} | {emitter_id: 1 for of_one in ids for emitter_id in of_one})
     for i in (i for i in in_order if i not in found):
-        plugin = emitters[i].class_name()
-        base = _layer_name((ids[i] or [PLUGINS.get(plugin, plugin)])[0])
+        base = _layer_name((ids[i] or [plugin_name(emitters[i])])[0])
         name = base
         while name in last:
             last[base] += 1

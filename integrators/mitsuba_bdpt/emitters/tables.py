@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from itertools import accumulate
 from typing import TypeVar
@@ -14,6 +15,26 @@ Record = TypeVar("Record")
 
 # Largest float below 1.
 BELOW_ONE = 1 - 2**-24
+
+
+def in_order(scene: mi.Scene) -> list[mi.Emitter]:
+    """Return the emitters as the scene has them, but those on meshes by the ids, then places, of these.
+
+    The order decides which random numbers choose which emitter. Mitsuba puts the meshes of a file in the
+    order of their addresses in memory, another one in each load, unless loaded with ``optimize=False``.
+    """
+    emitters = scene.emitters()
+    shapes = [emitter.get_shape() for emitter in emitters]
+    slots = [i for i, shape in enumerate(shapes) if shape is not None and shape.is_mesh()]
+    ids = Counter(shapes[i].id() for i in slots)
+
+    def key(i: int) -> tuple:
+        box, name = shapes[i].bbox(), shapes[i].id()
+        return name, *((tuple(box.min), tuple(box.max), str(emitters[i])) if ids[name] > 1 else ())
+
+    for slot, emitter in zip(slots, [emitters[i] for i in sorted(slots, key=key)], strict=True):
+        emitters[slot] = emitter
+    return emitters
 
 
 def rows(emitters, default, row) -> list:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UsageError
-from ..host.introspection import inverse_of, is_instance, matrix_of, named
+from ..host.introspection import inverse_of, is_instance, matrix_of, named, plugin_name
 
 # Relative tolerance, far above single-precision rounding.
 _TOLERANCE = 1e-3
@@ -128,10 +128,8 @@ def check_rotation(emitter: mi.Emitter):
     """Raise ``UsageError`` unless the ``to_world`` of an environment is a rotation."""
     columns = matrix_of(emitter)[:3, :3]
     if not np.allclose(columns.T @ columns, np.eye(3), atol=1e-3):
-        name = emitter.class_name()
-        kind = _PLUGINS.get(name) or name.removesuffix("Emitter").lower()
         raise UsageError(
-            f"to_world of {kind} {named(emitter)} is not a rotation (the lengths of its "
+            f"to_world of {plugin_name(emitter)} {named(emitter)} is not a rotation (the lengths of its "
             f"columns are {_lengths(columns)}); leave out scaling, and give rotate an axis of length 1"
         )
 
@@ -143,16 +141,12 @@ def check_angles(emitter: mi.Emitter):
     with np.errstate(invalid="ignore"):  # non-finite is not close
         keeps = np.allclose(columns.T @ columns, np.eye(3) * scale**2, rtol=0, atol=1e-3 * scale**2)
     if not keeps:
-        plugin, angle = _ANGLES[emitter.class_name()]
+        plugin = plugin_name(emitter)
+        angle = {"projector": "fov", "spot": "cutoff_angle"}[plugin]
         raise UsageError(
             f"to_world of {plugin} {named(emitter)} distorts angles (the lengths of its columns are "
             f"{_lengths(columns)}); leave out scaling and shear, and set {angle} instead"
         )
-
-
-_ANGLES = {"Projector": ("projector", "fov"), "SpotLight": ("spot", "cutoff_angle")}
-
-_PLUGINS = {"EnvironmentMapEmitter": "envmap", "TimedSunskyEmitter": "timed_sunsky"}
 
 
 def _lengths(matrix) -> str:

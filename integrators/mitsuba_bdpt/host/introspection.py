@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from collections.abc import Iterable
 from functools import cache
 
@@ -34,6 +35,12 @@ def named(owner) -> str:
     if of is not None and given_id(of):
         return f"without id {'on shape' if isinstance(of, mi.Shape) else 'with BSDF'} '{of.id()}'"
     return f"without id ({owner.class_name()})"
+
+
+def plugin_name(emitter: mi.Emitter) -> str:
+    """Return the name of an emitter's plugin, from that of its class."""
+    name = re.sub("(Background)?(Emitter|Light)$", "", emitter.class_name()).lower()
+    return {"environmentmap": "envmap", "timedsunsky": "timed_sunsky", "": "emitter"}.get(name, name)
 
 
 def children(owner) -> dict:
