@@ -1,9 +1,10 @@
 """Tables of the documentation's pages, made of the data of the repository.
 
     python scripts/pages.py docs/reports/stress.md    # prints the page with its tables
+    python scripts/pages.py docs/reports/public.md --results results/public
 
 The site of `make docs` has them. In the repository there is nothing between the lines `<!-- report: NAME -->`
-and `<!-- end -->`.
+and `<!-- end -->`, but where the results of a page are not committed.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ from pathlib import Path
 
 import choices
 import goals
+import numpy as np
+import pandas as pd
 import repository
 import scale
 import stress
-from mitsuba_bdpt.measure.report import PARTS, Report
-from mitsuba_bdpt.measure.tables import replace_part
+from mitsuba_bdpt.measure.analysis import Results
+from mitsuba_bdpt.measure.report import Report, efficiency_table, said
+from mitsuba_bdpt.measure.tables import markdown, replace_part
 
 REPORTS = repository.ROOT / "docs" / "reports"
 
@@ -38,8 +42,27 @@ def _recorded(name: str, table: Callable[..., str]) -> str:
     return table(json.loads((REPORTS / f"{name}.json").read_text()))
 
 
+GALLERY, GALLERY_COLUMNS = "../images/gallery", 3  # relative to docs/reports/figures.md
+
+
+def gallery(results: Results) -> str:
+    """Images of all scenes, with the efficiency over the stronger `path`."""
+
+    def figure(scene: str) -> str:
+        lacks = results.path_lacks(scene)
+        return f"{results.against_path(scene)}" + (f"<br>`{results.tracer(scene)}`: {lacks}" if lacks else "")
+
+    cells = [
+        f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
+    ]
+    cells += [""] * (-len(cells) % GALLERY_COLUMNS)
+    first, *rows = np.reshape(cells, (-1, GALLERY_COLUMNS)).tolist()
+    return markdown(pd.DataFrame(rows, columns=first))
+
+
 TABLES: dict[str, Callable[[], str]] = {
-    **{name: lambda part=part: part(benchmark()) for name, part in PARTS.items()},
+    "efficiency": lambda: efficiency_table(benchmark().results),
+    "gallery": lambda: gallery(benchmark().results),
     "goals": lambda: goals.goals_table(benchmark().results),
     "benchmark": lambda: benchmark().text().partition("\n")[2],  # the page has the title
     "scale": partial(_recorded, "scale", scale.tables),
@@ -61,7 +84,13 @@ def main(arguments=None) -> int:
     """Print a page."""
     parser = argparse.ArgumentParser(description="Print a page with its tables.")
     parser.add_argument("page", type=Path)
-    print(filled(parser.parse_args(arguments).page.read_text()))
+    parser.add_argument("--results", type=Path, help="folder of a sweep of which its efficiencies are")
+    options = parser.parse_args(arguments)
+    text = options.page.read_text()
+    if options.results:
+        found = Report.of(repository.PROJECT, options.results).results
+        text = replace_part(text, "efficiency", efficiency_table(found))
+    print(filled(text), end="")
     return 0
 
 

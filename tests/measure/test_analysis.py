@@ -326,14 +326,14 @@ def test_cells_are_numbers_where_nothing_is_wrong():
     sqrt(3); no verdict of so few, or by a reference of few renders, or of a single render."""
     rows = [row(seed=i, tile_means=list((1 + i / 100) * TRUE), variance=0.02) for i in (1, 2, 3)]
     found = results_of(rows)
-    energy = found.surplus("box", "bdpt")
-    assert (energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
+    energy = found.missing("box", "bdpt")
+    assert (-energy.value, energy.high - energy.value) == pytest.approx((0.02, 0.0248), rel=1e-2)
     checks = report.checks_table(found, MADE, {})
     assert "energy +2 % ± 2.5 (fewer than 8 renders of one budget: no verdict), by `path`" in checks
     with pytest.raises(Unavailable, match="the reference has fewer than 8 renders"):
-        results_of(rows, {}).surplus("box", "bdpt")
+        results_of(rows, {}).missing("box", "bdpt")
     with pytest.raises(Unavailable, match="fewer than two renders"):
-        results_of(rows[:1]).surplus("box", "bdpt")
+        results_of(rows[:1]).missing("box", "bdpt")
 
 
 def test_a_reference_of_few_renders_costs_the_bias_check_alone(tmp_path):
@@ -402,11 +402,7 @@ def test_a_report_is_written(results, tmp_path):
     table = results.rows[results.rows["scene"] == "box"].assign(reference_sha256=digest(file))
     table.to_parquet(tmp_path / "rows.parquet")
     (tmp_path / "notes.toml").write_text('box = "why"\n')
-    readme = tmp_path / "TOP.md"
-    readme.write_text(
-        "".join(f"<!-- report: {name} -->\n<!-- end -->\n" for name in ("efficiency", "gallery"))
-    )
-    words = ["report", str(tmp_path), "--readme", str(readme), "--project", str(tmp_path)]
+    words = ["report", str(tmp_path), "--project", str(tmp_path)]
     options = build_parser().parse_args(words)
     (tmp_path / "README.md").write_text("# Mine\n")
     with pytest.raises(CommandError, match="README.md' exists and was made by something else; move it away"):
@@ -416,17 +412,6 @@ def test_a_report_is_written(results, tmp_path):
     page = (tmp_path / "README.md").read_text()
     assert "* `box`: why" in page
     assert cells(page.partition("## References")[2], "`box`") == ["3", "`path`", "4096", "0.0e+00", "0.04"]
-    assert cells(readme.read_text(), "`box`")[0] == "2x (2–2)"
-    found = Report.of(Project(tmp_path), tmp_path)
-    for text, message in (
-        ("<!-- report: nothing -->\n<!-- end -->\n", "there is no part 'nothing'; there are efficiency"),
-        ("# Mine\n", "TOP.md has no `<!-- report: NAME -->`"),
-    ):
-        readme.write_text(text)
-        with pytest.raises(CommandError, match=message):
-            report._filled(readme, found)
-    readme.write_text("<!-- report: errors -->\n<!-- end -->\n<!-- report: first images -->\n<!-- end -->\n")
-    assert " squared bias " in report._filled(readme, found)
     for name in ("efficiency", "seconds", "samples", "rays"):
         assert (tmp_path / f"{name}.png").stat().st_size > 5000
         assert f"({name}.png)" in page

@@ -15,6 +15,7 @@ from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.estimates import RelativeError
 from mitsuba_bdpt.measure.metrics import Estimate
+from mitsuba_bdpt.measure.results import image_file
 
 METHODS = ("bdpt", "path", "path multijitter", "bdpt skip=none", "an integrator with a long name of its own")
 KNOWN = Means.known(np.full((4, 4, 3), 2.0))
@@ -59,13 +60,13 @@ def results(scenes=("a_caustic_with_a_long_name", "b")):
 def block(count, height=48, width=32, title="a_caustic_with_a_long_name"):
     """Images of a bright, noisy window at the bottom right, the noisier the earlier, and their reference."""
     rng, target = np.random.default_rng(1), np.full((height, width, 3), 0.5)
-    columns = []
+    shots = []
     for i in range(count):
         image = target + 0.01 * rng.standard_normal(target.shape)
         image[-12:, -12:] += (count - i) * rng.exponential(0.5, (12, 12, 3))
         error = RelativeError(Estimate(0.01234, 0.01, 0.02), "≤", 8)
-        columns.append(crops.judged(METHODS[i], 64, 1.234, error, image, target))
-    return crops.Block(title, tuple(columns), target)
+        shots.append(crops.Shot(METHODS[i], 64, 1.234, image, error))
+    return crops.Block(title, shots, target)
 
 
 def saved(monkeypatch, module):
@@ -78,7 +79,7 @@ def saved(monkeypatch, module):
 
 def test_windows_lie_where_errors_differ():
     made = block(2)
-    (left, top, side), (left2, top2, _) = crops.windows(made.columns[0].errors, made.columns[1].errors)
+    (left, top, side), (left2, top2, _) = crops.windows(made.errors(0), made.errors(1))
     assert side == 5 and left >= 20 - 1 and top >= 36 - 1
     assert abs(left - left2) >= 2 * side or abs(top - top2) >= 2 * side
     large = np.full((60, 60), 1e-3)
@@ -102,19 +103,18 @@ def test_crops_are_of_the_sweep(tmp_path):
     with pytest.raises(CommandError, match="no image of b is there; run the sweep again"):
         figures.cropped(tmp_path, found, kept, "b")
     for method, value in (("bdpt", 1.5), ("path", 2.0)):
-        (tmp_path / "images" / "b").mkdir(parents=True, exist_ok=True)
-        middle = found.of("b", method, 64).set_index("seed")["rel_mse_trimmed"].sort_values().index[3]
-        write_layers(tmp_path / "images" / "b" / f"{method}{middle}.exr", {"": np.full((8, 8, 3), value)}, {})
+        shown = found.of("b", method, 64).sort_values("rel_mse_trimmed").iloc[3]
+        write_layers(image_file(tmp_path, shown), {"": np.full((8, 8, 3), value)}, {})
     made = figures.cropped(tmp_path, found, kept, "b")
-    assert [one.caption for one in made.columns] == [
-        ("path", "64\u00a0spp, 0.64\u00a0s", f"relMSE ≥ {mean('path') - 0.004:.2g} (trimmed)"),
-        ("bdpt", "64\u00a0spp, 0.64\u00a0s", f"relMSE {mean('bdpt') - 0.004:.2g} (trimmed)"),
+    assert [one.caption for one in made.shots] == [
+        f"path\n64 spp, 0.64 s\nrelMSE ≥ {mean('path') - 0.004:.2g} (trimmed)",
+        f"bdpt\n64 spp, 0.64 s\nrelMSE {mean('bdpt') - 0.004:.2g} (trimmed)",
     ]
     assert f" {mean('bdpt') - 0.004:.2e} (" in report.errors_table(found).splitlines()[2]
-    np.testing.assert_allclose(made.columns[1].errors, 0.25 / 1.01, rtol=1e-3)
+    np.testing.assert_allclose(made.errors(1), 0.25 / 1.01, rtol=1e-3)
     rows = found.rows.assign(match=np.where(found.rows["method"] == "path", "spp", "seconds"))
     made = figures.cropped(tmp_path, replace(found, rows=rows), kept, "b")
-    assert [one.caption[0] for one in made.columns] == ["path (equal spp)", "bdpt"]
+    assert [one.name for one in made.shots] == ["path (equal spp)", "bdpt"]
 
 
 ALL = {"scenes": None, "integrators": None, "spp": None, "windows": None}

@@ -22,23 +22,13 @@ def pixel(r, g, b):
     return np.array([[[r, g, b]]], dtype=np.float64)
 
 
-# Mean 2, so eps of relMSE is 0.01 * 4 = 0.04 and eps1 of the MAPE 0.01 * 2 = 0.02.
-REFERENCE, IMAGE = row(0, 2, 4), row(0.2, 3, 2)
-
-
-@pytest.mark.parametrize(
-    ("measure", "expected"),
-    [
-        (metrics.mse, (0.2**2 + 1 + 2**2) / 3),
-        (metrics.rel_mse, (1 + 1 / 4.04 + 4 / 16.04) / 3),
-        (metrics.mape, (10 + 1 / 2.02 + 2 / 4.02) / 3),
-    ],
-)
-def test_measures_of_three_pixels(measure, expected):
+def test_relative_errors_of_three_pixels():
+    """Mean 2, so eps is 0.01 * 4 = 0.04; scaling both images changes nothing."""
+    reference, image = row(0, 2, 4), row(0.2, 3, 2)
     for factor in (1, 1e3):
-        found = measure(factor * IMAGE, factor * REFERENCE)
-        assert found == pytest.approx(expected * (factor**2 if measure is metrics.mse else 1), rel=1e-12)
-    assert measure(REFERENCE, REFERENCE) == 0
+        found = metrics.rel_mse(factor * image, factor * reference)
+        assert found == pytest.approx((1 + 1 / 4.04 + 4 / 16.04) / 3, rel=1e-12)
+    assert metrics.rel_mse(reference, reference) == 0
     # Mean of (0, 3, 6) is 3; per channel it would be (0, 0.09, 0.36).
     assert metrics.rel_mse_epsilon(pixel(0, 3, 6)) == pytest.approx(0.09, rel=1e-12)
 
@@ -75,15 +65,11 @@ def test_the_spread_of_renders():
 
 
 def test_tone_map():
-    """x = 0.25 at one stop is 0.5: 1.055 * 0.5^(1/2.4) - 0.055 = 1.055 * 0.749154 - 0.055 = 0.735357.
-
-    0.0005 becomes 0.001 and 12.92 * 0.001; what is outside [0, 1] after the exposure is clipped, so 0.6
-    is white at one stop.
-    """
+    """x = 0.25 at one stop is 0.5: 1.055 * 0.5^(1/2.4) - 0.055 = 0.735357; 0.0005 becomes 12.92 * 0.001; what
+    is outside [0, 1] after the exposure is clipped, so 0.6 is white. The exposure of 0.45 is one stop."""
     shown = metrics.tone_map(row(0.25, 0.0005, 0.6, -1), 1)
     assert shown == pytest.approx(row(0.735357, 0.01292, 1, 0), abs=1e-6)
-    assert metrics.tone_map(row(0.5), 0) == pytest.approx(row(0.735357), abs=1e-6)
-    assert metrics.tone_map(row(0.25), -1)[0, 0, 0] == pytest.approx(1.055 * 0.125 ** (1 / 2.4) - 0.055)
+    assert metrics.exposure_of(row(*[0.1] * 50, *[0.45] * 50)) == pytest.approx(1)
 
 
 def pq(luminance):
@@ -101,22 +87,17 @@ def test_delta_e_itp():
     assert metrics.delta_e_itp(pixel(0, 0, 0), pixel(1, 1, 1)) == pytest.approx(365.816, abs=0.01)
     expected = 720 * (pq(50.0) - pq(25.0))
     assert metrics.delta_e_itp(row(0.25), row(0.5)) == pytest.approx(expected, rel=1e-3)
-    assert metrics.delta_e_itp(row(0.5), row(1), -1) == pytest.approx(expected, rel=1e-3)
     assert metrics.delta_e_itp(row(2, 3, 0.5), row(7, 1, 0.5)) == pytest.approx(0, abs=1e-9)  # above white
-    assert metrics.delta_e_itp(row(0.25), row(0.5), white=200) == pytest.approx(720 * (pq(100.0) - pq(50.0)))
 
 
 def test_hdr_flip():
     """The values of a fixed pair are those of the package's own command `flip` 1.7; the reference decides the
     exposures, so the order matters, and scaling both images changes nothing."""
     for factor in (1, 1e3):
-        there, back = (
-            metrics.hdr_flip(row(0.5 * factor), row(factor)),
-            metrics.hdr_flip(row(factor), row(0.5 * factor)),
-        )
-        assert there[0] == pytest.approx(0.232887, abs=1e-4) and back[0] == pytest.approx(0.144833, abs=1e-4)
-    mean, error = metrics.hdr_flip(np.ones((64, 96, 3)), np.ones((64, 96, 3)))
-    assert mean == 0 and error.shape == (64, 96) and not error.any()
+        half, whole = row(0.5 * factor), row(factor)
+        assert metrics.hdr_flip(half, whole) == pytest.approx(0.232887, abs=1e-4)
+        assert metrics.hdr_flip(whole, half) == pytest.approx(0.144833, abs=1e-4)
+        assert metrics.hdr_flip(whole, whole) == 0
 
 
 def test_hdr_flip_refuses_what_ends_the_process():
@@ -137,9 +118,7 @@ metrics.hdr_flip(dark, gray)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-@pytest.mark.parametrize(
-    "measure", [metrics.mse, metrics.rel_mse, metrics.mape, metrics.delta_e_itp, metrics.hdr_flip]
-)
+@pytest.mark.parametrize("measure", [metrics.rel_mse, metrics.delta_e_itp, metrics.hdr_flip])
 def test_bad_images_are_refused(measure):
     good, bad = np.ones((2, 4, 3)), np.ones((2, 4, 3))
     bad[1, 2, 0] = np.nan
@@ -147,18 +126,12 @@ def test_bad_images_are_refused(measure):
         ((bad, good), r"image holds 1 values that are NaN or infinite, the first at index \[1, 2, 0\]; find"),
         ((good, -np.inf * good), "reference holds 24 values that are NaN or infinite"),
         ((np.ones((4, 2, 3)), good), r"image has shape \(4, 2, 3\) and reference \(2, 4, 3\); render"),
-        ((np.ones((2, 4, 4)), good), r"image has shape \(2, 4, 4\).*drop other channels"),
         ((good, np.ones((4, 3))), r"reference has shape \(4, 3\)"),
-        ((np.ones((2, 4, 3), dtype=np.uint8), good), "image has values of type uint8; give linear radiance"),
     ):
-        with pytest.raises((ValueError, TypeError), match=why):
+        with pytest.raises(CommandError, match=why):
             measure(*pair)
-
-
-@pytest.mark.parametrize("measure", [metrics.rel_mse, metrics.mape])
-def test_black_references_are_refused(measure):
-    with pytest.raises(ValueError, match="reference has mean 0.*use mse"):
-        measure(np.ones((2, 2, 3)), np.zeros((2, 2, 3)))
+    with pytest.raises(CommandError, match="reference has mean 0"):
+        metrics.rel_mse(good, 0 * good)
 
 
 def test_what_the_reference_adds():
@@ -215,12 +188,10 @@ def renders(seed, count=16, shape=(8, 8, 3), mean=1.0):
 
 
 def means_of(runs, tiles=agreement.TILES):
-    """Means for a bias check of renders."""
     return agreement.Means.of([agreement.tile_columns(run, tiles) for run in runs])
 
 
 def bias_check(images, references, tiles=agreement.TILES, significance=agreement.SIGNIFICANCE):
-    """The check of two sets of renders."""
     return agreement.compare_means(means_of(images, tiles), means_of(references, tiles), significance)
 
 
@@ -268,16 +239,12 @@ def test_the_interval_of_the_energy(count, ratio):
     """95 % or more, for few renders whose mean has from a tenth to 100 times the variance of that of 8
     renders of the reference. 2000 cases: to 4 standard errors."""
     rng, cases = np.random.default_rng(1), 2000
-    spread = 0.01 * math.sqrt(count / 8 * ratio)
-    ours, theirs = (
-        1 + spread * rng.standard_normal((cases, count)),
-        1 + 0.01 * rng.standard_normal((cases, 8)),
-    )
-    held = 0
-    for image, reference in zip(ours, theirs, strict=True):
-        found = agreement.missing_energy(*(Sample.of(side[:, None]) for side in (image, reference)))
-        held += found.low <= 0 <= found.high
-    assert held / cases > 0.95 - 4 * math.sqrt(0.95 * 0.05 / cases)
+    ours = 1 + 0.01 * math.sqrt(count / 8 * ratio) * rng.standard_normal((cases, count, 1))
+    theirs = 1 + 0.01 * rng.standard_normal((cases, 8, 1))
+    pairs = zip(map(Sample.of, ours), map(Sample.of, theirs), strict=True)
+    found = [agreement.missing_energy(*pair) for pair in pairs]
+    held = np.mean([one.low <= 0 <= one.high for one in found])
+    assert held > 0.95 - 4 * math.sqrt(0.95 * 0.05 / cases)
 
 
 def test_bias_check_of_a_black_image():
@@ -327,8 +294,7 @@ def test_bias_check_refuses():
 def test_slope():
     """x = log 2 * (0, 1, 3), two runs at the first count and the last, four in the middle.
 
-    In units of log 2: mean x = (2 * 0 + 4 * 1 + 2 * 3) / 8 = 1.25, offsets -1.25, -0.25, 1.75,
-    sum of squares 2 * 1.5625 + 4 * 0.0625 + 2 * 3.0625 = 9.5. Mean logs 0, -2, -3:
+    In units of log 2: mean x = 1.25, offsets -1.25, -0.25, 1.75, sum of squares 9.5. Mean logs 0, -2, -3:
     (2 * 0 + 4 * 0.25 * 2 - 2 * 1.75 * 3) / 9.5 = -8.5 / 9.5.
     """
     errors = {1: [0.5, 2], 2: [0.25, 0.25, 0.125, 0.5], 8: [0.125, 0.125]}

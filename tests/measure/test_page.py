@@ -116,9 +116,9 @@ def test_the_page_in_a_browser(tmp_path):
     noise[::2] = 1.0
     scenes = [fake_scene("cornell_box", bdpt=grey, path=half, reference=grey + noise)]
     rows = [
-        ["cornell_box", "bdpt", 64, 5, 64, 0.5, 1e-3, 1e-3, 0.1, None, 0.2],
-        ["cornell_box", "path", 64, 5, 90, 0.25, [1e-2, "≥"], 1e-2, 0.1, 0.3, 0.2],
-        ["open_sky </script>", "bdpt", 64, 5, 64, 0.125, 1e-3, 1e-3, 0.1, None, 0.2],
+        ["cornell_box", "bdpt", 64, 5, 64, 0.5, 1e-3, 1e-3, None, 0.2],
+        ["cornell_box", "path", 64, 5, 90, 0.25, [1e-2, "≥"], 1e-2, 0.3, 0.2],
+        ["open_sky </script>", "bdpt", 64, 5, 64, 0.125, 1e-3, 1e-3, None, 0.2],
     ]
     seen = opened(written(tmp_path, rows, scenes))
     assert seen["errors"] == [] and seen["outside"] == [] and seen["unlabelled"] == 0

@@ -11,7 +11,6 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import mitsuba as mi
 import numpy as np
@@ -26,18 +25,15 @@ from mitsuba_bdpt.files import whole
 from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import (
-    agreement,
     limited,
     making,
     metrics,
     reference,
     report,
-    scenes,
     showing,
     sweep,
 )
 from mitsuba_bdpt.measure.making import Job
-from mitsuba_bdpt.measure.models import PresetFile
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.results import cell_file, errors, image_file, keep_missing, missing_of, write_tables
@@ -139,211 +135,6 @@ def preset_file(folder, text=PRESET):
     return path
 
 
-# -- references -------------------------------------------------------------------------------
-
-
-def test_a_reference_comes_back_with_its_error_and_provenance(project, job):
-    """Half precision: 2^-11 relative; its own error is 0.9 % of that of `bdpt` with 4 samples."""
-    made, reached = making.make(job(2))
-    assert reached
-    kept = reference_of(project, 2)
-    np.testing.assert_allclose(kept.image, made.image, rtol=2.0**-11, atol=1e-6)
-    assert kept.error == pytest.approx(made.error, rel=0.05)
-    scene = REPOSITORY.scene("cornell_box").load(8)
-    ours = mi.load_dict({"type": "bdpt", "max_depth": 2})
-    image = np.array(mi.render(scene, integrator=ours, spp=4, seed=0))[..., :3]
-    assert 0 < made.error <= 0.009 * metrics.rel_mse(image, made.image)
-    assert kept.means.columns.freedom >= 7
-    np.testing.assert_allclose(kept.means.columns.mean, agreement.tile_columns(kept.image), rtol=2e-3)
-    np.testing.assert_allclose(kept.means.whole.error, made.means.whole.error, rtol=1e-6)
-    assert kept.provenance["integrator"] == {"type": "path", "max_depth": 2}
-    assert kept.provenance["spp"] % 128 == 0 and kept.provenance["versions"]["mitsuba"].startswith("3.9")
-
-
-def test_furnaces_are_known_without_error(project, job):
-    making.make(job(3, "furnace_emission"))
-    kept = reference_of(project, 3, "furnace_emission")
-    assert (kept.image == 0.875).all() and kept.error == 0
-    assert (kept.means.columns.error == 0).all() and kept.means.columns.freedom == np.inf
-    assert kept.provenance["integrator"] == "known answer"
-
-
-def test_halves_estimate_the_error_of_their_mean():
-    """Of halves r + e and r - e the error is that of r + e against r: e^2 / (r^2 + 0.01 r^2)."""
-    halves = making.Halves("box")
-    r, e = np.full((4, 4, 3), 2.0), 0.1
-    for _ in range(4):
-        halves.add([r + e, r - e])
-    made = halves.reference({})
-    assert made.error == pytest.approx(e**2 / (4 * 1.01))
-    assert made.means.columns.error == pytest.approx(e / np.sqrt(7))
-    with pytest.raises(CommandError, match="box: round 4 has values that are not finite"):
-        halves.add([r, np.full((4, 4, 3), np.inf)])
-    assert halves.rounds == 4 and np.isfinite(halves.sums).all()
-
-
-def test_windows_of_halves_have_more_samples():
-    halves = making.Halves("box")
-    for value in (1.0, 3.0):
-        halves.add([np.full((4, 4, 3), value)] * 2)
-    halves.add([np.full((2, 1, 3), 5.0), np.full((2, 1, 3), 9.0)], (slice(1, 3), slice(0, 1)), 4)
-    made = halves.reference({})
-    expected, half = np.full((4, 4, 3), 2.0), np.zeros((4, 4, 3))
-    expected[1:3, 0:1], half[1:3, 0:1] = (2 * 2 + 4 * 7) / 6, (4 * 5 - 4 * 9) / 6 / 2
-    np.testing.assert_allclose(made.image, expected)
-    np.testing.assert_allclose(made.difference, half)
-    assert halves.rounds == 3 and len(halves.columns) == 4
-    assert halves.counts.min() == 2 and halves.counts.max() == 6
-
-
-def test_a_run_goes_on_from_the_stored_reference(folder):
-    """Up to half precision (2^-11 of a value)."""
-    rng = np.random.default_rng(3)
-    halves, window = making.Halves("box"), (slice(0, 4), slice(4, 8))
-    for _ in range(agreement.FEWEST_RUNS):
-        halves.add(rng.uniform(1, 2, (2, 16, 16, 3)))
-    halves.add(rng.uniform(1, 2, (2, 4, 4, 3)), window, 4)
-    spp = {name: round(2 * making.PASS_SPP * count) for name, count in (("spp", 8), ("spp_in_windows", 12))}
-    reference.write(folder / "a.exr", halves.reference(spp | {"sources": ["x"]}))
-    again = making.Halves("box")
-    again.go_on_from(reference.read_reference(folder / "a.exr"), [window])
-    np.testing.assert_allclose(again.counts, halves.counts)
-    assert again.rounds >= halves.rounds and "x" in again.sources
-    more = rng.uniform(1, 2, (agreement.FEWEST_RUNS, 2, 16, 16, 3))
-    for images in more:
-        halves.add(images)
-        again.add(images)
-    np.testing.assert_allclose(again.sums, halves.sums, rtol=2**-10)
-    for name in ("mean", "error", "nonzero", "freedom"):
-        for part in ("columns", "whole"):
-            ours, theirs = (getattr(getattr(h.means(), part), name) for h in (again, halves))
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-
-
-def test_windows_cover_the_glass_and_show_the_same():
-    """Depths, which range over 2, agree to 0.02 on average (random positions at the outlines)."""
-    job = Job(REPOSITORY, REPOSITORY.scene("glass_caustics"), 64)
-    scene = REPOSITORY.scene("glass_caustics").load(64)
-    windows = [
-        making.Window(job, share, making.SAMPLER)
-        for share in making.recipe_of(REPOSITORY, "glass_caustics").windows
-    ]
-    inside = np.zeros((64, 64), bool)
-    for window in windows:
-        inside[window.slices] = True
-    assert inside.mean() < 0.2
-    y, x = np.mgrid[:64, :64]
-    at = mi.Point2f((x.ravel() + 0.5).tolist(), (y.ravel() + 0.5).tolist()) / 64
-    ray, _ = scene.sensors()[0].sample_ray(0, 0.5, at, 0.5)
-    si = scene.ray_intersect(ray)
-    delta = np.array(mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Delta)).reshape(64, 64)
-    assert delta.sum() > 200 and not (delta & ~inside).any()
-    depth, window = mi.load_dict({"type": "depth"}), windows[0]
-    whole = np.array(depth.render(scene, spp=256))[window.slices]
-    part = np.array(depth.render(window.scene, spp=256))
-    assert part.shape == whole.shape and part.std() > 0.1
-    assert np.abs(part - whole).mean() < 0.02
-
-
-def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
-    render, count = making.mi.render, iter(range(99))
-
-    def interrupted(*args, **more):
-        if next(count) == 6:  # two that are timed and two rounds
-            raise KeyboardInterrupt
-        return render(*args, **more)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(making.mi, "render", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            making.obtained(job(2, seconds=0, by="bdpt"))
-    assert reference_of(project, 2).provenance["spp"] == 16 and job(2).is_missing
-    assert making.obtained(job(2, seconds=0, by="bdpt")).provenance["spp"] == 48
-    assert not job(2).is_missing
-
-
-def test_a_reference_has_the_samples_that_fit(project, job, capsys, monkeypatch):
-    """Of 266 s 236 remain after measuring: 80 % hold eight renders of 16 samples, the rest six more."""
-    clock, seen = [0.0], []
-    render, name = making.mi.render, "cornell_box"
-
-    def rendered(scene, *, spp, seed, **more):
-        clock[0] += spp + (0 if seen else 10)
-        seen.append((seed, spp))
-        return render(scene, spp=1, seed=seed, **more)
-
-    monkeypatch.setattr(making, "time", SimpleNamespace(perf_counter=lambda: clock[0]))
-    monkeypatch.setattr(making.mi, "render", rendered)
-    made = making.obtained(job(2, seconds=266.0, spp=64))
-    assert [spp for _, spp in seen] == [4, 16, *[16] * 14] and clock[0] <= 266
-    assert made.provenance["spp"] == 224 and made.means.columns.freedom == 13
-    assert "as many as fit into 266 s; to go on: mitsuba-bdpt reference" in capsys.readouterr().out
-    made, _ = making.make(job(2, seconds=1))
-    assert made.means.columns.freedom == 13
-    seeds = [seed for seed, n in seen[2:] if seed >= making.FIRST_SEED]
-    assert len(seeds) == len({*seeds}) == 16
-    seen.clear()
-    path = reference.reference_path(project, name, 8, 3)
-    making.obtained(job(3, seconds=20.0))
-    assert [spp for _, spp in seen] == [4, 16, *[4] * 8] and path.is_file()
-    out = capsys.readouterr().out
-    assert "warning: cornell_box: 20 s are too few for its reference, which takes about 62 s" in out
-
-
-def test_a_reference_on_the_way_is_as_good_as_errors_need(job, monkeypatch):
-    """Renders have a 32nd of their samples here, and take 10 ms per sample."""
-    seen, render = [], making.mi.render
-
-    def rendered(scene, *, spp, seed, **more):
-        seen.append(spp)
-        return render(scene, spp=max(spp // 32, 1), seed=seed, **more)
-
-    monkeypatch.setattr(making, "time", SimpleNamespace(perf_counter=lambda: sum(seen) / 100))
-    monkeypatch.setattr(making.mi, "render", rendered)
-    made = making.obtained(job(2, spp=64, by="bdpt"))
-    assert seen[:10] == [4, 16, *[128] * 8] and seen.count(128) == made.means.columns.freedom + 1 < 64
-    assert made.provenance["share"] == making.SUBTRACTED_SHARE
-    assert making.make(job(2, spp=64, by="bdpt"))[0].provenance["spp"] > 4 * made.provenance["spp"]
-
-
-def test_a_better_reference_stays(project, job):
-    made, _ = making.make(job(2))
-    stored = replace(made, provenance=made.provenance | {"sampler": "another"})
-    reference.write(reference.reference_path(project, "cornell_box", 8, 2), stored)
-    kept, reached = making.make(job(2, seconds=0))
-    assert not reached and kept.provenance["spp"] == stored.provenance["spp"]
-    assert reference_of(project, 2).provenance["spp"] == stored.provenance["spp"]
-    assert making.make(job(2))[1]
-
-
-def test_a_reference_with_merging_replaces_one_without(project, job):
-    name = "lamp_behind_glass"
-    plain, _ = making.make(job(5, name, by="bdpt"))
-    assert not plain.merged and not reference_of(project, 5, name).merged
-    made, reached = making.make(job(5, name, seconds=0))
-    assert not reached and made.merged and made.error > plain.error
-    assert reference_of(project, 5, name).merged
-
-
-def test_references_that_half_precision_cannot_hold_are_refused(folder):
-    too_bright = reference.Reference(np.full((4, 4, 3), 1e5), np.zeros((4, 4, 3)), None, {})
-    with pytest.raises(ValueError, match="radiance 100000 does not fit into half precision"):
-        reference.write(folder / "bright.exr", too_bright)
-
-
-def test_missing_and_stale_references_are_refused(monkeypatch, project, job):
-    command = "mitsuba-bdpt reference cornell_box --resolution 8 --max-depth 2 --seconds 600 "
-    command += f"--project {project.root}"
-    with pytest.raises(ValueError, match=f"no reference.*{command}"):
-        reference_of(project, 2)
-    making.make(job(2, seconds=0))
-    monkeypatch.setattr(scenes.SceneFile, "sha256", "another file")
-    with pytest.raises(ValueError, match=f"another cornell_box, mesh or texture; {command}"):
-        reference_of(project, 2)
-    with pytest.raises(ValueError, match="scene='nowhere' is neither a scene file nor the name of one"):
-        project.scene("nowhere")
-
-
 # -- sweeps -----------------------------------------------------------------------------------
 
 
@@ -414,15 +205,6 @@ def test_equal_time_by_a_clock(folder, monkeypatch, known, swept):
     assert len(list((output / "ratios").glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "references").glob("*.exr")), ids=lambda path: path.stem)
-def test_committed_references_are_of_their_scenes(path):
-    kept = reference.header_of(path)
-    name, resolution, _ = path.stem.rsplit("_", 2)
-    assert resolution == "128" and kept["scene_sha256"] == REPOSITORY.scene(name).sha256
-    assert kept.get("spp_per_render", making.PASS_SPP) == making.PASS_SPP
-    assert kept.get("share", making.REFERENCE_SHARE) == making.REFERENCE_SHARE
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device that is always full")
 def test_a_full_disk_leaves_the_old_image(folder):
     file = folder / "image.exr"
@@ -432,35 +214,6 @@ def test_a_full_disk_leaves_the_old_image(folder):
     with pytest.raises(OSError, match="could not be written whole .*; is the disk full.*image.exr"):
         write_layers(file, {"": np.random.default_rng(0).random((256, 256, 3))}, {})
     assert file.read_bytes() == before and not list(folder.glob(".*"))
-
-
-def test_the_command_line_of_references_tells_what_failed(folder, capsys, project):
-    def run(*arguments):
-        return making.run(build_parser().parse_args(["reference", "--project", str(folder), *arguments]))
-
-    small = ("--resolution", "8", "--max-depth", "2", "--spp", "4")
-    assert run("nowhere", "furnace_point", *small) == 1
-    out = capsys.readouterr().out
-    assert "nowhere: failed: scene='nowhere' is neither" in out and "furnace_point: known answer" in out
-    assert run("cornell_box", *small, "--seconds", "0") == 1
-    assert "to go on: mitsuba-bdpt reference" in capsys.readouterr().out
-    assert run("cornell_box", *small) == 0
-    for wrong in (("--spp", "0"), ("--resolution", "50"), ("--max-depth", "0")):
-        with pytest.raises(SystemExit):
-            run("cornell_box", *wrong)
-
-
-def test_a_reference_is_of_the_depth_that_presets_ask_for(monkeypatch, project, job):
-    depths = []
-    monkeypatch.setattr(making, "_rendered", lambda job, recipe: (depths.append(job.depth), True))
-    monkeypatch.setattr(making, "write", lambda path, made: None)
-    for name in ("cornell_box", "pool"):
-        making.make(job(None, name))
-    preset = read_preset(project.preset("benchmark"), project, ["cornell_box", "pool"])
-    assert depths == [cells.max_depth for cells in preset.cells]
-    assert depths[0] != project.scene("cornell_box").max_depth
-    file = PresetFile.model_validate({"max_depth": 3, "scene": {"pool": {"max_depth": 4}}})
-    assert [file.depth(name, 9) for name in ("pool", "cornell_box")] == [4, 3]
 
 
 def test_a_failing_cell_does_not_cost_the_others(folder, capsys, known, monkeypatch, swept):
@@ -585,7 +338,6 @@ def test_rivals_are_those_that_see_the_media():
         assert has_media == (cells.scene.name in ("fog_lamp", "skin_ball", "cloud_sky"))
         assert tracers[has_media] <= rendered and not tracers[not has_media] & rendered
         assert set(path_tracers(has_media)) <= tracers[has_media]
-        assert making._way(cells.scene, "path") == {"type": path_tracers(has_media)[0]}
 
 
 def test_three_lines_are_a_preset(tmp_path):

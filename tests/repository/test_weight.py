@@ -9,11 +9,11 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5588,
+    "measure": 5320,
     "transport merging guided_emission": 5726,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1473,
+    "cli": 1472,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1322,  # top files
 }
-OUTSIDE = {"scripts": 2932, "tests": 29045}
-MOST_WORDS = 28804
+OUTSIDE = {"scripts": 2961, "tests": 29003}
+MOST_WORDS = 28806
 
 
 def _lines(files):

@@ -86,7 +86,6 @@ COMMANDS: dict[str, tuple] = {
         "report",
         options.Report,
         _FOLDER,
-        ("--readme", {"type": Path, "help": "a Markdown file whose parts are filled"}),
     ),
     "figure": (
         "a figure of a sweep for a paper, as PDF, SVG or PNG",

@@ -18,20 +18,14 @@ from scipy import stats
 from ..errors import CommandError
 from .metrics import CONFIDENCE, Estimate
 
-# Relative differences of tile means up to this are attributed to float32 rounding.
-ROUNDING = 2e-5
+ROUNDING = 2e-5  # relative differences of tile means up to this are attributed to float32
+NONZERO_SHARE = 0.9  # tiles nonzero in a smaller share of the renders are not normal, and not tested
 
-# Tiles nonzero in a smaller share of the renders of both sides are not normal, and not tested.
-NONZERO_SHARE = 0.9
-
-# Minimum number of renders of a bias check. Sidak's correction uses the far tail, where Welch's test of few
-# renders rejects too often: at significance 1e-3 over 48 values, 4 % false alarms for 5 renders, 0.9 % for 8,
-# 0.2 % for 12.
+# Fewest renders of a bias check: in the far tail Welch's test of fewer rejects too often (of 48 values at
+# 1e-3, 4 % false alarms for 5 renders, 0.9 % for 8).
 FEWEST_RUNS = 8
 
-# Tiles of a bias check along each side of the image, and its probability of a false alarm.
-TILES = 4
-SIGNIFICANCE = 1e-3
+TILES, SIGNIFICANCE = 4, 1e-3  # of a bias check: tiles along each side, probability of a false alarm
 
 
 def tile_means(image: ArrayLike, tiles: int) -> np.ndarray:
@@ -128,8 +122,7 @@ class BiasCheck:
     ``passed``: no difference at the given significance; ``p``: the smallest p-value; ``family_p``: the same
     after Sidak's correction for all ``comparisons``; ``tile``: (row, column) of the worst tile, None for the
     whole image; ``channel``: of it; ``difference``: image - reference there, in radiance, with a simultaneous
-    interval of all comparisons at confidence 1 - significance; ``missing``: the missing share of the energy,
-    1 - mean(image) / mean(reference) over the whole image, with its 95 % interval.
+    interval of all comparisons at confidence 1 - significance; ``missing``: `missing_energy`.
     """
 
     passed: bool
@@ -152,10 +145,7 @@ def tile_columns(image: ArrayLike, tiles: int = TILES) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Means:
-    """Samples of `tile_columns` and of the image's mean over all channels.
-
-    The input of `compare_means`, small enough to be stored with a reference or in a table.
-    """
+    """Samples of `tile_columns` and of the image's mean over all channels, the input of `compare_means`."""
 
     columns: Sample
     whole: Sample
@@ -182,10 +172,9 @@ class Means:
 def missing_energy(image: Sample, reference: Sample) -> Estimate:
     """Return 1 - mean(image) / mean(reference) with its 95 % interval (m = 1).
 
-    Variance of the ratio to first order: v_x / r^2 + x^2 v_r / r^4. The interval is Banerjee's, of half width
-    sqrt(t_x^2 v_x / r^2 + t_r^2 x^2 v_r / r^4) with Student's quantile of each side, which holds the value in
-    95 % of cases or more; with the degrees of freedom of `welch` it is 88 % for two renders. Source:
-    S. K. Banerjee, Sankhya 22, 1960.
+    The interval is Banerjee's, of half width sqrt(t_x^2 v_x / r^2 + t_r^2 x^2 v_r / r^4) with Student's
+    quantile of each side, which holds the value in 95 % of cases or more. Source: S. K. Banerjee, Sankhya 22,
+    1960.
     """
     x, r = float(image.mean[0]), float(reference.mean[0])
     if not r > 0:

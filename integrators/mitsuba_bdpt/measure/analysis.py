@@ -1,8 +1,7 @@
 """Statistics of a sweep's rows: efficiencies, slopes, bias, costs.
 
 Rows are a frame with the columns of rows.parquet. Efficiency = 1 / (seconds * error), with the errors of
-`estimates`. Comparisons pair renders of equal seed, which ran consecutively. Raises `Unavailable`, with the
-reason, for figures that cannot be computed.
+`estimates`. Comparisons pair renders of equal seed, which ran consecutively.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from collections.abc import Hashable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -61,12 +61,10 @@ def slope(samples: Iterable[float], errors: Iterable[ArrayLike]) -> Estimate:
     """Exponent of error ~ samples^slope; -1 for squared errors of Monte Carlo.
 
     ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs. Least
-    squares of log(error) over log(samples), a point per run: sum (x - mean x) y / sum (x - mean x)^2.
-
-    The 95 % interval is the `bootstrap`'s, of runs drawn with replacement within each count. Deviations from
-    a count's mean are multiplied by sqrt(k / (k - 1)), k its number of runs: resampling k values has only
-    (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to the Bootstrap, 1993,
-    sections 9 and 13.
+    squares of log(error) over log(samples), a point per run. The 95 % interval is the `bootstrap`'s, of runs
+    drawn within each count; their deviations from its mean are multiplied by sqrt(k / (k - 1)), since
+    resampling k values has (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to
+    the Bootstrap, 1993, sections 9 and 13.
     """
     x, y = np.log([*samples]), [np.log(row) for row in errors]
     runs = np.array([len(row) for row in y])
@@ -143,7 +141,6 @@ class Results:
     """Rows of a sweep, and tile means of its references by scene.
 
     ``aside``: integrators of which efficiencies are not compared; ``compared``: the budget of comparisons.
-    Figures that tables share are cached, for the length of a command.
     """
 
     rows: pd.DataFrame
@@ -153,15 +150,11 @@ class Results:
 
     @cached_property
     def scenes(self) -> list[str]:
-        """Scenes, in the order of the rows."""
         return list(self.rows["scene"].unique())
 
     @cached_property
     def methods(self) -> list[str]:
-        """Integrators; the others are compared with the first.
-
-        In the order of the preset, as far as scenes show it: before those that follow them in a scene.
-        """
+        """Integrators, in the order of the preset as far as scenes show it; the first is compared."""
         order: list[str] = [self.rows["first"].iloc[0]]
         for _, found in self.rows.groupby("scene", sort=False)["method"]:
             names = list(found.unique())
@@ -173,10 +166,7 @@ class Results:
 
     @cached_property
     def rivals(self) -> list[str]:
-        """Integrators that the first is compared with at equal time.
-
-        Mitsuba's path tracers first, then others.
-        """
+        """Integrators that the first is compared with at equal time, Mitsuba's path tracers first."""
         others = [name for name in self.methods[1:] if name not in self.aside]
         return sorted(others, key=lambda name: name not in (*RIVALS, *MEDIA_RIVALS))
 
@@ -188,10 +178,7 @@ class Results:
 
     @cached_property
     def standard(self) -> list[str]:
-        """Baselines of efficiencies by budget and of costs.
-
-        `path`, `volpath` and `volpathmis`, by any name; other rivals if none of these was rendered.
-        """
+        """`path`, `volpath` and `volpathmis`, by any name; other rivals if none of these was rendered."""
         tracers = RIVALS[0], *MEDIA_RIVALS
         return [rival for rival in self.rivals if self.kind(rival) in tracers] or self.rivals
 
@@ -207,10 +194,9 @@ class Results:
 
     def has_efficiency(self, scenes: Sequence[str]) -> bool:
         """Return whether the first integrator has an efficiency over a rival in one of the ``scenes``."""
-        for scene in scenes:
-            for rival in self.rivals:
-                with suppress(Unavailable):
-                    return bool(self.efficiency(scene, rival))
+        for scene, rival in product(scenes, self.rivals):
+            with suppress(Unavailable):
+                return bool(self.efficiency(scene, rival))
         return False
 
     def present(self, scene: str, methods: Sequence[str], *budget: int) -> list[str]:
@@ -254,10 +240,7 @@ class Results:
         return int(self.compared or max(common))
 
     def bias(self, scene: str, method: str) -> BiasCheck:
-        """Return the bias check against the scene's reference.
-
-        Uses the budget with the most samples of those with enough renders.
-        """
+        """Return the bias check at the budget with the most samples of those with enough renders."""
         rows = self.of(scene, method)
         if scene not in self.references:
             raise Unavailable(FEW if len(rows) else "not rendered")
@@ -277,13 +260,10 @@ class Results:
             rows = self.of(scene, method)
             is_black = scene in self.references and len(rows) and not np.any([*rows["tile_means"]])
             return NOTHING if is_black else ""
-        return "" if check.passed else missing(check)
+        return "" if check.passed else lacking(check)
 
-    def surplus(self, scene: str, method: str) -> Estimate:
-        """Return the relative difference of the mean from the reference's, with its 95 % interval.
-
-        At the deciding budget, or the largest of two renders or more.
-        """
+    def missing(self, scene: str, method: str) -> Estimate:
+        """Return the missing share of the energy, at the deciding budget or the largest of two renders."""
         counts = self.of(scene, method)["budget"].value_counts()
         several = counts.index[counts > 1]
         if not len(several):
@@ -291,15 +271,11 @@ class Results:
         if scene not in self.references:
             raise Unavailable(FEW)
         rows = self.of(scene, method, self.deciding if self.deciding in several else max(several))
-        share = missing_energy(means_of(rows, 2).whole, self.references[scene].whole)
-        return Estimate(-share.value, -share.high, -share.low)
+        return missing_energy(means_of(rows, 2).whole, self.references[scene].whole)
 
     @cache  # noqa: B019
     def differs(self, scene: str, method: str, budget: int | None = None) -> bool:
-        """Return whether the mean of an integrator differs from the reference.
-
-        By the bias check, or by the renders of one budget alone, by default the deciding one.
-        """
+        """Return whether the mean differs from the reference, by the bias check or at a budget."""
         rows, reference = self.of(scene, method, budget or self.deciding), self.references.get(scene)
         if reference is None or rows.empty:
             return False
@@ -315,10 +291,7 @@ class Results:
         return relative_error(rows, error, self.differs(scene, method, budget))
 
     def convergence(self, scene: str, method: str) -> Estimate:
-        """Return the `slope` of the raw error over all renders of an integrator in a scene.
-
-        The interval is infinite where a budget has fewer than `FEWEST_WITH_INTERVAL` renders.
-        """
+        """Return the `slope` of the raw error; infinite interval with few renders at a budget."""
         rows = self.of(scene, method)
         if rows.empty:
             raise Unavailable("not rendered")
@@ -360,8 +333,7 @@ class Results:
     ) -> Summary:
         """Return the ratios of efficiencies 1 / (seconds * error), ``first`` over ``rival``, by seed.
 
-        Also the ratios of errors at equal time, and of times at equal error, if errors fall as 1 / time. At
-        the deciding budget by default. Where both means differ from the reference but not from each other,
+        At the deciding budget by default. Where both means differ from the reference but not from each other,
         raw errors are variances: what both lack is no difference between them.
         """
         first, budget = first or self.methods[0], budget or self.deciding
@@ -379,10 +351,7 @@ class Results:
     def against_path(
         self, scene: str, error: Error = "rel_mse_trimmed", budget: int | None = None
     ) -> Summary:
-        """Return the efficiency over the strongest of `standard` (smallest ratio).
-
-        Considers integrators that pass the bias check, if any does.
-        """
+        """Return the smallest efficiency over `standard`, of those that pass the bias check if any does."""
         rivals = self.standard_in(scene)
         if not rivals:
             raise Unavailable(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
@@ -400,18 +369,15 @@ NOTHING = "all energy is missing"
 FEW = f"the reference has fewer than {FEWEST_RUNS} renders"
 
 
-def missing(check: BiasCheck) -> str:
+def lacking(check: BiasCheck) -> str:
     """Describe the energy missing from an integrator that fails the bias check."""
     share = check.missing
     low, high = sorted((abs(100 * share.low), abs(100 * share.high)))
     if low > 99.95:
         return NOTHING
     if share.low <= 0 <= share.high:
-        where = (
-            "the whole image"
-            if check.tile is None
-            else f"the tile in row {check.tile[0]}, column {check.tile[1]}"
-        )
+        tile = check.tile and f"the tile in row {check.tile[0]}, column {check.tile[1]}"
+        where = tile or "the whole image"
         return f"wrong in {where} of 4 x 4, by {check.difference.value:.2g}"
     what = "of the energy is missing" if share.value > 0 else "too much energy"
     return f"{abs(100 * share.value):.2g} % {what} ({low:.2g} to {high:.2g})"

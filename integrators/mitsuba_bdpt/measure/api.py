@@ -18,7 +18,7 @@ from .options import VARIANT
 if TYPE_CHECKING:
     import pandas as pd
 
-    from .equal_time import Shot
+    from .crops import Shot
     from .project import Project
     from .reference import Reference
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from matplotlib.patches import Rectangle
 
 from ..errors import CommandError
 from .estimates import RelativeError
-from .metrics import rel_mse_epsilon, tone_map
+from .metrics import exposure_of, relative_errors, tone_map
 from .paper import PAPER, WIDTHS, save
 
 WINDOW = 6  # side of a window: this fraction of the image's
@@ -33,33 +34,36 @@ Window = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
-class Column:
-    """An image with its ``caption``, a text per line, and its squared relative ``errors`` (height, width)."""
+class Shot:
+    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE with its bound."""
 
+    name: str
+    spp: int
+    seconds: float
     image: np.ndarray
-    caption: tuple[str, ...]
-    errors: np.ndarray | None = None
+    error: RelativeError
+
+    @property
+    def rel_mse(self) -> float:
+        """The trimmed relMSE, less the reference's own where that is known."""
+        return self.error.total.value
+
+    @property
+    def caption(self) -> str:
+        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.error.brief} (trimmed)"
 
 
 @dataclass(frozen=True)
 class Block:
-    """The images of a scene, and its reference ``target``."""
+    """The renders of a scene, and its reference ``target``."""
 
     title: str
-    columns: tuple[Column, ...]
+    shots: Sequence[Shot]
     target: np.ndarray
 
-
-def judged(
-    name: str, spp: int, seconds: float, error: RelativeError, image: np.ndarray, target: np.ndarray
-) -> Column:
-    """Return the column of a render, with its errors against ``target``.
-
-    ``error``: the trimmed relMSE that its caption has, that of the tables of reports.
-    """
-    errors = ((image - target) ** 2 / (target**2 + rel_mse_epsilon(target))).mean(axis=-1)
-    figure = f"relMSE {error.brief} (trimmed)"
-    return Column(image, (name, f"{spp}\u00a0spp, {seconds:.2g}\u00a0s", figure), errors)
+    def errors(self, i: int) -> np.ndarray:
+        """Return the squared relative errors of a render's pixels, (height, width)."""
+        return relative_errors(self.shots[i].image, self.target).mean(axis=-1)
 
 
 def _side(height: int, width: int) -> int:
@@ -132,7 +136,7 @@ def draw(
         parts = figure.subfigures(len(blocks), 1, height_ratios=heights, squeeze=False)[:, 0]
         for part, block, row in zip(parts, blocks, rows, strict=True):
             if places is None:
-                chosen = windows(block.columns[0].errors, block.columns[-1].errors)
+                chosen = windows(block.errors(0), block.errors(-1))
             else:
                 chosen = _around(places, *block.target.shape[:2])
             _block(part, block, row, chosen)
@@ -142,14 +146,14 @@ def draw(
 
 def _captions(block: Block, wide: float) -> list[str]:
     """Return the captions, wrapped to the width of an image of a block ``wide`` inches wide."""
-    every = [*(column.caption for column in block.columns), ("reference",)]
+    every = [*(re.sub(r"(?<=\d) ", "\u00a0", shot.caption) for shot in block.shots), "reference"]
     most = max(int((wide / len(every) - GAP) / CHARACTER), 8)
-    return ["\n".join(textwrap.fill(line, most) for line in caption) for caption in every]
+    return ["\n".join(textwrap.fill(line, most) for line in caption.split("\n")) for caption in every]
 
 
 def _heights(block: Block, wide: float) -> list[float]:
     """Return the heights in inches of title and captions, images, windows, errors."""
-    width = wide / (len(block.columns) + 1) - GAP
+    width = wide / (len(block.shots) + 1) - GAP
     height = width * block.target.shape[0] / block.target.shape[1]
     lines = max(text.count("\n") for text in _captions(block, wide)) + 1
     return [LINE * (lines + 1.6), height, (width - GAP) / 2, max(height, SCALE)]
@@ -157,23 +161,23 @@ def _heights(block: Block, wide: float) -> list[float]:
 
 def _block(figure: SubFigure, block: Block, heights: Sequence[float], chosen: Sequence[Window]) -> None:
     """Draw a block, with these windows, in rows of these ``heights``."""
-    exposure = math.log2(0.9 / max(float(np.quantile(block.target.max(axis=-1), 0.95)), 1e-9))
+    exposure = exposure_of(block.target)
     wide, tall = figure.bbox.width / figure.dpi, figure.bbox.height / figure.dpi
-    columns = [*block.columns, Column(block.target, ())]
+    images = [*(shot.image for shot in block.shots), block.target]
     grid = figure.add_gridspec(
-        *(len(heights), 2 * len(columns)),
+        *(len(heights), 2 * len(images)),
         height_ratios=heights,
         left=GAP / 2 / wide,
         right=1 - GAP / 2 / wide,
         bottom=GAP / tall,
         top=1,
-        wspace=GAP / (wide / len(columns) / 2 - GAP),
+        wspace=GAP / (wide / len(images) / 2 - GAP),
         hspace=GAP / np.mean(heights),
     )
     figure.text(GAP / wide, 1 - 0.2 * LINE / tall, block.title, va="top", weight="bold")
-    for i, (column, caption) in enumerate(zip(columns, _captions(block, wide), strict=True)):
+    for i, (image, caption) in enumerate(zip(images, _captions(block, wide), strict=True)):
         place = slice(2 * i, 2 * i + 2)
-        shown = tone_map(column.image, exposure)
+        shown = tone_map(image, exposure)
         axis = figure.add_subplot(grid[1, place])
         axis.imshow(shown, interpolation="nearest", aspect="auto")
         axis.set_axis_off()
@@ -186,8 +190,8 @@ def _block(figure: SubFigure, block: Block, heights: Sequence[float], chosen: Se
             part.spines[:].set(color=colour, linewidth=0.8)
         axis = figure.add_subplot(grid[3, place])
         axis.set_axis_off()
-        if column.errors is not None:
-            axis.imshow(column.errors, interpolation="nearest", aspect="auto", **ERRORS)
+        if i < len(block.shots):
+            axis.imshow(block.errors(i), interpolation="nearest", aspect="auto", **ERRORS)
             continue
         where = axis.inset_axes((0.08, 1 - 0.1 / heights[3], 0.84, 0.07 / heights[3]))
         bar = figure.colorbar(ScalarMappable(**ERRORS), cax=where, orientation="horizontal")

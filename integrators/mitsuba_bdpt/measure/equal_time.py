@@ -22,6 +22,7 @@ from ..errors import CommandError
 from ..files.images import read_layers
 from ..files.loading import choose_sensor
 from . import crops
+from .crops import Shot
 from .estimates import RelativeError, mean_of, relative_error
 from .making import Job, fitted, obtained
 from .metrics import TRIM, rel_mse
@@ -35,26 +36,6 @@ from .timing import alternating, timed
 
 TIMED = 3  # renders for the median of times
 MATCHED, CLOSE = 3, 0.05  # times that samples are matched at most, and difference of times that is left
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE with its bound."""
-
-    name: str
-    spp: int
-    seconds: float
-    image: np.ndarray
-    error: RelativeError
-
-    @property
-    def rel_mse(self) -> float:
-        """The trimmed relMSE, less the reference's own where that is known."""
-        return self.error.total.value
-
-    @property
-    def caption(self) -> str:
-        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.error.brief} (trimmed)"
 
 
 @dataclass(frozen=True)
@@ -145,11 +126,7 @@ def pictured(
     given = subject(project, file, options)
     ways = dict(integrators) or {kind: {"type": kind} for kind in (path_tracers(file.has_media)[0], "bdpt")}
     found = shots(given, ways, options.spp)
-    columns = [
-        crops.judged(shot.name, shot.spp, shot.seconds, shot.error, shot.image, given.target)
-        for shot in found
-    ]
-    crops.draw([crops.Block(file.name, tuple(columns), given.target)], output, options.columns, places)
+    crops.draw([crops.Block(file.name, found, given.target)], output, options.columns, places)
     return output, found
 
 

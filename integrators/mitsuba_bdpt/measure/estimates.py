@@ -28,18 +28,10 @@ KINDS: dict[Error, str] = {"rel_mse_trimmed": "trimmed", "rel_mse": "raw"}
 Bound = Literal["", "≥", "≤", "~"]
 """Exact, at least, at most, or neither bound."""
 
-# Above this share of the measured error the reference's own error is not subtracted: the difference would be
-# mostly noise.
-SUBTRACTED = 0.9
-
-# Bootstrap resamples: the ends of a 95 % interval vary by 1 % of its width between seeds.
-RESAMPLES = 10_000
-
-# Fewest renders for which a 95 % interval is given; a range of fewer has their number beside it.
-FEWEST_WITH_INTERVAL = 5
-
-# Ratio of the ends of an interval from which on it says nothing.
-WIDE = 1e3
+SUBTRACTED = 0.9  # largest share of the reference's own error in a measured one that is subtracted
+RESAMPLES = 10_000  # of the bootstrap: ends of a 95 % interval vary by 1 % of its width between seeds
+FEWEST_WITH_INTERVAL = 5  # renders for which a 95 % interval is given
+WIDE = 1e3  # ratio of the ends of an interval from which on it is not given
 
 # Fewest renders of a test for a differing mean; below `FEWEST_RUNS` the squared bias must be this share of
 # the error too: tiles of few, rare bright values differ too often, others hardly ever.
@@ -69,8 +61,7 @@ class RelativeError:
     """relMSE of an integrator at one budget: the mean over ``count`` seeds with a 95 % interval.
 
     ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where the reference is too
-    noisy. ``variance`` and ``squared_bias`` are parts of the raw error; None of a single render, or without
-    the renders' variance. Of two renders their intervals are infinite.
+    noisy. ``variance`` and ``squared_bias``: parts of the raw error of two renders or more.
     """
 
     total: Estimate
@@ -145,10 +136,9 @@ def relative_error(rows: pd.DataFrame, error: Error, differs: bool) -> RelativeE
 
 
 def mean_of(values: Sequence[float] | pd.Series) -> Estimate:
-    """Return the mean of positive values with Student's 95 % interval of its logarithm.
+    """Return the mean of positive values with Student's 95 % interval of its logarithm, by the jackknife.
 
-    The standard error is the jackknife's. From 0 to infinity for a single value. The interval of few values
-    with a long tail is too narrow: a rare value was not met.
+    From 0 to infinity for a single value; of few values with a long tail too narrow.
     """
     given = pd.Series(values)
     without = (given.sum() - given) / (len(given) - 1) if len(given) > 1 else None
@@ -180,28 +170,26 @@ def bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., Any]) -> E
 
 
 def variance(rows: pd.DataFrame) -> Estimate:
-    """Return the variance relative to the reference, with a 95 % interval over seeds.
+    """Return the variance relative to the reference, with an interval over seeds like `mean_of`.
 
-    Student's interval of the logarithm, whose standard error is the jackknife's; from 0 to infinity for two
-    renders, whose only difference shows no spread. Too narrow where the renders missed rare bright values.
+    From 0 to infinity for two renders, whose only difference shows no spread.
     """
     return _of_logarithm(float(rows["variance"].mean()), _variance_without(rows))
 
 
 def _variance_without(rows: pd.DataFrame) -> pd.Series | None:
     """Return the variances without each of the ``rows``; None for fewer than 3."""
-    n = len(rows)
+    n, spread = len(rows), rows["variance"]
     if n < 3:
         return None
     # The sum of squares about the mean falls by that row's `metrics.spread`.
-    spread = rows["variance"]
     return ((n - 1) / n * spread.sum() - spread) / (n - 2)
 
 
 def squared_bias(rows: pd.DataFrame) -> Estimate | None:
-    """Return the squared bias relative to the reference, raw, with a 95 % interval over seeds.
+    """Return the squared bias relative to the reference, raw, with a 95 % interval; both may be negative.
 
-    None for a single render; infinite interval for two. Value and interval may be negative.
+    None for a single render; infinite interval for two.
     """
     n = len(rows)
     if n < 2 or not _has_variance(rows):
@@ -218,8 +206,8 @@ def squared_bias(rows: pd.DataFrame) -> Estimate | None:
 def mean_differs(rows: pd.DataFrame, reference: Means) -> bool:
     """Return whether the mean of renders of one budget differs from the reference.
 
-    By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light.
-    Elsewhere it hardly ever rejects few renders, for which 95 % intervals of energy and squared bias suffice.
+    By tiles and by the squared bias: Welch's test alone rejects too often where few pixels hold the light,
+    else hardly ever with few renders, for which 95 % intervals of energy and squared bias suffice.
     """
     found, are_few = squared_bias(rows), len(rows) < FEWEST_RUNS
     is_significant = compared(rows, reference)

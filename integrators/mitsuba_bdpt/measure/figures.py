@@ -276,13 +276,13 @@ NOT_FOR = {"windows": tuple(PLOTS), "integrators": ("rays",), "spp": ("samples",
 """Options that plots lack."""
 
 
-def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
-    """Return images of a scene at the deciding budget, rivals first, and the reference.
+def shots(folder: Path, results: Results, scene: str, methods: Sequence[str]) -> list[crops.Shot]:
+    """Return renders of a scene at the deciding budget, where their image is there.
 
-    Each image is of the seed with the median trimmed error. Captions have the seconds and errors of tables.
+    Of each integrator the seed with the median trimmed error, with the seconds and errors of tables.
     """
-    columns: list[crops.Column] = []
-    for method in results.present(scene, [*results.rivals, results.methods[0]], results.deciding):
+    found: list[crops.Shot] = []
+    for method in results.present(scene, methods, results.deciding):
         rows = results.of(scene, method, results.deciding).sort_values("rel_mse_trimmed", kind="stable")
         shown = rows.iloc[(len(rows) - 1) // 2]
         file = image_file(folder, shown)
@@ -290,10 +290,16 @@ def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crop
             (image,), _ = read_layers(file, "")
             called = f"{method} (equal spp)" if method in results.at_equal_samples else method
             seconds, error = rows["seconds"].median(), results.error(scene, method)
-            columns.append(crops.judged(called, shown["spp"], seconds, error, image, kept.image))
-    if not columns:
+            found.append(crops.Shot(called, shown["spp"], seconds, image, error))
+    return found
+
+
+def cropped(folder: Path, results: Results, kept: Reference, scene: str) -> crops.Block:
+    """Return the `shots` of a scene, rivals first, and the reference."""
+    found = shots(folder, results, scene, [*results.rivals, results.methods[0]])
+    if not found:
         raise CommandError(f"{folder}: no image of {scene} is there; run the sweep again, which renders them")
-    return crops.Block(scene, tuple(columns), kept.image)
+    return crops.Block(scene, found, kept.image)
 
 
 def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> None:

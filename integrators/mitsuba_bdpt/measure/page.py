@@ -1,14 +1,13 @@
 """Writes a sweep as one HTML file that needs neither network nor server.
 
-For each scene: the first integrator's efficiency over `path`, images of the first seed at the deciding budget
-(half precision, divider, exposure control), and error maps. Then a table of all renders, and the report with
-its plots. The template is page.html.
+For each scene: the first integrator's efficiency over `path`, images of the seeds with the median trimmed
+error (half precision, divider, exposure control), and error maps. Then a table of all renders, and the report
+with its plots. The template is page.html.
 """
 
 from __future__ import annotations
 
 import base64
-import math
 import re
 import tempfile
 from argparse import Namespace
@@ -20,15 +19,16 @@ from jinja2 import Template
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from ..files.images import check_output, read_layers
+from ..files.images import check_output
 from ..files.texts import write_text
 from ..files.whole import check_own
+from . import figures
 from .analysis import Results, Unavailable
 from .estimates import KINDS
+from .metrics import exposure_of
 from .project import Project
 from .reference import HALF_MAX
 from .report import Report
-from .results import image_file
 
 TITLE = "mitsuba-bdpt: sweep"
 """How the title of every page begins."""
@@ -73,26 +73,15 @@ def encoded(image: np.ndarray) -> str:
 def scene_data(folder: Path, results: Results, made: dict, scene: str, words: str) -> dict:
     """Return a scene's images by name, captions and size."""
     target = made[scene].image
-    images, captions = {}, {}
-    for method in results.present(scene, results.methods, results.deciding):
-        rows = results.of(scene, method, results.deciding)
-        file = image_file(folder, rows.iloc[0])
-        if file.exists():
-            (image,), _ = read_layers(file, "")
-            images[method] = encoded(image)
-            captions[method] = (
-                f"{method}: {rows['spp'].iloc[0]} samples per pixel, {rows['seconds'].median():.3g} s, "
-                f"relMSE {results.error(scene, method).brief} (trimmed)"
-            )
-    bright = float(np.quantile(target.max(axis=-1), 0.95))
+    found = figures.shots(folder, results, scene, results.methods)
     return {
         "name": scene,
         "width": target.shape[1],
         "height": target.shape[0],
         "mean": float(target.mean()),
-        "exposure": round(4 * math.log2(0.9 / max(bright, 1e-6))) / 4,
-        "images": images | {"reference": encoded(target)},
-        "figures": captions,
+        "exposure": round(4 * exposure_of(target)) / 4,
+        "images": {shot.name: encoded(shot.image) for shot in found} | {"reference": encoded(target)},
+        "figures": {shot.name: shot.caption.replace("\n", ", ") for shot in found},
         "words": words,
     }
 

@@ -1,21 +1,19 @@
 """Tables and plots of a sweep.
 
 Reads rows.parquet in a folder; writes plots and README.md with all tables beside them, by the
-template report.md.jinja. Explanations are read from notes.toml, if present. Parts of another Markdown file
-between the lines `<!-- report: NAME -->` and `<!-- end -->` are filled too, NAME being ``efficiency``,
-``errors``, ``first images`` or ``gallery`` (of images in ../images/gallery).
+template report.md.jinja. Explanations are read from notes.toml, if present.
 """
 
 from __future__ import annotations
 
 import json
-import re
 from argparse import Namespace
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -33,16 +31,15 @@ from .analysis import (
     NONE,
     RIVALS,
     Results,
-    Summary,
     Unavailable,
     cost,
 )
 from .estimates import KINDS, Error
-from .metrics import rel_mse_epsilon
+from .metrics import Estimate, rel_mse_epsilon
 from .project import Project
 from .reference import Reference
 from .results import load, missing_of
-from .tables import markdown, ratio, replace_part, spanned
+from .tables import markdown, spanned
 
 Figure = Callable[[str], object]
 """A figure of a scene, see `said`."""
@@ -118,15 +115,11 @@ def errors_table(results: Results) -> str:
                     "relMSE, raw": str(raw),
                     "variance": variance,
                     "squared bias": squared_bias,
-                    "energy": results.lacks(scene, method) or said(_energy, results, scene, method),
+                    "energy": results.lacks(scene, method)
+                    or said(lambda *one: _energy(results.missing(*one)), scene, method),
                 }
             )
     return markdown(pd.DataFrame(lines))
-
-
-def _energy(results: Results, scene: str, method: str) -> str:
-    found = results.surplus(scene, method)
-    return f"{100 * found.value:+.2g} % ± {50 * (found.high - found.low):.2g}"
 
 
 def budgets_table(results: Results) -> str:
@@ -137,47 +130,23 @@ def budgets_table(results: Results) -> str:
             return str(results.against_path(scene, error, budget))
         return "–"
 
-    columns: dict[str, Figure] = {
-        f"{budget} spp, {kind}": partial(figure, error, budget)
-        for budget in sorted(results.rows["budget"].unique())
-        for error, kind in KINDS.items()
-    }
+    cells = product(sorted(results.rows["budget"].unique()), KINDS.items())
+    columns = {f"{n} spp, {kind}": partial(figure, error, n) for n, (error, kind) in cells}
     return by_scene(results.scenes, columns)
 
 
-def first_images_table(results: Results) -> str:
-    """Table of seconds from an empty kernel cache to the first image, introduced; empty if not measured."""
-    if "seconds_first_image" not in results.rows:
-        return ""
-    rows = results.rows.dropna(subset="seconds_first_image")
-    found = rows.groupby(["scene", "method"])["seconds_first_image"].last().to_dict()
-    ours = results.methods[0]
-
-    def over(rival: str, scene: str) -> str:
-        seconds = found.get((scene, rival))
-        return "–" if seconds is None else f"{seconds:.3g} s, {ratio(found[scene, ours] / seconds)}"
-
-    columns: dict[str, Figure] = {
-        ours: lambda scene: f"{found[scene, ours]:.3g} s",
-        **{f"{rival}, ratio to it": partial(over, rival) for rival in results.standard},
-    }
-    scenes = [scene for scene in results.scenes if (scene, ours) in found]
-    text = "Seconds from an empty kernel cache to the first image, at the fewest samples of the sweep:"
-    return f"{text}\n\n{by_scene(scenes, columns)}\n" if scenes else ""
-
-
 def gaps_table(results: Results) -> str:
-    """Table of raw over trimmed relMSE: how much of the error few values carry.
-
-    For the first integrator and the first of `Results.standard`, by decreasing ratio.
-    """
+    """Table of raw over trimmed relMSE, by decreasing ratio: how much of the error few values carry."""
     ours, rivals = results.methods[0], _first_rivals(results)
     columns: dict[str, Figure] = {ours: partial(results.gap, method=ours)}
     if rivals:
-        columns[" or ".join(rivals)] = lambda scene: results.gap(
-            scene, (results.standard_in(scene) or rivals)[0]
-        )
+        columns[" or ".join(rivals)] = lambda scene: results.gap(scene, _first_rival(results, scene))
     return by_scene(results.by_gap(ours), columns)
+
+
+def _first_rival(results: Results, scene: str) -> str:
+    """Return the first of `Results.standard` in a scene."""
+    return (results.standard_in(scene) or results.standard or RIVALS)[0]
 
 
 def _first_rivals(results: Results) -> list[str]:
@@ -191,17 +160,9 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
     ours = results.methods[0]
     rival = " or ".join(_first_rivals(results) or RIVALS[:1])
 
-    def costs(method: str, scene: str) -> Summary:
-        first = (results.standard_in(scene) or RIVALS)[0]
-        return cost(*(results.of(scene, name, results.deciding) for name in (method, first)))
-
-    def bias(scene: str) -> str:
-        try:
-            verdict = _verdict(results, scene, made[scene].merged)
-        except Unavailable as few:
-            why = str(few)
-            verdict = said(lambda: f"energy {_energy(results, scene, ours)} ({why}: no verdict)")
-        return f"{verdict}, by {_maker(made[scene])}"
+    def costs(method: str, scene: str) -> object:
+        names = method, _first_rival(results, scene)
+        return cost(*(results.of(scene, name, results.deciding) for name in names))
 
     def over_light_tracer(scene: str) -> str:
         lacks = results.lacks(scene, LIGHT_TRACER)
@@ -212,7 +173,7 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
         f"{NONE} over {rival}": (NONE, partial(costs, NONE)),
         "slope": (ours, partial(_slope, results, notes)),
         "slope, independent points": (INDEPENDENT, partial(results.convergence, method=INDEPENDENT)),
-        "bias check": (ours, bias),
+        "bias check": (ours, lambda scene: f"{_bias(results, made[scene], scene)}, by {_maker(made[scene])}"),
     }
     if LIGHT_TRACER in results.aside:  # else it is in the table of efficiencies
         columns[f"efficiency over {LIGHT_TRACER}"] = (LIGHT_TRACER, over_light_tracer)
@@ -229,16 +190,22 @@ def _slope(results: Results, notes: dict[str, str], scene: str) -> str:
     return f"{found}" + ("" if expected else ", **unexplained**")
 
 
-def _verdict(results: Results, scene: str, merged: bool) -> str:
-    """Format a bias check, with the surplus of energy and its interval in percent.
-
-    ``merged``: the reference contains light that only `merging` samples.
-    """
-    check = results.bias(scene, results.methods[0])
-    half = 50 * (check.missing.high - check.missing.low)
-    failed = "fails by what `merging` finds" if merged and check.missing.low > 0 else "**failed**"
+def _bias(results: Results, reference: Reference, scene: str) -> str:
+    """Format the bias check of the first integrator, or why there is none."""
+    ours = results.methods[0]
+    try:
+        check = results.bias(scene, ours)
+    except Unavailable as why:
+        reason = str(why)
+        return said(lambda: f"energy {_energy(results.missing(scene, ours))} ({reason}: no verdict)")
+    failed = "fails by what `merging` finds" if reference.merged and check.missing.low > 0 else "**failed**"
     verdict = "passed" if check.passed else failed
-    return f"{verdict}, p = {check.family_p:.2g}, energy {-100 * check.missing.value:+.2g} % ± {half:.2g}"
+    return f"{verdict}, p = {check.family_p:.2g}, energy {_energy(check.missing)}"
+
+
+def _energy(missing: Estimate) -> str:
+    """Format the surplus of energy, in percent, with its interval."""
+    return f"{-100 * missing.value:+.2g} % ± {50 * (missing.high - missing.low):.2g}"
 
 
 def _chosen(decisions: str) -> str:
@@ -262,25 +229,6 @@ def _maker(kept: Reference) -> str:
     """Name the integrator that made a reference."""
     by = kept.provenance["integrator"]
     return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
-
-
-GALLERY = "../images/gallery"  # relative to docs/reports/figures.md
-GALLERY_COLUMNS = 3
-
-
-def gallery(results: Results) -> str:
-    """Images of all scenes, with the efficiency over the stronger `path`."""
-
-    def figure(scene: str) -> str:
-        lacks = results.path_lacks(scene)
-        return f"{results.against_path(scene)}" + (f"<br>`{results.tracer(scene)}`: {lacks}" if lacks else "")
-
-    cells = [
-        f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
-    ]
-    cells += [""] * (-len(cells) % GALLERY_COLUMNS)
-    first, *rows = np.reshape(cells, (-1, GALLERY_COLUMNS)).tolist()
-    return markdown(pd.DataFrame(rows, columns=first))
 
 
 def stronger(results: Results) -> str:
@@ -307,8 +255,7 @@ def machine(rows: pd.DataFrame) -> str:
     found["versions"] = [", ".join(f"{name} {version}" for name, version in one.items()) for one in versions]
     wheres = (found["machine"] + "; " + found["versions"]).unique()
     sources = found[["scene", "source"]].drop_duplicates()
-    if sources["scene"].duplicated().any():
-        scene = sources["scene"][sources["scene"].duplicated()].iloc[0]
+    for scene in sources["scene"][sources["scene"].duplicated()]:
         raise CommandError(f"the rows of {scene} are by several sources of the plugin; render them anew")
     if len(wheres) > 1:
         raise CommandError(f"the rows are from several machines or versions: {sorted(wheres)}")
@@ -417,7 +364,6 @@ class Report:
             has_efficiency=results.has_efficiency(results.scenes),
             budgets=budgets_table(results),
             stronger=stronger(results),
-            first_images=first_images_table(results),
             gaps=gaps_table(results),
             errors=errors_table(results),
             checks=checks_table(results, self.made, self.notes),
@@ -449,29 +395,5 @@ def run(options: Namespace) -> int:
         ) from error
     write_text(folder / "README.md", found.text())
     found.draw(folder)
-    if options.readme:
-        write_text(options.readme, _filled(options.readme, found))
     print(folder / "README.md")
     return 0
-
-
-PARTS: dict[str, Callable[[Report], str]] = {
-    "efficiency": lambda found: efficiency_table(found.results),
-    "errors": lambda found: errors_table(found.results),
-    "first images": lambda found: first_images_table(found.results),
-    "gallery": lambda found: gallery(found.results),
-}
-"""Parts of Markdown files that a report fills, by their names in `<!-- report: NAME -->`."""
-
-
-def _filled(file: Path, found: Report) -> str:
-    """Return the text of a Markdown file with its parts filled; ``CommandError`` if it has none."""
-    text = file.read_text(encoding="utf-8")
-    names = re.findall(r"<!-- report: (.*?) -->", text)
-    for name in names:
-        if name not in PARTS:
-            raise CommandError(f"{file}: there is no part {name!r}; there are {', '.join(PARTS)}")
-        text = replace_part(text, name, PARTS[name](found))
-    if not names:
-        raise CommandError(f"{file} has no `<!-- report: NAME -->` with an `<!-- end -->`; add one")
-    return text

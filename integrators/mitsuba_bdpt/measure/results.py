@@ -56,7 +56,7 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
         "mean": float(image.mean()),
         "energy": float(image.mean() / ref.image.mean()),
         "tile_means": [float(f"{x:.7g}") for x in agreement.tile_columns(image)],
-        "flip": metrics.hdr_flip(image, ref.image)[0] if flip else None,
+        "flip": metrics.hdr_flip(image, ref.image) if flip else None,
         "delta_e_itp": metrics.delta_e_itp(image, ref.image),
     }
 
