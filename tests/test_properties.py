@@ -200,14 +200,6 @@ def test_sensor_is_an_index_or_an_object():
         bdpt.render(scene, sensor=2)
 
 
-def test_crop_window_is_the_region_of_the_whole():
-    """Expected: radiance 1. Tolerance: five standard errors of 8 renders of 96 pixels."""
-    scene = lamp_in_a_sphere(crop_offset_x=3, crop_offset_y=2, crop_width=12, crop_height=8)
-    means = [image(integrator(), scene, seed=seed, spp=256) for seed in range(8)]
-    assert means[0].shape == (8, 12, 3)
-    assert abs(np.mean(means) - 1) < 0.02
-
-
 # -- passes, timeout, interruption ------------------------------------------------------------
 
 

@@ -108,11 +108,6 @@ class BDPTIntegrator(metaclass=ABCMeta):
         depth = self.settings.max_depth
         return -1 if depth == UNLIMITED else depth
 
-    @property
-    def rr_depth(self) -> int:
-        """The parameter ``rr_depth``."""
-        return self.settings.rr_depth
-
     @_without_gradients
     def render(
         self,

@@ -13,7 +13,7 @@ MOST = {
     "transport merging guided_emission": 5726,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1472,
+    "cli": 1463,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,
@@ -22,9 +22,9 @@ MOST = {
     "scene sampling": 775,
     "host": 713,
     "sensors": 883,
-    "": 1322,  # top files
+    "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 29003}
+OUTSIDE = {"scripts": 2961, "tests": 28995}
 MOST_WORDS = 28806
 
 

@@ -12,6 +12,7 @@ import io
 import re
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, NoReturn
 
@@ -121,8 +122,7 @@ def add_mix_arguments(parser: argparse.ArgumentParser) -> None:
     text = "PNG or EXR file to write (beside an EXR a PNG); default: IMAGE.mixed.png"
     add("-o", "--output", type=Path, help=text)
     add("-m", "--variant", default=DEFAULT_VARIANT, help="default: %(default)s")
-    text = "brightness of the PNG in stops; default: %(default)s"
-    add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)
+    add("--exposure", type=STOPS, default=0.0, metavar="EV", help="brightness of the PNG in stops")
 
 
 def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
@@ -130,24 +130,19 @@ def add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     add("scene", type=Path, help="scene file in Mitsuba's XML format")
     add("-m", "--variant", default=DEFAULT_VARIANT, help="Mitsuba variant; default: %(default)s")
     add("--spp", type=WHOLE, help="samples per pixel; default: the scene's")
-    text = "value of a parameter $KEY of the scene; may be repeated"
-    add("-D", dest="defines", type=definition, action="append", default=[], metavar="K=V", help=text)
-    text = "property of the integrator, such as skip=none; may be repeated"
-    add("-P", dest="properties", type=property_, action="append", default=[], metavar="K=V", help=text)
-    text = "index of the sensor; default: %(default)s"
-    add("-s", "--sensor", type=Number(int, 0), default=0, metavar="INDEX", help=text)
-    text = "folder in which files that the scene names are looked for, after the scene's own; may be repeated"
-    add("-a", "--append", type=Path, action="append", default=[], metavar="FOLDER", help=text)
-    text = "size of the image in pixels; overrides the size of every film except meters'"
-    add("--size", type=size, metavar="WxH", help=text)
-    text = "render this part of the image alone, in pixels from the upper left corner"
-    add("--crop", type=crop, metavar="X,Y,W,H", help=text)
-    text = "number of threads; default: one for each core"
-    add("--threads", type=WHOLE, metavar="N", help=text)
+    repeated = partial(add, action="append", default=[])
+    repeated("-D", dest="defines", type=definition, metavar="K=V", help="parameter of the scene; repeatable")
+    text = "parameter of the integrator, such as skip=none; repeatable"
+    repeated("-P", dest="properties", type=property_, metavar="K=V", help=text)
+    text = "folder in which files that the scene names are looked for, after the scene's own; repeatable"
+    repeated("-a", "--append", type=Path, metavar="FOLDER", help=text)
+    add("-s", "--sensor", type=Number(int, 0), default=0, metavar="INDEX", help="of the sensor; default: 0")
+    add("--size", type=size, metavar="WxH", help="size of the image: of all films but meters'")
+    add("--crop", type=crop, metavar="X,Y,W,H", help="render this part of the image alone, in pixels")
+    add("--threads", type=WHOLE, metavar="N", help="number of threads; default: one for each core")
     text = "memory that the process may take; default: limits of the machine, its control groups and ulimit"
     add("--memory", type=Number(float, 1e-3), metavar="GIB", help=text)
-    text = "log more: Mitsuba's log at level info (-v), debug (-vv) or trace (-vvv)"
-    add("-v", "--verbose", action="count", default=0, help=text)
+    add("-v", "--verbose", action="count", default=0, help="log more: info (-v), debug (-vv), trace (-vvv)")
 
 
 def add_render_arguments(parser: argparse.ArgumentParser) -> None:
@@ -170,12 +165,10 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
     add("--statistics", type=Path, metavar="FILE", help=text)
     text = "bar, lines (for logs, from ten seconds on) or none; default: a bar on a terminal, lines elsewhere"
     add("--progress", choices=KINDS, default="auto", help=text)
-    text = "rewrite the PNG with the image so far every SECONDS"
-    add("--preview", type=SECONDS, metavar="SECONDS", help=text)
+    add("--preview", type=SECONDS, metavar="SECONDS", help="rewrite the PNG every SECONDS while it renders")
     text = "render in parts on the workers of a dask.distributed scheduler (extra [cluster])"
     add("--scheduler", metavar="ADDRESS", help=text)
-    text = "number of parts of a render on a cluster; default: 4 for each worker"
-    add("--parts", type=WHOLE, metavar="N", help=text)
+    add("--parts", type=WHOLE, metavar="N", help="of a render on a cluster; default: 4 for each worker")
     text = "add a denoised image as a layer, which the PNG then shows (extra [denoise]); the raw one stays"
     add("--denoise", action="store_true", help=text)
     text = (
@@ -183,7 +176,5 @@ def add_render_arguments(parser: argparse.ArgumentParser) -> None:
         "rr_depth, hide_emitters, timeout and layers of aov; default: %(default)s"
     )
     add("--integrator", default="bdpt", metavar="TYPE", help=text)
-    text = "of the random numbers; default: %(default)s"
-    add("--seed", type=SEED, default=0, help=text)
-    text = "brightness of the PNG in stops; the EXR is not affected; default: %(default)s"
-    add("--exposure", type=STOPS, default=0.0, metavar="EV", help=text)
+    add("--seed", type=SEED, default=0, help="of the random numbers; default: %(default)s")
+    add("--exposure", type=STOPS, default=0.0, metavar="EV", help="brightness of the PNG in stops")
