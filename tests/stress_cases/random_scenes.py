@@ -1,29 +1,10 @@
 """Random scenes, drawn by hypothesis: shapes, BSDFs, emitters, sensors, and which strategies are in use."""
 
-import mitsuba as mi
-import numpy as np
+from bsdf_parts import blend, bumps, tilted
 from hypothesis import strategies as st
-from scene_parts import T, film, grey
+from scene_parts import T, film, grey, sky_bitmap
 
 from scenes import area, floor
-
-
-def bitmap(pixels):
-    """A texture that is not a colour."""
-    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32)), "raw": True}
-
-
-def waves():
-    """A height field for bump maps."""
-    y, x = np.mgrid[0:32, 0:32] / 32 * 2 * np.pi
-    return (0.5 + 0.15 * (np.sin(3 * x) + np.sin(2 * y + x)))[..., None]
-
-
-def tilts():
-    """Normals of a wavy surface in tangent space."""
-    y, x = np.mgrid[0:32, 0:32] / 32 * 2 * np.pi
-    n = np.stack([0.3 * np.sin(2 * x), 0.3 * np.sin(3 * y), np.ones_like(x)], axis=-1)
-    return (n / np.linalg.norm(n, axis=-1, keepdims=True) + 1) / 2
 
 
 def sides(bsdf):
@@ -48,13 +29,9 @@ BSDFS = {
     "roughplastic": lambda a: sides(rough("roughplastic", a)),
     "principled": lambda a: {"type": "principled", "roughness": a, "metallic": 0.3, "spec_trans": 0.3},
     "mask": lambda a: {"type": "mask", "opacity": 0.6, "bsdf": grey(0.6)},
-    "blend": lambda a: sides(
-        {"type": "blendbsdf", "weight": 0.4, "one": MATTE, "two": rough("roughconductor", a)}
-    ),
-    "bumpmap": lambda a: sides({"type": "bumpmap", "height": bitmap(waves()), "bsdf": MATTE}),
-    "normalmap": lambda a: sides(
-        {"type": "normalmap", "normalmap": bitmap(tilts()), "bsdf": rough("roughconductor", a)}
-    ),
+    "blend": lambda a: sides(blend(0.4, MATTE, rough("roughconductor", a))),
+    "bumpmap": lambda a: sides(bumps(MATTE)),
+    "normalmap": lambda a: sides(tilted(rough("roughconductor", a))),
 }
 
 
@@ -85,7 +62,7 @@ LAMPS = {
     "constant": lambda c, a, s: {"type": "constant"},
     "envmap": lambda c, a, s: {
         "type": "envmap",
-        "bitmap": mi.Bitmap(np.random.default_rng(5).uniform(0.2, 2, (8, 16, 3)).astype(np.float32)),
+        "bitmap": sky_bitmap(),
         "to_world": turned([0, 0, 0], a),
     },
 }

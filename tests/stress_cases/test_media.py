@@ -55,14 +55,6 @@ def like(scene, other, reach=0.01, light=True, **integrator) -> None:
     assert bool(method.statistics["rays"].get("light", 0)) == light
 
 
-def test_empty_grid():
-    """A grid of density 0.
-
-    Expected: as without it: Welch's test of tiles (1e-3), which sees errors of 1 %.
-    """
-    like(room(cloud=box(interior=cloud(np.zeros((4, 4, 4))))), room())
-
-
 def test_nested_boxes():
     """32 empty boxes with null boundaries, one in the other.
 

@@ -1,12 +1,8 @@
-"""Light that bounces long, through glass in glass, off mirrors, off surfaces of every roughness, from thin
-spots."""
+"""Light that bounces long, through glass in glass, off mirrors, off surfaces of every roughness."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_bdpt.emitters.emitters import Emitters
-from mitsuba_bdpt.scene import diagnostics
-from mitsuba_bdpt.transport.inputs import Shared
 from scene_parts import T
 from warned import Warned
 
@@ -73,29 +69,6 @@ def test_too_bright_without_limit():
     assert len(warnings) == 1 + bool(made.statistics["non_finite"])
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_black(way):
-    """All BSDFs black: diffuse, glass, rough metal; emitters hidden.
-
-    Expected: an image of zeros exactly, no visibility ray, no warning.
-    """
-    glass = {"type": "dielectric", "specular_reflectance": 0.0, "specular_transmittance": 0.0}
-    metal = {"type": "roughconductor", "specular_reflectance": 0.0}
-    target = scene(
-        wall={"type": "sphere", "bsdf": diffuse(0.0)},
-        ball={"type": "sphere", "center": [0.2, -0.3, -0.4], "radius": 0.2, "bsdf": glass},
-        plate=square((-0.3, -0.4, -0.3), size=0.2, bsdf=metal),
-        lamp=square((0.3, 0.8, 0), DOWNWARDS, 0.2, emitter=area(4.0)),
-    )
-    made = mi.load_dict({"type": "bdpt", "hide_emitters": True} | WAYS[way])
-    with Warned() as warnings:
-        image = np.array(made.render(target, spp=32))
-    rays = made.statistics["rays"]
-    assert not image.any()
-    assert not warnings
-    assert rays["shadow_inner"] == rays["shadow_s1"] == rays["shadow_t1"] == 0
-
-
 # -- mirrors and glass ----------------------------------------------------------------------------
 
 # Of the steepest ray in the corridor of mirrors, in both directions across it: 32 reflections each.
@@ -154,15 +127,6 @@ def test_nested_dielectrics(index, way):
     inner = {"type": "sphere", "center": [0.2, 0.1, 0.0], "radius": 0.6, "bsdf": bsdf}
     target = glass(look((0, 0, 4), (0, 0, 0), 40), inner=inner)
     agree(tiles(target, WAYS[way] | {"rr_depth": 200}, SEEDS, 64), 1.0, 0.02)
-
-
-def test_from_within_glass():
-    """A white world from the centre of a ball of glass.
-
-    Expected: the square of its index: Student's test of tiles (1e-3), which sees errors of 2 %.
-    """
-    target = glass(look((0, 0, 0), (0.3, 0.1, -1), 60))
-    agree(tiles(target, {"rr_depth": 200}, SEEDS, 64), 1.5**2, 0.02)
 
 
 def test_total_reflection():
@@ -238,62 +202,3 @@ def test_surface(name):
     theirs = tiles(target, {"type": "path", "max_depth": 6}, SEEDS, 512)
     for way in WAYS if "sharp" in name or "0.0001" in name else ("defaults",):
         agree(tiles(target, WAYS[way] | {"max_depth": 6}, SEEDS, 128, sound=True), theirs, 0.02)
-
-
-# -- thin spots -----------------------------------------------------------------------------------
-
-
-def orientations():
-    """Transformations: Mitsuba rounds a direction's cosine in another way in each."""
-    rng = np.random.default_rng(2)
-    found = [T(), T().look_at([0, 3, 0], [0, 0, 0], [1, 0, 0])]
-    for number in range(14):
-        origin, target = (number % 2) * rng.normal(size=3), rng.normal(size=3)
-        found.append(T().look_at(origin.tolist(), target.tolist(), [0, 0, 1]))
-    return found
-
-
-def cells() -> np.ndarray:
-    """Points of the unit square, (2, 2^18), at random within a grid's cells: so it does not mix with the
-    steps of the cosine."""
-    corners = np.stack(np.meshgrid(np.arange(512), np.arange(512))).reshape(2, -1)
-    return (corners + np.random.default_rng(1).random(corners.shape)) / 512
-
-
-def by_next_event(spot, to_world, angle: float) -> float:
-    """Light by `sample_direction`, as `path` asks for it, at points a distance of 5 away."""
-    u, widest = cells(), 1.05 * angle
-    theta, phi = widest * np.sqrt(u[0]), 2 * np.pi * u[1]
-    d = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
-    matrix = np.array(to_world.matrix)
-    it = mi.SurfaceInteraction3f()
-    it.p = mi.Point3f((5 * matrix[:3, :3] @ d + matrix[:3, 3:]).astype(np.float32))
-    _, weight = spot.sample_direction(it, mi.Point2f(0.5), True)
-    return float(np.array(weight, dtype=np.float64)[0].mean() * 25 * np.pi * widest**2)
-
-
-@pytest.mark.parametrize("degrees", [0.05, 0.1, 0.2, 0.3])
-def test_narrow_spots(degrees):
-    """Spots of cutoff_angle 0.05 to 0.3 degrees in 16 orientations; light by next-event estimation, as in
-    `path`, over the exact value, and by light subpaths over that of `path`.
-
-    Expected: errors below the warning's bound (2^-24 over 1 - cos of the angle, Mitsuba's rounding); a
-    warning below 0.2 degrees; at 0.3 the strategies agree to 0.5 %.
-    """
-    angle = np.deg2rad(degrees)
-    beam = 0.75 * angle  # full intensity up to here, and from there down to 0 in proportion to the angle
-    ramp = angle * (angle**2 - beam**2) / 2 - (angle**3 - beam**3) / 3
-    exact = np.pi * beam**2 + 2 * np.pi * ramp / (angle - beam)
-    off, apart = [], []
-    for to_world in orientations():
-        lamp = {"type": "spot", "cutoff_angle": degrees, "to_world": to_world}
-        target = mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "lamp": lamp})
-        path = by_next_event(target.emitters()[0], to_world, angle)
-        u, like = mi.Point2f(cells()), Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
-        weight = Emitters(target).sample_emission(u, u, like, mi.Bool(True)).weight
-        off.append(path / exact - 1)
-        apart.append(float(np.array(weight, dtype=np.float64)[0].mean()) / path - 1)
-        assert len(diagnostics.narrow_spots(target)) == (degrees < 0.2)
-    print(f"`path` off by {max(map(abs, off)):.2g}, light subpaths from it by {max(map(abs, apart)):.2g}")
-    assert max(map(abs, [*off, *apart])) < 2.0**-24 / (1 - np.cos(angle))
-    assert degrees < 0.3 or max(map(abs, apart)) < 0.005
