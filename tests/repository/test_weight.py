@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28995}
-MOST_WORDS = 28806
+OUTSIDE = {"scripts": 2961, "tests": 28763}
+MOST_WORDS = 28850
 
 
 def _lines(files):

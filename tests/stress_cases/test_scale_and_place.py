@@ -16,11 +16,10 @@ DEPTH, SIZE = 6, 32
 # Samples per pixel of each way to render: by default so many that a pilot decides.
 SPP = {"defaults": 128, "all strategies": 16}
 
-# The scene of each kind of emitter; "spot" has one in place of its point light.
+# The scene of each kind of emitter.
 SCENES = {
     "area": "cornell_box",
     "point": "lamp_behind_glass",
-    "spot": "smallvcm_cornell_point",
     "envmap": "window_room",
     "sun": "smallvcm_cornell_sun",
     "lens": "thin_lens",
@@ -55,27 +54,19 @@ def append(element, linear, shift=(0, 0, 0)):
 
 
 def look_from(element, scale, turn, shift):
-    """Sensors and spots must not be scaled themselves."""
+    """Sensors must not be scaled themselves."""
     for lookat in element.iter("lookat"):
         for key in ("origin", "target"):
             lookat.set(key, text(numbers(lookat.get(key)) * scale))
     append(element, turn, shift)
 
 
-def place_emitter(emitter, kind, scale, turn, shift, light):
+def place_emitter(emitter, scale, turn, shift, light):
     times(emitter, light, "radiance", "irradiance", "intensity")
     times(emitter, scale**2, "intensity")
     vector = emitter.find("*[@x]")
     values = None if vector is None else np.array([float(vector.get(axis)) for axis in "xyz"])
-    if kind == "spot":  # in place of the point light, downwards
-        emitter.set("type", "spot")
-        emitter.remove(vector)
-        lookat = {"origin": text(values), "target": text(values - [0.1, -0.2, 1]), "up": "0 1 0"}
-        to_world = ElementTree.SubElement(emitter, "transform", name="to_world")
-        ElementTree.SubElement(to_world, "lookat", lookat)
-        ElementTree.SubElement(emitter, "float", name="cutoff_angle", value="60")
-        look_from(emitter, scale, turn, shift)
-    elif emitter.get("type") in ("point", "directional"):
+    if emitter.get("type") in ("point", "directional"):
         point = emitter.get("type") == "point"
         for axis, value in zip(
             "xyz", turn @ (values * scale) + shift if point else turn @ values, strict=True
@@ -101,7 +92,7 @@ def placed(kind, scale=1.0, turn=np.eye(3), shift=(0.0, 0.0, 0.0), light=1.0):  
     for shape in root.findall("shape"):
         append(shape, turn * scale, shift)
     for emitter in root.iter("emitter"):
-        place_emitter(emitter, kind, scale, turn, shift, light)
+        place_emitter(emitter, scale, turn, shift, light)
     return mi.load_string(ElementTree.tostring(root, encoding="unicode"), parallel=False, resolution=SIZE)
 
 
@@ -156,7 +147,7 @@ def same(kind, places, digits, **parameters):
 @pytest.mark.parametrize("kind", SCENES)
 @pytest.mark.parametrize("what, exponents", [("scale", (-13, -10, 10, 13)), ("light", (-40, -20, 20, 40))])
 def test_powers_of_two(what, exponents, kind):
-    """A scene with an area light, a point light, a spot, an environment with a sun, a sun, a thin lens; all
+    """A scene with an area light, a point light, an environment with a sun, a sun, a thin lens; all
     lengths times 2^-13 to 2^13, or all lights times 2^-40 to 2^40.
 
     Expected: the same image, seed for seed, by default and with all strategies, and the same decision of the

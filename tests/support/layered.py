@@ -5,7 +5,8 @@ import json
 import mitsuba as mi
 import numpy as np
 
-T = mi.ScalarTransform4f
+from scenes import DOWNWARDS, area, camera, floor, matte, rgb, square
+from scenes import ball as sphere
 
 # Radiance, or intensity, of each emitter.
 LAMPS = {"panel": (5, 1, 1), "globe": (0, 3, 1), "bulb": (0, 0, 4), "sky": (0.1, 0.1, 0.1)}
@@ -25,42 +26,22 @@ def scene(lit=tuple(LAMPS), medium=None, rfilter="gaussian", ball=None, wall=Non
 
     def light(name):
         colours = lit if isinstance(lit, dict) else LAMPS
-        return {"type": "rgb", "value": [float(x) * (name in lit) for x in colours[name]]}
+        return rgb(*(float(x) * (name in lit) for x in colours[name]))
 
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": rfilter}}
-    film |= {"pixel_format": "rgb", "component_format": "float32"} | crop
-    view = {"type": "perspective", "fov": 50, "to_world": T().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
-    view |= {"film": film, "sampler": {"type": "independent", "sample_count": 8}}
-    placed = T().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale(0.5)
-    if medium is not None:
-        view["medium"] = medium
-    wall = {} if wall is None else {"bsdf": wall}
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "sensor": view,
-            "floor": {
-                "type": "rectangle",
-                "to_world": T().translate([0, -1, 0]).rotate([1, 0, 0], -90).scale(3),
-            },
-            "wall": {"type": "rectangle", "to_world": T().translate([0, 0, -1.5]).scale(3)} | wall,
-            "ball": {"type": "sphere", "radius": 0.6, "bsdf": ball or {"type": "dielectric"}},
-            "panel": {
-                "type": "rectangle",
-                "to_world": placed,
-                "light": {"type": "area", "radiance": light("panel")},
-            },
-            "globe": {
-                "type": "sphere",
-                "radius": 0.3,
-                "center": [1.5, 0, 0],
-                "light": {"type": "area", "radiance": light("globe")},
-            },
-            "bulb": {"type": "point", "position": [-1.5, 1, 1], "intensity": light("bulb")},
-            "sky": {"type": "constant", "radiance": light("sky")},
-        },
-        optimize=False,
-    )
+    view = camera(origin=(0, 0, 4), target=(0, 0, 0), fov=50, size=8, rfilter=rfilter, near=0.01, film=crop)
+    view |= {} if medium is None else {"medium": medium}
+    dark = matte(0)
+    parts = {
+        "sensor": view,
+        "floor": floor(-1, 3),
+        "wall": square((0, 0, -1.5), size=3, bsdf=wall),
+        "ball": sphere(ball or {"type": "dielectric"}, 0.6),
+        "panel": square((0, 2, 0), DOWNWARDS, 0.5, dark, light=area(light("panel"))),
+        "globe": sphere(dark, 0.3, (1.5, 0, 0), light=area(light("globe"))),
+        "bulb": {"type": "point", "position": [-1.5, 1, 1], "intensity": light("bulb")},
+        "sky": {"type": "constant", "radiance": light("sky")},
+    }
+    return mi.load_dict({"type": "scene"} | parts, optimize=False)
 
 
 def layers(integrator, target, spp=8, seed=3, kind="groups"):
