@@ -13,7 +13,7 @@ import scene_parts as parts
 from mitsuba_bdpt.emitters.emitters import Emitters
 from mitsuba_bdpt.emitters.tables import cell_at
 from mitsuba_bdpt.geometry.smooth_meshes import is_flat
-from mitsuba_bdpt.guided_emission.tables import MOST_CELLS, SIDES, Cells, EmissionTables, side_of
+from mitsuba_bdpt.guided_emission.tables import SIDES, Cells, EmissionTables, side_of
 from mitsuba_bdpt.host.jit import evaluated_mode
 from scipy import stats
 
@@ -292,17 +292,6 @@ def test_tables_come_back_from_json():
     assert again == tables and hash(again) == hash(tables)
     np.testing.assert_allclose(again.densities(), densities, rtol=0.045)
     np.testing.assert_allclose(again.densities().mean(axis=(1, 2)), 1)
-
-
-@pytest.mark.parametrize("count", [0, 1, 17, 18, 38, 39, 153, 154, 612, 613])
-def test_sizes_of_tables(count):
-    """The most cells that fit."""
-    side = side_of(count)
-    if not 0 < count <= MOST_CELLS // SIDES[-1] ** 2:
-        assert side == 0
-        return
-    assert count * side**2 <= MOST_CELLS
-    assert all(count * other**2 > MOST_CELLS for other in SIDES if other > side)
 
 
 @pytest.mark.parametrize("side", SIDES)

@@ -178,9 +178,8 @@ class Capture(Observer):
         samples = -(-self.lanes * self.plan.camera_paths_per_light_path // pixels)
         batch = Batch(0, pixels, 0, samples)
         points = Points("independent", dr.opaque(mi.UInt32, seed))
-        slot = dr.arange(mi.UInt32, self.lanes)
         with stepwise(unbound):
-            dr.eval(kernel.trace(unbound, self, batch, points, samples, slot, self))
+            dr.eval(kernel.trace(unbound, self, batch, points, samples, self))
 
     # What the kernel shows: it has an observer, see `Observer`.
 

@@ -118,7 +118,7 @@ class Recursion:
 
     # -- subpaths -----------------------------------------------------------------------------
 
-    def _fold(self, partial, coefficient, rival, pdf_fwd_w, pdf_rev_w, cos_out, i):
+    def _fold(self, partial, coefficient, kappa_prime, pdf_fwd_w, pdf_rev_w, cos_out, i):
         is_delta = self.path.delta[i]
         # At a delta vertex the densities are unset: zeros must not get through.
         step = SimpleNamespace(
@@ -130,7 +130,7 @@ class Recursion:
         after = mis.scatter(self.h, partial, coefficient, step)
         if self.eta is None:
             return after
-        merges = mis.scattered_merges(self.h, partial, step, self.h.start(self.eta[i]), rival)
+        merges = mis.scattered_merges(self.h, partial, step, self.h.start(self.eta[i]), kappa_prime)
         return mis.Partial(after.d_vcm, after.d_vc, *merges)
 
     def _along_light(self):
@@ -169,7 +169,7 @@ class Recursion:
             found.append(partial)
             if e < k:
                 densities = x.to_light[i], x.to_camera[i]
-                kappa = self._of_camera(e), self._rival(e)
+                kappa = self._of_camera(e), self._kappa_prime(e)
                 partial = self._fold(partial, *kappa, *densities, x.cos_camera[i - 1], i)
         return found
 
@@ -179,9 +179,9 @@ class Recursion:
     def _of_camera(self, e):
         return self.kappa.splat if e == 1 else self.kappa.inner
 
-    def _rival(self, e):
+    def _kappa_prime(self, e):
         """The coefficient beside which a merge at z_e has to count."""
-        return self.kappa.splat_count if e == 1 else self.kappa.inner
+        return self.kappa.splat_prime if e == 1 else self.kappa.inner
 
     # -- strategies ---------------------------------------------------------------------------
 
@@ -195,8 +195,8 @@ class Recursion:
         arrived = mis.to_area(h, before, x.dist2[k - 1], x.cos_camera[k - 1], x.transmittance[k - 1])
         newest = kappa.endpoints if k == 1 else kappa.splat
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
-        rival = kappa.endpoints if k == 1 else kappa.splat_count
-        merges = h.scale(self._before_end(arrived, rival, x.sensor_pdf), x.lens_pdf)
+        kappa_prime = kappa.endpoints if k == 1 else kappa.splat_prime
+        merges = h.scale(self._before_end(arrived, kappa_prime, x.sensor_pdf), x.lens_pdf)
         return h.weigh(kappa.arrival, light_side, mi.Float(0), merges=merges)[0]
 
     def _before_end(self, partial, coefficient, pdf):
@@ -216,7 +216,7 @@ class Recursion:
         x, h, e = self.path, self.h, self.path.k - m
         y, z = self.light[m], self.camera[e]
         light = y, h.scale(y.d_vcm, self._of_light(m)), x.to_light[m]
-        camera = z, h.scale(z.d_vcm, self._rival(e)), x.to_camera[m]
+        camera = z, h.scale(z.d_vcm, self._kappa_prime(e)), x.to_camera[m]
         connections = h.combine(light[1], h.scale(z.d_vcm, self._of_camera(e)))
         return mis.weigh_merge(h, h.start(self.eta[m]), light, camera, connections)
 
@@ -249,7 +249,7 @@ class Recursion:
         light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
         density = x.ratio * x.cos_camera[0]
         z, densities = self.camera[k - 1], (x.to_camera[1], density)
-        merges = self._of_side(z, self._rival(k - 1), *densities, 1.0, 1)
+        merges = self._of_side(z, self._kappa_prime(k - 1), *densities, 1.0, 1)
         camera_side = mis.alternatives(h, z, self._of_camera(k - 1), *densities)
         return self._joined(1, light_side, camera_side, 0, merges)
 
@@ -262,7 +262,7 @@ class Recursion:
         from_light = x.to_camera[s - 1] * x.cos_camera[s - 1] / x.dist2[s - 1]
         y = self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
         z = self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
-        of_z = self._of_side(z[0], self._rival(k - s), *z[2:], kappa.inner, s)
+        of_z = self._of_side(z[0], self._kappa_prime(k - s), *z[2:], kappa.inner, s)
         merges = h.combine(self._of_side(*y, kappa.inner, s - 1), of_z)
         sides = mis.alternatives(h, *y), mis.alternatives(h, *z)
         return self._joined(kappa.inner, *sides, s - 1, merges)
@@ -276,7 +276,7 @@ class Recursion:
         y = self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
         to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
         camera_side = h.scale(h.start(to_sensor), self.arrival)
-        merges = self._of_side(*y, kappa.splat_count, k - 1)
+        merges = self._of_side(*y, kappa.splat_prime, k - 1)
         return self._joined(kappa.splat, mis.alternatives(h, *y), camera_side, k - 1, merges)
 
 

@@ -73,14 +73,14 @@ class Paths:
 
 @dataclass(frozen=True)
 class Coefficients:
-    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1. ``splat_count``: that of t = 1
+    """kappa of each class of strategies; s = 0 and s = 1 with t >= 2 have 1. ``splat_prime``: that of t = 1
     where merges are compared with it."""
 
     endpoints: float = 1.0
     splat: float = 1.0
     inner: float = 1.0
     arrival: float = 1.0
-    splat_count: float = 1.0
+    splat_prime: float = 1.0
 
     def of(self, s: int, k: int) -> float:
         t = k + 1 - s
@@ -203,17 +203,17 @@ def _combined(log_terms, heuristic: str):
 class Merged(Explicit):
     """With merges in further columns, see `mis`. S is the sum of kappa p of all strategies but merges, V that
     of the merges that have at least ``least`` (B) times that of the connection of either edge at their
-    vertex, where t = 1 has `splat_count` for kappa; a path is ``merged`` if V >= B S. ``log_s``, ``log_v``:
+    vertex, where t = 1 has `splat_prime` for kappa; a path is ``merged`` if V >= B S. ``log_s``, ``log_v``:
     their logarithms; ``near``: a comparison is closer than 0.1 %, so that rounding may decide it."""
 
     def __init__(self, paths: Paths, coefficients: Coefficients, eta, least: float, heuristic: str):
         super().__init__(paths, coefficients)
-        k, size, rivals = paths.k, self.size, self.size.copy()
+        k, size, primed = paths.k, self.size, self.size.copy()
         with np.errstate(divide="ignore", invalid="ignore"):
             merges, log_b = log_merges(paths, eta), np.log(least)
             if coefficients.splat and k > 1:
-                rivals[:, k] += np.log(coefficients.splat_count / coefficients.splat)
-            edges = np.maximum(rivals[:, 1:k], rivals[:, 2 : k + 1])  # before and after x_1 ... x_{k-1}
+                primed[:, k] += np.log(coefficients.splat_prime / coefficients.splat)
+            edges = np.maximum(primed[:, 1:k], primed[:, 2 : k + 1])  # before and after x_1 ... x_{k-1}
             over = merges - (log_b + edges)
             merges = np.where(over >= 0, merges, -np.inf)
             self.log_s, self.log_v = _combined(size, heuristic), _combined(merges, heuristic)

@@ -158,12 +158,14 @@ SAID = "'lamp', through or off shape 'block'.*set merging=true"
         (LAMPS["point"], {"ball": BALL | {"center": [30, 0.6, 0]}}, {}, []),
         (LAMPS["point"], {}, {}, []),
         (AREA, {"block": BLOCK}, {}, []),
+        ("own lamp", {"block": BLOCK}, {}, []),
     ],
 )
 def test_a_word_is_said_where_light_is_missing(lamp, shapes, parameters, said):
     """One warning for two renders of the floor beneath glass; none for a glass ball (a thousandth of the
-    light), one out of view, no glass, and a large lamp."""
-    scene = scene_of(lamp, **shapes)
+    light), one out of view, no glass, a large lamp, and one of a class without light subpaths."""
+    parts.register_plugins()
+    scene = scene_of(parts.EMITTERS[lamp]() if lamp == "own lamp" else lamp, **shapes)
     with Warned() as warnings:
         for seed in range(2):
             integrator = bdpt(**parameters)
@@ -359,16 +361,6 @@ def test_lamps_of_several_colours_are_lost_together():
     assert sum(coloured.values()) == pytest.approx(sum(white.values()), rel=0.2)
     parts_of = np.array([*coloured.values()]) / sum(coloured.values())
     np.testing.assert_allclose(parts_of, np.array([1, 0.8, 0.5]) / 2.3, rtol=0.2)
-
-
-def test_nothing_is_looked_for_where_no_light_subpath_starts():
-    """A lamp of a user's own class without area."""
-    parts.register_plugins()
-    glass = {"type": "sphere", "radius": 0.5, "bsdf": GLASS}
-    scene = scene_of(parts.EMITTERS["own lamp"](), glass=glass)
-    integrator = bdpt()
-    integrator.render(scene, spp=4)
-    assert integrator.statistics["unsampled_light"] == {}
 
 
 NEAR = {"type": "point", "position": [0, 0, 1], "intensity": 3.0}

@@ -154,13 +154,3 @@ def test_delta_events_are_of_light_from_either_side(name):
     plain, *_ = drawn(DELTA[name], sample_adjoint)
     weight = np.broadcast_to(np.array(plain.weight).ravel(), COUNT)
     np.testing.assert_allclose(ours[used, 0, 0], weight[used], rtol=2e-3)
-
-
-@pytest.mark.parametrize("name", ["retarder", "dielectric"])
-def test_light_of_the_way_back_has_another_matrix(name):
-    """The tests above are worth nothing where the matrices of both ways are the same."""
-    light, *_ = drawn(DELTA[name], sample_adjoint)
-    camera, *_ = drawn(DELTA[name], bsdf.sample)
-    ours, theirs = matrices(light.weight), matrices(camera.weight)
-    lit = ours[:, 0, 0] > 1e-3
-    assert np.median(difference(ours[lit], theirs[lit])) > 0.05

@@ -94,7 +94,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
         """Mask: a merge at ``vertex`` may count, as far as its side knows.
 
-        ``connection``: ``d_vcm`` times the coefficient of the connection of the edge to it.
+        ``connection``: c of the edge to it.
         """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
         return possible & mis.exceeds(self.kappa_eta(vertex.si.p), connection)
@@ -112,14 +112,14 @@ class Merging(PhotonStrategy, PhotonPolicy):
 
     def is_merged(self, kernel, z, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
-        asks = self.may_merge(kernel, z, _rival(kernel, z))
+        asks = self.may_merge(kernel, z, _connection(kernel, z))
         return asks & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
-        light = mis.Partial(0, y.older, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
-        camera = z.partial, _rival(kernel, z), f.pdf_rev_w
+        light = mis.Partial(0, y.d_vc, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
+        camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
         weight = mis.weigh_merge(h, self.kappa_eta(z.si.p), light, camera, connections)
@@ -148,9 +148,9 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return total, replace(counters, non_finite=lost, merges=merges)
 
 
-def _rival(kernel: TraceContext, z: Vertex) -> mis.PartialSum:
-    """The connection of the edge to the camera vertex ``z``, in comparisons with merges."""
-    return newest_connection(kernel, z, adjoint=False, beside_merges=True)
+def _connection(kernel: TraceContext, z: Vertex) -> mis.PartialSum:
+    """c of the edge to the camera vertex ``z``."""
+    return newest_connection(kernel, z, adjoint=False, prime=True)
 
 
 def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:

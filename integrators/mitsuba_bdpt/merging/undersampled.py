@@ -72,7 +72,7 @@ class Undersampled(Unsampled):
         h, photon, f = kernel.heuristic, found.photon, found.f
         newest = newest_connection(kernel, z, adjoint=False)
         camera = h.combine(newest, h.scale(z.partial.d_vc, f.pdf_rev_w))
-        area = photon.connection + photon.older * f.pdf_fwd_w + camera
+        area = photon.connection + photon.d_vc * f.pdf_fwd_w + camera
         # The render's light subpaths are not aimed.
         return self.samples * area * (found.number * photon.aim / merging.eta(z.si.p))
 

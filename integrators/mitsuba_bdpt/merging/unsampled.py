@@ -122,7 +122,7 @@ def _merged(kernel: TraceContext, merging: Merging, batch: Batch, policy: Unsamp
     def merge(z, size):
         found = draw(kernel, merging, z, sample.stream, shared.wavelength_set)
         active = policy.missing(kernel, merging, z, found, sample.start.position)
-        flaw = dr.select(dr.isfinite(found.photon.older + found.photon.aim), mi.Float(0), dr.nan)
+        flaw = dr.select(dr.isfinite(found.photon.d_vc + found.photon.aim), mi.Float(0), dr.nan)
         value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i

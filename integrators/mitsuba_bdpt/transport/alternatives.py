@@ -18,25 +18,21 @@ def where_lit(kernel: TraceContext, lit: mi.Bool | None) -> mis.Coefficient:
     return direct if lit is None else mis.choose(lit, direct, 0)
 
 
-def newest_coefficient(
-    kernel: TraceContext, vertex, adjoint: bool, beside_merges: bool = False
-) -> mis.Coefficient:
+def newest_coefficient(kernel: TraceContext, vertex, adjoint: bool, prime: bool = False) -> mis.Coefficient:
     """kappa of the newest alternative at ``vertex``, for s >= 1; s = 0 differs: `techniques.hit_emitter`.
 
-    ``beside_merges``: kappa' instead, for comparisons with merges (docs/method/sds_paths.md).
+    ``prime``: kappa' instead, for comparisons with merges (docs/method/sds_paths.md).
     """
     if adjoint:
         first = where_lit(kernel, kernel.space.allows_next_event(vertex))
     else:
-        first = kernel.kappa.splat_count if beside_merges else kernel.kappa.splat
+        first = kernel.kappa.splat_prime if prime else kernel.kappa.splat
     return mis.choose(vertex.edges == 1, first, kernel.kappa.inner)
 
 
-def newest_connection(
-    kernel: TraceContext, vertex, adjoint: bool, beside_merges: bool = False
-) -> mis.PartialSum:
+def newest_connection(kernel: TraceContext, vertex, adjoint: bool, prime: bool = False) -> mis.PartialSum:
     """The newest alternative at ``vertex``: ``d_vcm`` times `newest_coefficient`."""
-    newest = newest_coefficient(kernel, vertex, adjoint, beside_merges)
+    newest = newest_coefficient(kernel, vertex, adjoint, prime)
     return kernel.heuristic.scale(vertex.partial.d_vcm, newest)
 
 
@@ -69,20 +65,20 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: 
     found = mis.alternatives(h, partial, newest, pdf_rev_w, pdf_a)
     if not kernel.sds.merges:
         return found, 0
-    rival = newest_coefficient(kernel, vertex, adjoint, beside_merges=True)
+    kappa_prime = newest_coefficient(kernel, vertex, adjoint, prime=True)
     kappa_eta = kernel.sds.kappa_eta(vertex.si.p)
-    return found, mis.merges(h, partial, rival, pdf_rev_w, pdf_a, own, kappa_eta)
+    return found, mis.merges(h, partial, kappa_prime, pdf_rev_w, pdf_a, own, kappa_eta)
 
 
 def merges_before_end(
-    kernel: TraceContext, partial: mis.Partial, coefficient: mis.Coefficient, pdf: mi.Float
+    kernel: TraceContext, partial: mis.Partial, kappa_prime: mis.Coefficient, pdf: mi.Float
 ) -> mis.PartialSum:
     """Merges before the end of a subpath, on an emitter or the sensor.
 
-    ``pdf``: density of the end and of the direction from there; ``coefficient``: kappa' of the last edge,
-    times the density of the end if ``pdf`` contains it.
+    ``pdf``: density of the end and of the direction from there; ``kappa_prime`` of the last edge, times the
+    density of the end if ``pdf`` contains it.
     """
     if not kernel.sds.merges:
         return 0
-    connection = kernel.heuristic.scale(partial.d_vcm, coefficient)
+    connection = kernel.heuristic.scale(partial.d_vcm, kappa_prime)
     return mis.older_merges(kernel.heuristic, partial, connection, pdf)

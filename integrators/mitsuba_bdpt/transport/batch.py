@@ -114,7 +114,6 @@ class Sharing:
 
     def __init__(self, pixels: int, samples: int, camera_paths: int, seed: mi.UInt32):
         part = -(-pixels // camera_paths)
-        self._parts = camera_paths
         self.total, self.lanes = pixels * samples, part * samples
         bits = max(min(LONGEST_RUN, part // LEAST_RUNS), 1).bit_length() - 1  # of the pixels of a run
         rows, columns = _table_size(part >> bits)
@@ -143,13 +142,6 @@ class Sharing:
             return part * self._lanes + place
 
         return slot
-
-    def lane(self, slot: mi.UInt32) -> mi.UInt32:
-        """The lane of a slot, the inverse of `slots`, from a table of all: for tools."""
-        lane, part = dr.meshgrid(dr.arange(mi.UInt32, self.lanes), dr.arange(mi.UInt32, self._parts))
-        table = dr.zeros(mi.UInt32, self._parts * self.lanes)
-        dr.scatter(table, lane, self.slots(lane)(part))
-        return dr.gather(mi.UInt32, table, slot)
 
 
 def _table_size(runs: int) -> tuple[int, int]:

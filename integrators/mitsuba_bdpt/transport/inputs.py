@@ -33,7 +33,7 @@ KEPT = 64
 class Coefficients:
     """kappa of each class of strategies in all weights, the Python number 0 for classes that are not in use.
 
-    ``splat_count``: ``splat`` without `Plan.kappa_light`.
+    ``splat_prime``: kappa' of t = 1, without `Plan.kappa_light`.
     """
 
     hit: mi.Float | mi.Vector4f | int
@@ -42,7 +42,7 @@ class Coefficients:
     endpoints: mi.Float | mi.Vector4f | int
     arrival: mi.Float | mi.Vector4f | int
     inner: mi.Float | mi.Vector4f | int
-    splat_count: mi.Float | mi.Vector4f | int
+    splat_prime: mi.Float | mi.Vector4f | int
 
 
 @dataclass
@@ -64,8 +64,11 @@ class Observer:
     """Observes the subpaths of a lane during recording, for tools; does nothing.
 
     See `kernel.trace`. Arguments must not be changed. In recorded loops they have no values yet; disable
-    `SymbolicLoops` and `SymbolicConditionals` to read them.
+    `SymbolicLoops` and `SymbolicConditionals` to read them. ``lanes``: traces this many lanes, each with its
+    first camera sample; 0: all.
     """
+
+    lanes = 0
 
     def emitted(self, emission):
         """A light subpath starts: y_0 and the first direction, an `emitters.Emission`."""
@@ -187,5 +190,5 @@ def _coefficients(plan: Plan, by_class: bool) -> Coefficients:
         arrival=entry("light", light, plan.arrival),
         # One of M candidates is not M independent samples (experiments, "Several light subpaths per lane").
         inner=entry("inner", math.sqrt(plan.joined), plan.connections != "none"),
-        splat_count=entry("light", count, plan.splat),
+        splat_prime=entry("light", count, plan.splat),
     )

@@ -64,30 +64,29 @@ def trace(
     batch: Batch,
     points: Points,
     spp: int,
-    slot: mi.UInt32 | None = None,
     observer: Observer | None = None,
 ) -> mi.UInt64:
     """Trace one batch and accumulate its contributions in ``sink`` (see `image.sink`).
 
-    ``spp``: samples per pixel of the render, which place the batch in the image's sequence. Tools trace only
-    the camera samples ``slot``, each with the light subpath of its lane, with an ``observer``. Returns
-    `Counters.summed`; evaluates nothing.
+    ``spp``: samples per pixel of the render, which place the batch in the image's sequence; ``observer``, of
+    tools, may trace some lanes only. Returns `Counters.summed`; evaluates nothing.
     """
     sharing = shared_by(kernel, batch, points)
     # Exact also if S does not divide the pixels; a pilot divides by the number of light subpaths itself.
     count_light = 1.0 if batch.spread else kernel.plan.joined * sharing.lanes / batch.size
     kernel = kernel.bound(points, count_light, observer)
-    index = dr.arange(mi.UInt32, sharing.lanes) if slot is None else sharing.lane(slot)
+    only = kernel.observer.lanes
+    index = dr.arange(mi.UInt32, only or sharing.lanes)
     lane, of_light = _begin(kernel, sink, Places(kernel, batch, spp), index)
 
     def trace_sample(slot) -> Counters:
         active = slot < dr.opaque(mi.UInt32, batch.size)
         return _camera_subpath(kernel, sink, lane, slot, active)
 
-    if kernel.plan.light and slot is None:
+    if kernel.plan.light and not only:
         of_camera = _camera_paths(kernel, sharing.slots(index), trace_sample)
     else:
-        of_camera = trace_sample(index if slot is None else slot)
+        of_camera = trace_sample(index)
     return (of_light + of_camera).summed()
 
 

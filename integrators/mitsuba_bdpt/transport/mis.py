@@ -227,20 +227,22 @@ def exceeds(merges: PartialSum, others: PartialSum):
 def older_merges(h: Heuristic, partial: Partial, connection: PartialSum, pdf_rev_w: mi.Float) -> PartialSum:
     """O: merges at vertices before the last.
 
-    ``connection``: c, ``d_vcm`` times kappa' of the edge to the last vertex.
+    ``connection``: c of the edge to the last vertex, its ``d_vcm`` times kappa'.
     """
     newest = h.scale(partial.d_vm_newest, pdf_rev_w)
     older = h.scale(partial.d_vm, pdf_rev_w)
     return h.combine(older, dr.select(exceeds(newest, connection), newest, 0))
 
 
-def scattered_merges(h: Heuristic, partial: Partial, step: Step, kappa_eta: mi.Float, rival: Coefficient):
+def scattered_merges(
+    h: Heuristic, partial: Partial, step: Step, kappa_eta: mi.Float, kappa_prime: Coefficient
+):
     """``d_vm`` and ``d_vm_newest`` after an event (eqs. 36, 55).
 
-    ``kappa_eta``: eta is the number of photon subpaths times the area of the disc; ``rival``: kappa'
-    of the edge to the vertex. Next to a delta event no edge is connected: the newest merge counts.
+    ``kappa_eta``: eta is the number of photon subpaths times the area of the disc; ``kappa_prime`` of the
+    edge to the vertex. Next to a delta event no edge is connected: the newest merge counts.
     """
-    connection, before = h.scale(partial.d_vcm, rival), h.combine(partial.d_vm, partial.d_vm_newest)
+    connection, before = h.scale(partial.d_vcm, kappa_prime), h.combine(partial.d_vm, partial.d_vm_newest)
     older = older_merges(h, partial, connection, step.pdf_rev_w)
     newest = dr.select(exceeds(kappa_eta, connection), kappa_eta, 0)
     return _folded(h, step, before, older), _folded(h, step, 0, newest)
@@ -249,7 +251,7 @@ def scattered_merges(h: Heuristic, partial: Partial, step: Step, kappa_eta: mi.F
 def merges(
     h: Heuristic,
     partial: Partial,
-    coefficient: Coefficient,
+    kappa_prime: Coefficient,
     pdf_rev_w: mi.Float,
     pdf_a: mi.Float,
     own: Coefficient,
@@ -257,10 +259,10 @@ def merges(
 ) -> PartialSum:
     """Part of V of a connection: merges at the vertices of one subpath, whose last vertex is connected.
 
-    ``coefficient`` and ``own``: kappa' of the edges to and from that vertex; ``pdf_rev_w``, ``pdf_a``: as in
+    ``kappa_prime`` of the edge to that vertex, ``own`` of the connection; ``pdf_rev_w``, ``pdf_a``: as in
     `alternatives`; ``kappa_eta``: there.
     """
-    connection = h.scale(partial.d_vcm, coefficient)
+    connection = h.scale(partial.d_vcm, kappa_prime)
     there = h.scale(kappa_eta, pdf_a)
     there = dr.select(exceeds(kappa_eta, connection) & exceeds(there, own), there, 0)
     return h.combine(there, h.scale(older_merges(h, partial, connection, pdf_rev_w), pdf_a))

@@ -207,7 +207,7 @@ def splat(kernel: TraceContext, y: Vertex, stream: Stream) -> Contribution:
     active = y.endpoint_active & ~spectra.is_zero(value)
 
     densities = f.pdf_rev_w, connection.pdf_w * to_area
-    light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_count)
+    light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_prime)
     camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side
     if kernel.sds.near_specular:
@@ -254,8 +254,8 @@ def hit_sensor(kernel: TraceContext, emission, y: Vertex, walk) -> Contribution:
     partial = mis.to_area(h, before, dist2, z.cos, tr)
     newest = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat)
     light_side = mis.alternatives(h, partial, newest, z.pdf_w, z.pdf_a)
-    rival = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_count)
-    merges = h.scale(merges_before_end(kernel, partial, rival, z.pdf_w), z.pdf_a)
+    kappa_prime = mis.choose(directly, kernel.kappa.endpoints, kernel.kappa.splat_prime)
+    merges = h.scale(merges_before_end(kernel, partial, kappa_prime, z.pdf_w), z.pdf_a)
     if kernel.sds.near_specular:
         active &= ~walk.sds.is_sds_path(walk.edges, newest)
     elif walk.sds is not None:

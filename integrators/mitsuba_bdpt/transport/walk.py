@@ -352,9 +352,9 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
     """
     state, h = vertex.sds, kernel.heuristic
     if side.sds.merges:
-        rival = newest_coefficient(kernel, vertex, side.adjoint, beside_merges=True)
+        kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
         kappa_eta = side.sds.kappa_eta(vertex.si.p)
-        return state, *mis.scattered_merges(h, vertex.partial, step, kappa_eta, rival)
+        return state, *mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
     if state is None:
         return None, 0, 0
     state = state.after(h, vertex, coefficient, step)

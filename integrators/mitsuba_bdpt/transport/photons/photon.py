@@ -14,9 +14,9 @@ class Photon:
     """A stored light vertex, or arrays of many.
 
     ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
-    throughput, not divided by the number of subpaths. Partial sums, see `mis`: ``connection``, its ``d_vcm``
-    times the coefficient of the connection of the last edge; ``older``, its ``d_vc``; ``d_vm`` and
-    ``d_vm_newest``. ``aim``: the emitter's own density of the first direction over that of `Aim`;
+    throughput, not divided by the number of subpaths. Partial sums, see `mis`: ``connection`` (c), its
+    ``d_vcm`` times the coefficient of the connection of the last edge; ``d_vc``, ``d_vm``, ``d_vm_newest``.
+    ``aim``: the emitter's own density of the first direction over that of `Aim`;
     ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``:
     index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`.
     """
@@ -26,7 +26,7 @@ class Photon:
     n: mi.Normal3f
     flux: mi.Spectrum
     connection: mi.Float
-    older: mi.Float
+    d_vc: mi.Float
     d_vm: mi.Float
     d_vm_newest: mi.Float
     aim: mi.Float

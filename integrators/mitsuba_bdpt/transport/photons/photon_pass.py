@@ -122,7 +122,7 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
             n=y.si.n,
             flux=y.throughput / probability,
             connection=present(newest_connection(kernel, y, adjoint=True)),
-            older=present(y.partial.d_vc),
+            d_vc=present(y.partial.d_vc),
             d_vm=present(y.partial.d_vm),
             d_vm_newest=present(y.partial.d_vm_newest),
             aim=aimed,
