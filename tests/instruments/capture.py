@@ -92,6 +92,17 @@ def stepwise(kernel_):
         yield
 
 
+def run(kernel_, recorder, seed: int):
+    """Trace ``recorder.lanes`` lanes; the recorder is sink and observer."""
+    pixels = int(np.prod(kernel_.camera.region.size))
+    # So many that each of the lanes has a light subpath of its own.
+    samples = -(-recorder.lanes * kernel_.plan.camera_paths_per_light_path // pixels)
+    batch = Batch(0, pixels, 0, samples)
+    points = Points("independent", dr.opaque(mi.UInt32, seed))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), stepwise(kernel_):
+        dr.eval(kernel.trace(kernel_, recorder, batch, points, samples, recorder))
+
+
 def rows(v) -> np.ndarray:
     return float64(v).T
 
@@ -161,8 +172,7 @@ class Capture(Observer):
         self.tables = None if self.plan.emission is None else Tables(scene, self.plan.emission)
         self.walked = {"light": Walked(), "camera": Walked()}
         self.found, self.endpoint = {}, {}
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False):
-            self._run(render.kernel, seed)
+        run(render.kernel, self, seed)
 
     @property
     def coefficients(self) -> Coefficients:
@@ -170,18 +180,7 @@ class Capture(Observer):
         names = ("endpoints", "splat", "inner", "arrival")
         return Coefficients(*(float(np.array(getattr(kappa, name)).ravel()[0]) for name in names))
 
-    # -- the run ----------------------------------------------------------------------------
-
-    def _run(self, unbound, seed: int):
-        pixels = int(np.prod(unbound.camera.region.size))
-        # So many that each of the lanes has a light subpath of its own.
-        samples = -(-self.lanes * self.plan.camera_paths_per_light_path // pixels)
-        batch = Batch(0, pixels, 0, samples)
-        points = Points("independent", dr.opaque(mi.UInt32, seed))
-        with stepwise(unbound):
-            dr.eval(kernel.trace(unbound, self, batch, points, samples, self))
-
-    # What the kernel shows: it has an observer, see `Observer`.
+    # -- what the kernel shows an `Observer` ---------------------------------------------------
 
     def emitted(self, emission):
         dr.eval(emission)

@@ -10,7 +10,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5320,
-    "transport merging guided_emission": 5726,
+    "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
     "cli": 1463,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28763}
-MOST_WORDS = 28850
+OUTSIDE = {"scripts": 2961, "tests": 28668}
+MOST_WORDS = 28893
 
 
 def _lines(files):

@@ -14,15 +14,13 @@ import numpy as np
 import pytest
 from mitsuba_bdpt import settings
 from mitsuba_bdpt.run import rendering
-from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import connections, kernel, techniques
-from mitsuba_bdpt.transport.batch import Batch
+from mitsuba_bdpt.transport import connections, techniques
 from mitsuba_bdpt.transport.contribution import Counters
 from mitsuba_bdpt.transport.inputs import Observer
 from test_oracle import check
 
 from instruments import endpoints, oracle
-from instruments.capture import rows, stepwise
+from instruments.capture import rows, run
 from instruments.chains import COEFFICIENTS, random_paths, recursion
 from instruments.oracle import AREA, POSITION
 
@@ -170,11 +168,7 @@ class Recorder(Observer):
 def recorded(scene, integrator):
     """All paths of one run of the kernel, and the extinction (1 / scene unit) of T~."""
     render, recorder = rendering.Render(scene, scene.sensors()[0], integrator.settings, 5, 1), Recorder()
-    pixels = int(np.prod(render.kernel.camera.region.size))
-    samples = -(-LANES * render.plan.camera_paths_per_light_path // pixels)
-    batch, points = Batch(0, pixels, 0, samples), Points("independent", dr.opaque(mi.UInt32, 5))
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, False), stepwise(render.kernel):
-        dr.eval(kernel.trace(render.kernel, recorder, batch, points, samples, recorder))
+    run(render.kernel, recorder, 5)
     (sigma,) = render.kernel.space.media.mean(render.kernel.sensor_medium).numpy()
     return recorder.paths, float(sigma)
 
