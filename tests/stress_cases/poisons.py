@@ -11,15 +11,9 @@ from .rooms import filled, room
 NAN, INF = float("nan"), float("inf")
 
 
-class Scales:
-    """The numbers that a poisoned plugin multiplies with, by what they multiply; 1 where none is given."""
-
-    def __init__(self, props, *names):
-        self._factors = {name: dr.opaque(mi.Float, props.get(name, 1.0)) for name in names}
-
-    def of(self, name, where):
-        """The factor of ``name`` at the places in ``where``, else 1."""
-        return dr.select(where, self._factors[name], 1)
+def factors(props, *names):
+    """What a poisoned plugin multiplies with, by what it multiplies; 1 where nothing is given."""
+    return {name: dr.opaque(mi.Float, props.get(name, 1.0)) for name in names}
 
 
 @cache
@@ -27,7 +21,7 @@ def register(variant: str):
     """Register the plugins ``poison`` (a BSDF) and ``poison_lamp`` (an emitter) for a variant."""
 
     class Poison(mi.BSDF):
-        """Diffuse; where u > 0.5, the scales multiply what it answers.
+        """Diffuse; where u > 0.5, factors multiply what it answers.
 
         The sampled weight, the direction, eta, the value, the density.
         """
@@ -37,10 +31,10 @@ def register(variant: str):
             self.inner = mi.load_dict({"type": "diffuse", "reflectance": 0.6})
             self.m_flags = self.inner.flags()
             self.m_components = [self.m_flags]
-            self.scales = Scales(props, "weight", "direction", "eta", "eval", "pdf")
+            self.factors = factors(props, "weight", "direction", "eta", "eval", "pdf")
 
         def scale(self, name, si):
-            return self.scales.of(name, si.uv.x > 0.5)
+            return dr.select(si.uv.x > 0.5, self.factors[name], 1)
 
         def sample(self, ctx, si, u1, u2, active=True):
             bs, weight = self.inner.sample(ctx, si, u1, u2, active)
@@ -62,7 +56,7 @@ def register(variant: str):
             return "Poison[]"
 
     class PoisonLamp(mi.Emitter):
-        """Surroundings of radiance 1; in half of all directions the scales multiply radiance and density.
+        """Surroundings of radiance 1; in half of all directions factors multiply radiance and density.
 
         The half is x > 0. The weight of a sampled direction is what a sound density would make it.
         """
@@ -70,10 +64,10 @@ def register(variant: str):
         def __init__(self, props):
             super().__init__(props)
             self.m_flags = int(mi.EmitterFlags.Infinite)
-            self.scales = Scales(props, "eval", "pdf")
+            self.factors = factors(props, "eval", "pdf")
 
         def scale(self, name, d):
-            return self.scales.of(name, d.x > 0)
+            return dr.select(d.x > 0, self.factors[name], 1)
 
         def sample_direction(self, it, sample, active=True):
             d = mi.warp.square_to_uniform_sphere(sample)
