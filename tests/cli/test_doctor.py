@@ -83,7 +83,7 @@ def test_what_fails_is_said(monkeypatch):
     wrong = [child(0, f'{{"llvm": "23", "mean": {mean}}}') for mean in ("0.0", "NaN", "1e9")]
     found = [found for process in (*wrong, hang) for found in doctor.render_in_child("llvm_ad_rgb", process)]
     for finding, text in zip(
-        (*found, doctor.versions()[-1]),
+        (*found, [*doctor.versions()][-1]),
         (*["its mean is"] * 3, "not finished", "pip install surely-not-installed"),
         strict=True,
     ):

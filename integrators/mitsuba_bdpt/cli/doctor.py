@@ -74,21 +74,17 @@ def findings(variant: str) -> Iterator[Finding]:
         yield from render_in_child(variant)
 
 
-def versions() -> list[Finding]:
-    findings = [
-        Finding("ok", "python", f"{platform.python_version()}, {sys.executable}"),
-        Finding("ok", "platform", f"{platform.system()} {platform.machine()}"),
-        Finding("ok", "mitsuba-bdpt", mitsuba_bdpt.__version__),
-    ]
+def versions() -> Iterator[Finding]:
+    yield Finding("ok", "python", f"{platform.python_version()}, {sys.executable}")
+    yield Finding("ok", "platform", f"{platform.system()} {platform.machine()}")
+    yield Finding("ok", "mitsuba-bdpt", mitsuba_bdpt.__version__)
     for package in PACKAGES:
         try:
-            findings.append(Finding("ok", package, importlib.metadata.version(package)))
+            yield Finding("ok", package, importlib.metadata.version(package))
         except importlib.metadata.PackageNotFoundError:
             # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
             state = "note" if package == llvm.WHEEL else "FAIL"
-            text = f"not installed; mend it with: python -m pip install {package}"
-            findings.append(Finding(state, package, text))
-    return findings
+            yield Finding(state, package, f"not installed; mend it with: python -m pip install {package}")
 
 
 def llvm_library() -> Finding:
@@ -98,9 +94,8 @@ def llvm_library() -> Finding:
         return Finding("FAIL", subject, str(failure))
     if choice.version in llvm.KNOWN_GOOD or not (choice.path or choice.version):
         return Finding("ok", "LLVM", str(choice))
-    return Finding(
-        "note", "LLVM", f"{choice}; versions known to work: {', '.join(map(str, llvm.KNOWN_GOOD))}"
-    )
+    known = ", ".join(map(str, llvm.KNOWN_GOOD))
+    return Finding("note", "LLVM", f"{choice}; versions known to work: {known}")
 
 
 def kernel_cache() -> Finding:
