@@ -204,10 +204,11 @@ def test_kinds_that_take_part_partly_beside_others():
     """A point light, a plugin of unknown class, a `directionalarea` and an area light together make the sum
     of their images: none keeps others from what they can do, nor is chosen where it cannot be used."""
     parts.register_plugins()
+    coloured_beam = {"type": "directionalarea", "radiance": scenes.rgb(2, 3, 4)}
     lamps = {
         "a": parts.EMITTERS["sphere"](),
         "b": parts.EMITTERS["own lamp"](),
-        "c": beam((0.3, 2.6, 0.6), 0.3),
+        "c": scenes.square((0.3, 2.6, 0.6), scenes.DOWNWARDS, 0.3, parts.grey(0.0), emitter=coloured_beam),
         "d": parts.EMITTERS["textured projector"](),
     }
     alone = 0
@@ -228,24 +229,8 @@ def unlit(part):
 
 # -- known answers ----------------------------------------------------------------------------
 
-DIRECTIONAL_AREA = {"type": "directionalarea", "radiance": {"type": "rgb", "value": [2.0, 3.0, 4.0]}}
 
-
-def beam(at, size):
-    """A lamp that shines straight down."""
-    return scenes.square(at, scenes.DOWNWARDS, size, parts.grey(0.0), emitter=DIRECTIONAL_AREA)
-
-
-def test_directionalarea_by_inner_connections():
-    """(2,2) and (3,1) make the same paths, and nothing else checks them with such a lamp."""
-    method = bdpt(layers="strategies")
-    images = renders(parts.pair("directionalarea", "perspective"), method, 4 * SAMPLES, 0)
-    inner, splat = (layer(images, method, "unweighted", s, 4 - s) for s in (2, 3))
-    precise(inner, 0.02, "inner")
-    assert_agree([paired(inner, splat, "(2,2) against (3,1)")])
-
-
-def meters_under_a_point(width, **others):
+def meters_under_a_point(width):
     """A batch of two meters that look up at a point light, one of them twice as large as the other."""
 
     def plate(x, scale):
@@ -254,7 +239,7 @@ def meters_under_a_point(width, **others):
 
     film = parts.film(size=1) | {"width": width, "height": 1}
     batch = {"type": "batch", "left": plate(-0.5, 0.2), "right": plate(0.3, 0.4), "film": film}
-    scene = {"type": "scene", "sensor": batch, "lamp": LAMPS_ABOVE["point"][0]()} | others
+    scene = {"type": "scene", "sensor": batch, "lamp": LAMPS_ABOVE["point"][0]()}
     return mi.load_dict(scene, optimize=False)  # else Mitsuba makes one meter of equal ones
 
 
@@ -272,17 +257,6 @@ def test_batch_of_meters_reads_the_known_irradiance(width):
         known += [part.mean() * CHANNELS.sum() for part in np.split(irradiance, width // 2, axis=1)]
     assert_agree([st.one_sample(values, known, f"{width} pixels")])
     assert (values.std(0) < 0.05 * values.mean(0)).all()  # known well enough to mean something
-
-
-def test_strategies_of_a_batch_of_meters_agree():
-    """Meters side by side share the densities of one; a wrong one would show in the weights."""
-    lamp = LAMPS_ABOVE["rectangle"][0]()
-    mirror = {"type": "rectangle", "to_world": T().translate([0, 0, -1]), "bsdf": {"type": "conductor"}}
-    floor = scenes.floor(-0.2, 3)
-    scene = meters_under_a_point(2, lamp=lamp, mirror=mirror, floor=floor)
-    both = [renders(scene, bdpt(**o), SAMPLES, i) for i, o in enumerate(({}, {"light_paths": 0}))]
-    a, b = (images[:, 0, :, :3] @ CHANNELS for images in both)
-    assert_agree([st.welch(a, b, "meters")])
 
 
 def test_meter_of_another_scene():

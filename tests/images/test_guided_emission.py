@@ -77,15 +77,6 @@ def test_the_best_table_of_paths_that_emission_alone_makes():
     assert learnt.whole == pytest.approx(learnt.variance_ratio, rel=0.05)
 
 
-def test_what_camera_subpaths_find_as_well_is_not_aimed_at():
-    """No tables where emission has a 256th part in the densities, whatever the moments are."""
-    squares = np.ones((16, 16))
-    squares[3:5, 7:9] = 1e4
-    assert learning.learn(statistics_of(squares, 4.0**-4), 16, [1]).whole > 0.95
-    few = statistics_of(squares, 4.0**4) * 1e-3 + statistics_of(np.full((16, 16), 1e4), 4.0**-4)
-    assert learning.learn(few, 16, [1]).whole > 0.95
-
-
 def test_the_best_table_of_unequal_shares():
     """l has to count where it differs from cell to cell. What is left is within 2 % of the least that a
     search finds, over densities that have two values (no blur: the two halves are large)."""
@@ -232,18 +223,6 @@ def test_it_gains_and_says_so():
     text = auto[0][1].explain(scene, spp=64)
     assert "used: guided emission (predicted to lower squared errors of light subpaths to" in text
     assert "skipped (by hand): guided emission: guiding=photons" in never[0][1].explain(scene, spp=64)
-
-
-def test_where_nothing_is_gained_nothing_changes():
-    light = {"type": "point", "position": [0, 0, 0], "intensity": 1.0}
-    ball = {"type": "sphere", "radius": 2.0, "flip_normals": True, "bsdf": parts.grey(0.7)}
-    eye = parts.perspective(origin=[0, 0, 1], target=[0, 0, 0], fov=90) | {"film": parts.film(32)}
-    scene = mi.load_dict({"type": "scene", "sensor": eye, "ball": ball, "light": light})
-    a, method = rendered(scene)
-    b, _ = rendered(scene, guiding="photons")
-    np.testing.assert_allclose(a, b, **ROUNDING)
-    (why,) = (s["why"] for s in method.statistics["skipped"] if s["class"] == "guided emission")
-    assert "subpaths; they are used below 93%" in why
 
 
 def test_many_lamps_have_small_tables_or_none():

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 import welch as st
 from meshes import ball_mesh
-from scipy import integrate
 from tables import Table
 
 from scenes import (
@@ -178,39 +177,54 @@ def unequal_sampling_weights(one, other):
     return Row(scene, None, 0, 256, {"max_depth": 3}, layers=alone | {3: (0.25, 0.01)})
 
 
-PLACES = ((0, 0, 0.7), (0, 0.1, 0.5)), ((0.3, 0.5, 0.4), (0.3, 0, 0.2)), ((-0.6, 0.1, 0.3), (0.2, -0.6, 0.1))
-PANES = (
-    (True, False, "point"),
-    (False, True, "point"),
-    (True, True, "point"),
-    (True, True, "area"),
-    (True, False, "area"),
-)
-
-
-@known("all", of=[(*panes, i) for panes in PANES for i in range(3)])
-def panes(at_lamp, at_camera, emitter, place):
-    """LuxCore #678: brightness depended on the distance for certain paths. A pane around the lamp leaves t =
-    1 and inner connections (and s = 0 if it has an area), one around the camera s = 1 and inner ones, both
-    inner ones alone. After two reflections the radiance is 1/4 wherever lamp and camera are; panes take 0.15
-    % at most."""
-    lamp, eye = PLACES[place]
-    scene = {"sensor": camera(origin=eye, target=(0.1, 0.1, -1), fov=50, size=8, near=1e-3), "wall": sphere()}
-    null = {"type": "sphere", "bsdf": {"type": "null"}}
-    if emitter == "point":
-        scene["lamp"] = {"type": "point", "position": list(lamp), "intensity": float(np.pi)}
-    else:  # of the same flux
-        scene["lamp"] = null | {"radius": 0.005, "center": list(lamp), "emitter": area(1 / 0.005**2)}
-    for name, at in (("a", lamp), ("b", eye)):
-        if at_lamp if at is lamp else at_camera:
-            scene[name] = null | {"radius": 0.01, "center": list(at)}
-    edges = 3 + at_lamp + at_camera
-    layers = {edges: (0.25, 0.04)}
-    return Row(scene, None, 0, 512, {"max_depth": edges}, layers=layers, rounding=1.5e-3)
-
-
 def glass(**more):
     return {"type": "sphere", "bsdf": {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}, **more}
+
+
+# Parameters, and what error the weighted sums can show.
+CONFIGURATIONS = {
+    "everything": ({"skip": "none"}, 3e-3),
+    "K=2": ({"skip": "none", "stored_vertices": 2}, 3e-3),
+    "light_paths=1/4": ({"skip": "impossible", "light_paths": "1/4"}, 3e-3),
+    "power, 1/2": ({"skip": "impossible", "heuristic": "power", "light_paths": 0.5}, 3e-3),
+    "light_paths=0": ({"skip": "none", "light_paths": 0}, 3e-3),
+    "no connections": ({"skip": "none", "connections": "none"}, 5e-3),
+}
+
+
+@known("default", of=[(kind, name) for kind in ("point", "emission") for name in CONFIGURATIONS])
+def every_path_length(kind, name):
+    """The weighted strategies of each path length add up to 2^-m, and so does each unweighted one that can
+    make the path (5e-2, for t = 1), also with stored vertices short of the path length; others are 0."""
+    (parameters, tolerance), layers = CONFIGURATIONS[name], {}
+    for k in range(1 if kind == "emission" else 2, 6):
+        layers[k] = radiance(kind, k), tolerance
+        for s in range(k + 1):
+            traced, t = s >= 2 or s == k == 1, k + 1 - s
+            off = kind == "point" and (s == 0 or k == 1)
+            off |= name == "no connections" and s >= 2 <= t
+            off |= traced and (name == "light_paths=0" or k > parameters.get("stored_vertices", 64))
+            layers[f"s{s}t{t}"] = (0, 0) if off else (radiance(kind, k), 5e-2)
+    return Row(sphere_lit_by(kind), None, 0, 256, {"max_depth": 5} | parameters, layers=layers)
+
+
+@known("all", "power", of=[(sensor, kind) for sensor in ("meter", "lens") for kind in ("point", "emission")])
+def sensor_with_area(sensor, kind):
+    """With t = 0 a path of k edges has k + 2 strategies. The meter is the sphere itself, the lens one that a
+    hundredth of all light hits within its view; it sees the point lamp as a disk out of focus, of which a
+    part is on the film: k = 1 is left out."""
+    first = 1 if kind == "point" else 0
+    if sensor == "meter":
+        scene, unit, spp, least = sphere_lit_by(kind), np.pi, 1 << 15, 1
+        del scene["sensor"]
+        scene["wall"] |= {"flip_normals": True, "sensor": meter()}
+    else:
+        lens = thinlens(**EYE, size=4, aperture_radius=0.3, focus_distance=1.0)
+        scene, unit, spp, least = sphere_lit_by(kind, lens), 1, 1 << 13, 1 + first
+    known = {k: unit * 0.5 ** (k - first) for k in range(least, 4)}
+    layers = {k: (value, 0.02) for k, value in known.items()}
+    layers |= {f"s{s}t{k + 1 - s}": (v, 0.15) for k, v in known.items() for s in range(first, k + 2)}
+    return Row(scene, None, 0, spp, {"max_depth": 3, "skip": "none"}, layers=layers)
 
 
 @known("all", "default")
@@ -579,24 +593,6 @@ def slab_under_the_sun(kind):
     return Row(scene, expected, 0.05, 1 << 14, {"max_depth": 2}, seeds=12)
 
 
-@known(*MEDIA, of=("", "and a speck"))
-def airlight(speck):
-    """A ray at the distance h from a point lamp in endless fog: sigma_s rho I int e^(-sigma (t + d)) / d^2
-    dt."""
-    sigma, albedo, h, near = 0.6, 0.7, 0.3, 1e-3  # the fog begins at the near plane
-    eye = camera(origin=(h, 0, 1), target=(h, 0, 0), fov=0.05, size=1, near=near)
-    scene = {"sensor": eye | {"medium": fogs.fog(sigma, albedo, 0.0), "far_clip": 1e4}}
-    scene["lamp"] = {"type": "point", "position": [0, 0, 0], "intensity": 3.0}
-    scene |= {"speck": fogs.ball(matte(0), 1e-3, (3, 0, 0))} if speck else {}
-
-    def along(t):
-        d2 = h * h + (1 - t) ** 2
-        return sigma * albedo / (4 * np.pi) * 3.0 * np.exp(-sigma * (t - near + np.sqrt(d2))) / d2
-
-    expected, _ = integrate.quad(along, near, 60, points=[1.0], limit=400)
-    return Row(scene, expected, 0.05, 1 << 15, {"max_depth": 2}, seeds=12)
-
-
 # -- media: all orders of scattering ------------------------------------------------------------
 
 
@@ -847,112 +843,6 @@ def test_known_answer(make, way):
         )
         present = [n for n in names if f"{n}.R" in method.aov_names()]
         check(sum(layer(images, method, n) for n in present).mean((1, 2, 3)), expected, tolerance)
-
-
-# -- what needs more than one mean --------------------------------------------------------------
-
-
-def test_white_slab_reflects_what_it_does_not_transmit():
-    """By reciprocity a slab of albedo 1 under a lid of radiance 1, seen from above and from below at one
-    cosine, sums to 1; 5e-4 of it leaves at the edges, in `volpath` too."""
-    lid = square((0, 0, 4), ([1, 0, 0], 180), 1000, matte(0), emitter=area(1.0))
-    medium, method, found = slab(fogs.fog(1.5, 1.0), wide=100.0), integrator(light_paths=0, max_depth=200), []
-    for side in (1, -1):
-        eye = camera(origin=(2.1, 0, 2.8 * side), target=(0, 0, 0), fov=0.01, size=4, near=1e-3)
-        found.append(renders(load(sensor=eye, slab=medium, lid=lid), method, 4096, 12).mean((1, 2)))
-    check(sum(found).mean(1) / (1 - 5e-4), 1.0, 0.01)
-
-
-# -- each strategy ------------------------------------------------------------------------------
-
-# Parameters, and what error the weighted sums can show.
-CONFIGURATIONS = {
-    "everything": ({"skip": "none"}, 3e-3),
-    "K=2": ({"skip": "none", "stored_vertices": 2}, 3e-3),
-    "light_paths=1/4": ({"skip": "impossible", "light_paths": "1/4"}, 3e-3),
-    "power, 1/2": ({"skip": "impossible", "heuristic": "power", "light_paths": 0.5}, 3e-3),
-    "light_paths=0": ({"skip": "none", "light_paths": 0}, 3e-3),
-    "no connections": ({"skip": "none", "connections": "none"}, 5e-3),
-}
-
-
-def strategy(images, method, kind, s, t):
-    """Means over pixels of a strategy's layer, for each seed."""
-    return layer(images, method, f"{kind}.s{s}t{t}").mean((1, 2, 3))
-
-
-@pytest.mark.parametrize("kind", ["point", "emission"])
-@pytest.mark.parametrize("name", CONFIGURATIONS)
-def test_every_path_length_in_the_unit_sphere(kind, name):
-    """Expected: the weighted strategies of each path length add up to 2^-m, and so does each unweighted one
-    that can make the path (5e-2, for t = 1), also with stored vertices short of the path length; others are
-    0."""
-    depth, (parameters, tolerance) = 5, CONFIGURATIONS[name]
-    method = integrator(max_depth=depth, layers="strategies", **parameters)
-    images = renders(load(**sphere_lit_by(kind)), method, 256, 16)
-    lengths = range(1 if kind == "emission" else 2, depth + 1)
-    weighted = {
-        k: [strategy(images, method, "weighted", s, k + 1 - s) for s in range(k + 1)] for k in lengths
-    }
-    sums = np.stack([sum(of_length) for of_length in weighted.values()], axis=1)
-    check(sums, [radiance(kind, k) for k in lengths], tolerance)
-    np.testing.assert_allclose(sums.sum(1), images[..., :3].mean((1, 2, 3)), rtol=1e-4)
-    stored = parameters.get("stored_vertices", 64)
-    for k in lengths:
-        for s in range(k + 1):
-            t = k + 1 - s
-            off = ((s == 0 or (s == 1 and t == 1)) and kind == "point") or (
-                name == "no connections" and s >= 2 <= t
-            )
-            off |= (s >= 2 or (s, t) == (1, 1)) and (name == "light_paths=0" or k > stored)
-            found = strategy(images, method, "unweighted", s, t)
-            if off:
-                assert np.all(found == 0), (s, t)
-            else:
-                check(found, radiance(kind, k), 5e-2)
-
-
-def metered_sphere(kind):
-    """The sphere of `sphere_lit_by`, itself the meter of what its inside receives; also the irradiance by
-    paths of k edges (light of radiance L from everywhere: pi L; the lamp alone: pi / 1^2)."""
-    lit = sphere_lit_by(kind)
-    scene = {name: part for name, part in lit.items() if name != "sensor"}
-    scene["wall"] |= {"flip_normals": True, "sensor": meter()}
-    return scene, lambda k: np.pi * 0.5 ** (k - 1 if kind == "point" else k)
-
-
-def wide_lens(kind):
-    """A thin lens that a hundredth of all light hits within its view. It sees the point lamp itself as a disk
-    out of focus, of which a part is on the film: k = 1 is left out."""
-    scene = sphere_lit_by(kind, thinlens(**EYE, size=4, aperture_radius=0.3, focus_distance=1.0))
-    return scene, lambda k: None if kind == "point" and k == 1 else radiance(kind, k)
-
-
-@pytest.mark.parametrize("kind", ["point", "emission"])
-@pytest.mark.parametrize("heuristic", ["balance", "power"])
-@pytest.mark.parametrize("sensor", [metered_sphere, wide_lens])
-def test_all_strategies_of_sensors_with_area(sensor, heuristic, kind):
-    """With t = 0 a path of k edges has k + 2 strategies. Expected: the weighted ones add up to the known
-    value (2 %), and each unweighted one has it (15 %)."""
-    scene, answer = sensor(kind)
-    method = integrator(max_depth=3, layers="strategies", skip="none", heuristic=heuristic)
-    images = renders(load(**scene), method, 1 << 15 if sensor is metered_sphere else 1 << 13, 16)
-    for k in (1, 2, 3):
-        if (expected := answer(k)) is None:
-            continue
-        check(sum(strategy(images, method, "weighted", s, k + 1 - s) for s in range(k + 2)), expected, 2e-2)
-        for s in range(1 if kind == "point" else 0, k + 2):
-            check(strategy(images, method, "unweighted", s, k + 1 - s), expected, 0.15)
-
-
-def test_t_0_is_explained():
-    scene, _ = metered_sphere("point")
-    assert "used: t=0" in integrator().explain(load(**scene))
-    parallel = {key: value for key, value in camera().items() if key != "fov"} | {"type": "orthographic"}
-    for sensor, why in ((camera(), "pinhole"), (parallel, "one direction")):
-        lines = integrator().explain(load(**sphere_lit_by("point", sensor))).splitlines()
-        (line,) = (x for x in lines if ": t=0:" in x)
-        assert line.startswith("skipped (impossible): t=0") and why in line
 
 
 @pytest.mark.parametrize("skip", ["none", "auto"])

@@ -1,16 +1,13 @@
 """Light groups: layers of the image by emitter."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-import variants
 from internals import bdpt
 from layered import JOINED, LAMPS, check_sum, layers, scene
 from mitsuba_bdpt import mix
 from mitsuba_bdpt.emitters.light_groups import LightGroups
 from mitsuba_bdpt.emitters.tables import in_order
-from mitsuba_bdpt.image.accumulator import reduce_mode
 from sds_scenes import point, under_glass
 from snapshots import ROUNDING, stopped
 from warned import Warned
@@ -88,22 +85,6 @@ def test_mixed_light_is_that_of_other_lamps():
     np.testing.assert_allclose(mixed, expected, rtol=1e-4, atol=2e-5 * expected.max())
 
 
-@pytest.mark.skipif(variants.BACKEND != "llvm", reason="threads are those of a CPU")
-def test_sums_are_copied_for_each_thread_where_that_pays(monkeypatch):
-    """On few threads always; on many with many samples per pixel, and if the copies are small."""
-    for threads, numbers, samples, mode in (
-        (2, 1 << 20, 1, dr.ReduceMode.Expand),
-        (16, 1 << 20, 8, dr.ReduceMode.Local),
-        (16, 1 << 20, 16, dr.ReduceMode.Expand),
-        (2, 1 << 28, 64, dr.ReduceMode.Local),
-    ):
-        monkeypatch.setattr(dr, "thread_count", lambda threads=threads: threads)
-        assert reduce_mode(numbers, samples) == mode
-    monkeypatch.setattr(dr, "thread_count", lambda: 32)
-    modes = [reduce_mode(1 << 20, 1, additions, dr.ReduceMode.Direct) for additions in (1023, 1024)]
-    assert modes == [dr.ReduceMode.Direct, dr.ReduceMode.Expand]
-
-
 def test_each_emitter_has_its_own_group():
     target = scene()
     made = LightGroups.of(target, "auto")
@@ -127,20 +108,6 @@ def test_emitters_without_id_go_by_their_plugin():
     same = LightGroups.of(target, "area: area; area_2: area_2; constant: constant")
     assert (same.names, same.of_emitters) == (made.names, made.of_emitters)
     assert LightGroups.of(target, "lamps: area*").of_emitters.count(0) == 2
-
-
-def test_names_of_layers_are_names_of_emitters():
-    """A group may name an emitter as ``auto`` does: with signs that a layer cannot have as _, and those
-    without id by the numbers that ids leave."""
-    lamp = '<shape type="sphere"{}><emitter type="area"/></shape>'
-    lamps = "".join(lamp.format(f' id="{i}"' if i else "") for i in ("", "", "key.1", "area_2", "rest"))
-    target = mi.load_string(f'<scene version="3.0.0">{lamps}</scene>')
-    made = LightGroups.of(target, "auto")
-    assert made.names == ("area", "area_2", "area_3", "key_1", "rest_2")
-    assert made.of_emitters == LightGroups.of(target, "; ".join(f"{n}: {n}" for n in made.names)).of_emitters
-    of_id = {e.get_shape().id(): g for e, g in zip(target.emitters(), made.of_emitters, strict=True)}
-    assert (of_id["area_2"], of_id["key.1"], of_id["rest"]) == (1, 3, 4)
-    assert LightGroups.of(target, "key: key.1").of_emitters.count(0) == 1
 
 
 def _points(*ids):

@@ -261,14 +261,6 @@ def test_an_infinite_voxel_ends():
     assert np.isfinite(np.array(image)).all() and method.statistics["non_finite"] > 0
 
 
-def test_sample_emitters_off_saves_shadow_rays():
-    rays, method = [], integrator(skip="none", max_depth=4)
-    for value in (False, True):
-        method.render(mi.load_dict(parts.foggy(parts.fog(1.5, 0.9, sample_emitters=value))), spp=16)
-        rays.append(method.statistics["rays"]["shadow_s1"])
-    assert 0 < rays[0] < 0.8 * rays[1]
-
-
 # -- what is explained and refused ---------------------------------------------------------------------
 
 

@@ -5,17 +5,22 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy connects two neighbours of that path; point lamps are found by merging alone.
 """
 
+from functools import cache
 from types import SimpleNamespace
 
+import internals
 import mitsuba as mi
 import numpy as np
 import pytest
 import welch as st
+from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
 from mitsuba_bdpt.merging.radius import Footprints
+from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import rendering
+from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.sampling.points import Points
-from mitsuba_bdpt.transport import mis
+from mitsuba_bdpt.transport import light_path, mis, sds
 from mitsuba_bdpt.transport.photons import aim, photon_pass
 from mitsuba_bdpt.transport.photons.photon import Photon
 from sds_scenes import (
@@ -32,6 +37,8 @@ from sds_scenes import (
     images,
     matte,
     point,
+    principled,
+    rough,
     strategy_images,
     sun,
     transform,
@@ -268,22 +275,6 @@ def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
     assert done == [*range(1, 55)]
 
 
-def test_joined_renders_are_their_mean():
-    """To rounding of sums (box filter); they are not unbiased."""
-    scene, parts = mi.load_dict(under_glass(point())), ((1, 16), (2, 32))
-    whole, *methods = (bdpt(merging=True, spp_per_pass=8) for _ in range(3))
-    snapshots = [
-        stopped(method, scene, None, seed=seed, spp=spp).image_only()
-        for method, (seed, spp) in zip(methods, parts, strict=True)
-    ]
-    image = np.array(whole.assemble(snapshots[0].joined(snapshots[1]), scene))
-    expected = sum(spp / 48 * np.array(methods[0].render(scene, seed=seed, spp=spp)) for seed, spp in parts)
-    np.testing.assert_allclose(image, expected, **ROUNDING)
-    assert np.isfinite(image).all() and image.any()
-    found = whole.statistics
-    assert sum(found["passes"]) == 48 and found["merging"]["merges"] and not found["unbiased"]
-
-
 @pytest.mark.parametrize("spp", [1, 64])
 def test_merging_where_light_is_missing(spp):
     """The image of ``merging=true`` where light is missing, with a pilot and without one; else that of
@@ -300,21 +291,6 @@ def test_merging_where_light_is_missing(spp):
     why = default.statistics["merging"]["why"]
     assert "about 99 % of the image's light: that of emitter 'light', through or off shape" in why
     assert why in default.explain(hidden, spp=spp)
-
-
-def test_what_a_render_says():
-    scene = mi.load_dict(under_glass(point()))
-    plain, merged = bdpt(merging=False), bdpt(merging="true")
-    assert "not sampled: delta emitter" in plain.explain(scene)
-    text = merged.explain(scene)
-    assert "not sampled" not in text and "consistent, not unbiased" in text
-    mi.render(scene, integrator=merged, spp=4)
-    found = merged.statistics
-    assert not found["unbiased"] and found["merging"]["photons"] and found["merging"]["merges"]
-    assert found["rays"]["photon"] and found["unsampled_light"] == {}
-    mi.render(scene, integrator=plain, spp=4)
-    assert plain.statistics["unbiased"] and "merging" not in plain.statistics
-    assert "photon" not in plain.statistics["rays"]
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens"])
@@ -409,3 +385,137 @@ def test_what_is_refused():
         (left_out,) = (row for row in default.statistics["skipped"] if row["class"] == "merging")
         assert left_out["level"] == "impossible" and words in left_out["why"]
         assert len(warnings) == 1 and "set merging" not in warnings[0]
+
+
+# -- through near-specular lobes ---------------------------------------------------------------------------
+
+
+def small_lamp(half, height, **more):
+    """Under glass and a square lamp."""
+    to_world = transform().look_at(origin=[0.8, 0, height], target=[0.8, 0, 0], up=[0, 1, 0]).scale(half)
+    lamp = scenes.square(bsdf=matte(0.0), emitter=scenes.area(10.0)) | {"to_world": to_world}
+    return under_glass(lamp, plate=rough(0.02), **more)
+
+
+def near_pane():
+    """A pane below a lamp, close to the camera: its pixels are smaller than the floor's by a factor of 6."""
+    described = small_lamp(0.3, 3.4)
+    described["plate"]["to_world"] = transform().translate([0, 0, 2.5]).scale([4, 4, 0.05])
+    return described
+
+
+def through_a_lens():
+    """t = 0 is an alternative of the camera's side."""
+    return small_lamp(0.1, 3.4, kind="thinlens")
+
+
+@pytest.mark.parametrize(
+    "described, slack, ended",
+    [(near_pane, 0.2, True), (near_pane, 0.2, False), (through_a_lens, 0.05, True)],
+)
+def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
+    """What bounds leave out still has its weight: 15 % of the image was missing under a pane so close to the
+    camera that discs at the floor are 36 times larger. A small ``slack`` leaves out many. Photon subpaths'
+    roulette acts first; if they are not ``ended``, that of photons, and through a lens that of camera
+    vertices. Tolerance: a few standard errors of the roulette."""
+    if not ended:
+        never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
+        monkeypatch.setattr(merging.Merging, "survival", never)
+    built, found = mi.load_dict(described()), []
+    for least in (slack, 1e30):
+        monkeypatch.setattr(merging, "SLACK", least)
+        _, layers = strategy_images(built, 32, 8, merging_radius=1.0, skip="none")
+        found.append(layers["weighted.merged"].mean())
+    assert found[0] == pytest.approx(found[1], rel=0.08)
+    assert found[1] > 0
+
+
+def test_undersampled_lamps_that_are_not_finite_are_named():
+    described = mi.load_dict(under_glass(point() | {"intensity": 1e38}, plate=rough(0.01)))
+    render = Render(described, described.sensors()[0], internals.bdpt(light_paths=0).settings, 0, 64)
+    given = render.prepared, render.plan, render.settings
+    assert unsampled_light.is_undersampling_possible(*given)
+    with Warned() as warnings:
+        found = unsampled_light.estimate(*given)
+    assert len(warnings) == 1 and "how much light of emitter 'light' is not sampled is unknown" in warnings[0]
+    assert not found.radiance
+
+
+def test_stored_vertices_keep_their_merges():
+    sums = [mi.Float(0.1 * i, i) for i in range(1, 5)]
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    anchor = rays.Anchor(si.p, si.n, mi.Float(0, 0), mi.Float(0, 0))
+    vertex = SimpleNamespace(
+        si=si,
+        bsdf=si.bsdf(),
+        cos=mi.Float(1),
+        anchor=anchor,
+        throughput=mi.Spectrum(1),
+        partial=mis.Partial(*sums),
+        edges=mi.UInt32(1),
+        hit=mi.Bool(True),
+        edge=None,
+        sds=sds.State(isolated=mi.Bool(True, False), specular=mi.Bool(False, True)),
+        layer=None,
+        connectible=lambda: mi.Bool(True),
+    )
+    kernel = SimpleNamespace(
+        store_size=2,
+        sds=SimpleNamespace(merges=True, near_specular=True),
+        heuristic=mis.Heuristic("balance"),
+        light_groups=None,
+        path_layers=False,
+        has_media=False,
+        plan=SimpleNamespace(joined=1),
+        reach=mi.UInt32(9),
+        shape_errors=SimpleNamespace(any=False),
+    )
+    path = light_path.allocate_light_path(kernel, 2)
+    light_path.store_light_vertex(kernel, vertex, path)
+    y = light_path.read_light_vertex(kernel, path, mi.UInt32(0))
+    found = y.partial
+    for a, b in zip((found.d_vcm, found.d_vc, found.d_vm, found.d_vm_newest), sums, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert list(y.sds.isolated) == [True, False] and list(y.sds.specular) == [False, True]
+
+
+# -- under panes that are nearly deltas --------------------------------------------------------------------
+
+# Pixels of 48 x 48 around the highlight of the light in the pane.
+ROWS, COLUMNS = np.mgrid[:48, :48] - 47 / 2
+BESIDE = np.hypot(ROWS, COLUMNS) > 14
+
+PANES = {f"alpha {alpha}": rough(alpha) for alpha in (1e-4, 1e-3, 3e-3, 0.01, 0.02, 0.03)}
+PANES |= {f"roughness {roughness}": principled(roughness) for roughness in (0.0, 0.05, 0.1, 0.15, 0.2)}
+
+
+def under_a_pane(bsdf, reflectance=0.5, seeds=4):
+    """(seeds, height, width): a point light above a pane, a floor below, the camera above."""
+    to_world = transform().translate([0, 0, 1]).scale([1.5, 1.5, 0.05])
+    scene = {
+        "type": "scene",
+        "sensor": scenes.camera(origin=(0, -1.5, 5), target=(0, 0, 0), fov=25, size=48),
+        "floor": scenes.square(size=1.5, bsdf=matte(reflectance)),
+        "pane": {"type": "cube", "to_world": to_world, "bsdf": bsdf},
+        "lamp": {"type": "point", "position": [0, 0, 2], "intensity": 10.0},
+    }
+    return images(scene, 64, seeds, merges=reflectance > 0, max_depth=8, skip="none", merging=True)
+
+
+@cache
+def under_ideal_glass():
+    return under_a_pane(glass())[:, BESIDE].mean()
+
+
+@pytest.mark.parametrize("pane", PANES)
+def test_floor_has_the_light_that_it_has_under_ideal_glass(pane):
+    """Lobes of alpha 1e-3 are no deltas, and yet connections through them hardly ever succeed: 98 % of the
+    light was missing, and some pixels had 17,000 times their share. Expected: the mean under `dielectric`
+    within 3 % (both have a standard error of 0.7 %) without the highlight, which is what a black floor shows;
+    no pixel above 100 times the median of its eight neighbours in all images."""
+    found, highlight = under_a_pane(PANES[pane]), under_a_pane(PANES[pane], 0.0, 1)
+    light = found[:, BESIDE].mean() - highlight[:, BESIDE].mean()
+    assert light == pytest.approx(under_ideal_glass(), rel=0.03)
+    around = np.lib.stride_tricks.sliding_window_view(found, (3, 3), axis=(1, 2))[:, BESIDE[1:-1, 1:-1]]
+    neighbours = np.delete(around.reshape(4, -1, 9), 4, axis=-1)
+    assert (around[..., 1, 1] <= 100.0 * np.median(neighbours, axis=(0, 2))).all()

@@ -12,7 +12,8 @@ from mitsuba_bdpt.scene import diagnostics
 from scipy import stats
 from warned import Warned
 
-from scenes import area, camera, load, matte, square
+from scenes import UPWARDS, area, camera, load, renders, square
+from scenes import matte as diffuse
 
 from stress_cases.poisons import BSDFS, NAN, painted
 from stress_cases.rooms import filled, room
@@ -72,26 +73,21 @@ def test_a_blend_seen_from_behind_is_black(held):
     blend = {"type": "blendbsdf", "weight": 0.5, "metal": {"type": "roughconductor"}, "matte": matte}
     if held == "masked":
         blend = {"type": "mask", "opacity": 0.7, "inner": blend}
-    plate = {"type": "rectangle", "bsdf": blend, "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], -90)}
-    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
 
     def seen(height):
-        eye = mi.ScalarTransform4f().look_at([0, height, 1], [0, 0, 0], [0, 0, 1])
-        eye = {"type": "perspective", "fov": 50, "to_world": eye, "film": film}
-        parts = {"type": "scene", "plate": plate, "sky": {"type": "constant"}, "sensor": eye}
-        plain = mi.load_dict(parts)
+        eye = camera(origin=(0, height, 1), target=(0, 0, 0), up=(0, 0, 1), fov=50, size=8)
+        plain = load(plate=square(turn=UPWARDS, bsdf=blend), sky={"type": "constant"}, sensor=eye)
         # As long as there is such an emitter kernels run step by step.
         other = mi.load_dict({"type": "timed_sunsky"}) if held == "step by step" else None
         bdpt = mi.load_dict({"type": "bdpt", "max_depth": 4, "skip": "none"})
-        images = np.array([np.array(bdpt.render(plain, seed=s, spp=64)) for s in range(8)])
+        images = renders(plain, bdpt, 64, 8)
         del other
         assert bdpt.statistics["non_finite"] == 0
         return plain, images
 
     plain, images = seen(2)
     _, behind = seen(-2)
-    path = mi.load_dict({"type": "path", "max_depth": 4})
-    others = np.array([np.array(mi.render(plain, integrator=path, seed=s, spp=64)) for s in range(8)])
+    others = renders(plain, mi.load_dict({"type": "path", "max_depth": 4}), 64, 8)
     assert stats.ttest_ind(images.mean((1, 2, 3)), others.mean((1, 2, 3)), equal_var=False).pvalue > 1e-4
     found = behind[:, 3:5, 3:5].mean((1, 2, 3))
     expected = {"bare": 0, "masked": 0.3, "beside a two-sided one": 0.25}.get(held, 0)
@@ -225,7 +221,7 @@ def beside_spots(*angles):
 def beside_lamps(*places, kind="rectangle"):
     """A floor under lamps of side 1 at these places."""
     lamp = {"type": kind, "emitter": area(1.0)}
-    lamps = {f"lamp {i}": square(at, ([1, 0, 0], 180), 0.5, matte(0)) | lamp for i, at in enumerate(places)}
+    lamps = {f"lamp {i}": square(at, ([1, 0, 0], 180), 0.5, diffuse(0)) | lamp for i, at in enumerate(places)}
     eye = camera(origin=(0, 0, 0.9), target=(0, 0, -1), fov=50, size=8)
     scene = {"type": "scene", "sensor": eye, "floor": square((0, 0, -1), size=2), **lamps}
     return mi.load_dict(scene, optimize=False)

@@ -15,7 +15,7 @@ from mitsuba_bdpt.transport.near_specular import NARROW
 from mitsuba_bdpt.transport.path_layers import NAMES
 from snapshots import ROUNDING, stopped
 
-from scenes import camera, load, square, transform
+from scenes import camera, square
 
 ROUGH_GLASS = {"type": "roughdielectric", "alpha": 0.1}
 POLISHED = {"type": "roughconductor", "alpha": 0.05}
@@ -38,35 +38,26 @@ def divided(method, target, **more):
     return layers(method, target, kind="path", **more)
 
 
-@pytest.mark.parametrize(
-    ("parameters", "of_scene"),
-    [
-        ({"skip": "none", "connections": "one"}, {"crop_width": 6, "crop_offset_x": 1}),
-        ({"skip": "none", "connections": "all"}, SURFACES["near-specular"]),
-        ({"skip": "none", "connections": "one"}, SURFACES["near-specular"]),
-        ({"light_paths": 0}, SURFACES["near-specular"]),
-        ({}, {"rfilter": "box"}),
-        ({"merging": True}, {}),
-        ({"merging": True}, SURFACES["near-specular"]),
-        ({"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}, SURFACES["null"]),
-        ({"max_depth": 3, "layers": "strategies"}, {}),
-        ({"guiding": "always"}, {}),
-        ({"decisions": JOINED}, SURFACES["near-specular"]),
-        ({"connections": "all"}, {"medium": fog()} | SURFACES["near-specular"]),
-    ],
-    ids=[
-        "one",
-        "all",
-        "drawn",
-        "path tracing",
-        "pilot",
-        "merging",
-        "merged paths",
-        "other layers",
-        "strategies",
-    ]
-    + ["guiding", "joined", "fog"],
-)
+GLOSSY = SURFACES["near-specular"]
+OTHERS = {"hide_emitters": True, "layers": "variance", "aovs": "n:sh_normal"}
+# Parameters, and what the scene has.
+RENDERS = {
+    "one": ({"skip": "none", "connections": "one"}, {"crop_width": 6, "crop_offset_x": 1}),
+    "all": ({"skip": "none", "connections": "all"}, GLOSSY),
+    "drawn": ({"skip": "none", "connections": "one"}, GLOSSY),
+    "path tracing": ({"light_paths": 0}, GLOSSY),
+    "pilot": ({}, {"rfilter": "box"}),
+    "merging": ({"merging": True}, {}),
+    "merged paths": ({"merging": True}, GLOSSY),
+    "other layers": (OTHERS, SURFACES["null"]),
+    "strategies": ({"max_depth": 3, "layers": "strategies"}, {}),
+    "guiding": ({"guiding": "always"}, {}),
+    "joined": ({"decisions": JOINED}, GLOSSY),
+    "fog": ({"connections": "all"}, {"medium": fog()} | GLOSSY),
+}
+
+
+@pytest.mark.parametrize(("parameters", "of_scene"), RENDERS.values(), ids=RENDERS)
 def test_layers_add_up_to_the_image(parameters, of_scene):
     """With what else a render may do, and so do light groups beside them."""
     method, target = integrator(light_groups="auto", **parameters), scene(**of_scene)
@@ -105,31 +96,6 @@ def test_layers_of_bands_and_of_stokes_vectors():
     box["sensor"]["film"] = {"type": "hdrfilm", "width": 4, "height": 4, "component_format": "float32"}
     image, found = divided(integrator(layers="stokes", light_groups="auto"), mi.load_dict(box))
     check_sum(np.broadcast_to(image, (4, 4, 3)), found)
-
-
-@pytest.mark.parametrize("light_paths", [0, 1])
-def test_light_of_a_mirror_beside_a_floor(light_paths):
-    """Under an even sky a point of a floor at distance c from an upright mirror of height a and width 2 b
-    sees the sky in it with the form factor F of a rectangle perpendicular to the point's plane (1 /
-    pi)(atan(b / c) - (c / r) atan(b / r)), r^2 = a^2 + c^2. No light meets the floor twice. Expected:
-    ``caustic`` is albedo F, ``direct`` albedo (1 - F), the others 0. Tolerance: five standard errors of 2^18
-    samples of a variance below 1/4, and the pixels' extent, 1e-4 of c."""
-    a, b, c, albedo = 1.0, 2.0, 0.5, 0.5
-    upright = transform().translate([-c, 0, 0]).rotate([0, 1, 0], 90).scale([a, b, 1])
-    mirror = {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}}
-    target = load(
-        sensor=camera(origin=(0, 0, 5), target=(0, 0, 0), fov=0.01, size=4),
-        floor=square(size=20),
-        mirror={"type": "rectangle", "to_world": upright, "bsdf": mirror},
-        sky={"type": "constant"},
-    )
-    method = integrator(skip="none", light_paths=light_paths)
-    _, found = divided(method, target, spp=2**14)
-    r = np.hypot(a, c)
-    factor = (np.arctan(b / c) - c / r * np.arctan(b / r)) / np.pi
-    expected = {"emission": 0, "direct": albedo * (1 - factor), "indirect": 0, "caustic": albedo * factor}
-    for name, layer in found.items():
-        assert layer.mean() == pytest.approx(expected[name], abs=5 * 0.5 / 512 + 1e-4), name
 
 
 def by_sampling(target, count, seed, depth):

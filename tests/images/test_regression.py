@@ -93,19 +93,24 @@ def reference(path: Path, colour: str):
     return xyz(mi.Bitmap(f"{stem}.exr")), xyz(mi.Bitmap(f"{stem}_var.exr"))
 
 
-def cases(scenes, colours=COLOURS):
+def cases(folder, scenes, colours):
     """Every scene, colour mode and choice of skipping; by default one of the two choices for each image."""
     product = itertools.product(enumerate(scenes), enumerate(colours), enumerate(("none", "auto")))
     return [
-        pytest.param(name, colour, skip, marks=[] if (i + j + k) % 2 else [pytest.mark.slow])
+        pytest.param(
+            folder, name, colour, skip, marks=[needs(folder)] + [pytest.mark.slow] * ((i + j + k + 1) % 2)
+        )
         for (i, name), (j, colour), (k, skip) in product
     ]
 
 
-@needs(DATA)
-@pytest.mark.parametrize("name, colour, skip", cases(SCENES, [*COLOURS, POLARIZED]))
-def test_image_is_mitsubas(name, colour, skip):
-    """Images made by others, on scenes with textures, masks, rough glass, meshes.
+@pytest.mark.parametrize(
+    "folder, name, colour, skip",
+    cases(DATA, SCENES, [*COLOURS, POLARIZED]) + cases(MEDIA_DATA, MEDIA_SCENES, COLOURS),
+)
+def test_image_is_mitsubas(folder, name, colour, skip):
+    """Images made by others, on scenes with textures, masks, rough glass, meshes; with media by ``volpath``
+    (``volpathmis``): fog in a null boundary, a chromatic medium, a grid around a matte ball.
 
     Expected: at least 99.75 % of the values pass, and the image's mean is within 4.5 sigma (plus 5e-4 for the
     references' colour conversion). Statistic: Z = |mean - ref| / sqrt(v / seeds + var / 32000 + 1e-4 / spp),
@@ -114,15 +119,7 @@ def test_image_is_mitsubas(name, colour, skip):
     some. With 5e5 samples the rare splats of (1,1) from the sky, 6 % of a pixel each, are too few for
     Student's t. The floor of 1e-4 hides biases below 1 % in dark pixels; the mean does not.
     """
-    compare(DATA / "tests" / "scenes" / f"{name}.xml", colour, skip)
-
-
-@needs(MEDIA_DATA)
-@pytest.mark.parametrize("name, colour, skip", cases(MEDIA_SCENES))
-def test_image_with_media_is_mitsubas(name, colour, skip):
-    """Homogeneous fog in a null boundary, a chromatic medium, a grid around a matte ball, under an
-    environment map; the references are by ``volpath`` (``volpathmis``)."""
-    compare(MEDIA_DATA / "tests" / "scenes" / f"{name}.xml", colour, skip)
+    compare(folder / "tests" / "scenes" / f"{name}.xml", colour, skip)
 
 
 def rendered(scene, integrator, spp: int) -> np.ndarray:

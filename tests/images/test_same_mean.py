@@ -324,20 +324,6 @@ def lamp_of_many_triangles():
     return Row(under(mesh), EVERYTHING, 2, 64, 64, other=under(square(turn=([1, 0, 0], 180))))
 
 
-@same("all", of=range(3))
-def caustic_seen_by_a_moving_lens(frame):
-    """LuxCore #441: caustics of a ball at rest under an environment flashed from frame to frame."""
-    origin = (3 * np.sin(0.1 * frame), 2, 3 * np.cos(0.1 * frame))
-    glass = {"type": "sphere", "center": [0, 0.5, 0], "radius": 0.4, "bsdf": {"type": "dielectric"}}
-    scene = {
-        "sensor": camera("thinlens", origin, (0, 0, 0), 45, aperture_radius=0.1, focus_distance=3.6),
-        "floor": floor(0, 2, both_sides(0.7)),
-        "ball": glass,
-        "sky": {"type": "envmap", "bitmap": parts.sky_bitmap()},
-    }
-    return Row(scene, PATH, 6, 64, 512, 8)
-
-
 @same("all")
 def own_lamp():
     """An emitter of a class that the package does not know takes part by Mitsuba's calls alone: as a point
@@ -766,11 +752,11 @@ def lens_and_photons_without_aim():
     return Row(scene, {}, 6, 512, 512, 8, more, tile=8, error=0.1, patched=patched)
 
 
-@same("merged", "guided 4", of=("instance", "border"))
-def small_lamp_and_an(change):
+@same("merged", "guided 4", of=("an instance", "a border"))
+def small_lamp_and(change):
     """An instance in place of the plate; pixels around the film."""
     scene = under_glass(sds.spark())
-    if change == "border":
+    if change == "a border":
         scene["sensor"]["film"] |= {"sample_border": True, "rfilter": {"type": "gaussian"}}
     else:
         plate = scene.pop("plate") | {"to_world": transform().scale([4, 4, 0.1])}

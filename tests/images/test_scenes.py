@@ -121,17 +121,6 @@ def test_cornell_box_is_the_one_of_mitsuba():
     assert np.abs(images[0] - images[1]).mean() < 2e-3 * images[1].mean()
 
 
-@pytest.mark.parametrize("name, share", [("pool_floor", 0.942), ("lamp_in_glass_seen", 0.0585)])
-def test_what_only_merging_finds(name, share):
-    """Means of sixteen renders as here. Tolerance: 0.01 and 0.003; the shares of single renders have standard
-    deviations of 0.003 and 0.0005, but for one with a bright sample near a corner."""
-    scene = load(name, integrator="bdpt", resolution=32)
-    ours = {"type": "bdpt", "max_depth": scene.integrator().max_depth}
-    ways = [mi.load_dict(ours | {"merging": merging}) for merging in (False, True)]
-    mean = [np.mean(mi.render(scene, integrator=way, spp=64, seed=1)) for way in ways]
-    assert 1.0 - mean[0] / mean[1] == pytest.approx(share, abs=0.01 if share > 0.5 else 0.003)
-
-
 @pytest.mark.parametrize("name", ["furnace_point", "furnace_emission", "furnace_white"])
 def test_furnaces_have_the_known_answer(name):
     """Also where paths end after 3 edges. Tolerance: 0.3 %; the mean has a standard deviation below 0.1 %."""

@@ -18,6 +18,7 @@ from sds_scenes import ball, images, matte, point, transform, under_glass
 from snapshots import ROUNDING
 
 import scenes
+from scenes import area, square
 
 import drjit as dr  # isort: skip
 
@@ -101,19 +102,15 @@ def lit_by_a_wall():
     edges, all that there are, have two diffuse vertices. The surfaces are delta ones that change nothing.
     """
 
-    def square(at, axis, angle, size, bsdf):
-        to_world = transform().translate(at).rotate(axis, angle).scale(size)
-        return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
-
     clear = {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0}
     lens = {"size": 4, "aperture_radius": 0.8, "focus_distance": 1.2}
-    lamp = square([0, 0, 1.7], [0, 1, 0], -90, 0.5, matte(0.0))
+    lamp = square([0, 0, 1.7], ([0, 1, 0], -90), 0.5, matte(0.0))
     parts = {
-        "wall": square([-1, 0, 1.5], [0, 1, 0], 90, 1.5, matte(0.9)),
-        "before the wall": square([-0.9, 0, 1.5], [0, 1, 0], 90, 3, clear),
-        "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
-        "floor": square([1, 0, 0], [0, 0, 1], 0, 1, matte(0.9)),
-        "above the floor": square([2, 0, 0.1], [0, 0, 1], 0, 2.8, clear),
+        "wall": square([-1, 0, 1.5], ([0, 1, 0], 90), 1.5, matte(0.9)),
+        "before the wall": square([-0.9, 0, 1.5], ([0, 1, 0], 90), 3, clear),
+        "lamp": lamp | {"emitter": area(10.0)},
+        "floor": square([1, 0, 0], ([0, 0, 1], 0), 1, matte(0.9)),
+        "above the floor": square([2, 0, 0.1], ([0, 0, 1], 0), 2.8, clear),
         "sensor": scenes.camera("thinlens", origin=(1, 0, 1.2), target=(1, 0, 0), **lens),
     }
     return mi.load_dict({"type": "scene", **parts})

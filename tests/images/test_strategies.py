@@ -36,7 +36,7 @@ from mitsuba_bdpt.image.layers import strategies
 from mitsuba_bdpt.planning import planner
 from mitsuba_bdpt.transport import inputs, light_path
 
-from scenes import area, camera, integrator, matte, square, thinlens, transform
+from scenes import area, ball, camera, integrator, matte, square, thinlens, transform
 
 TILES = 4
 CHANNELS = np.array([0.5, 1.0, 1.5])  # one number per pixel that sees every channel
@@ -61,27 +61,23 @@ ROUGH = {"type": "roughconductor", "alpha": 0.4, "distribution": "ggx", "specula
 MATTE = (0.7, 0.5, 0.3)
 
 
-def ball(bsdf, center, radius, **more):
-    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf, **more}
-
-
 def inside(sensor=camera, **more):
     """Inside of the wall, with other things well apart."""
     return {"sensor": sensor(), "wall": fogs.wall(), **more}
 
 
 def beside_a_ball(left, right=None):
-    more = {"lamp": fogs.lamp(), "left": ball(left, [-0.35, -0.25, -0.25], 0.3)}
-    return inside(**more, **({"right": ball(right, [0.3, -0.3, -0.2], 0.2)} if right else {}))
+    more = {"lamp": fogs.lamp(), "left": ball(left, 0.3, [-0.35, -0.25, -0.25])}
+    return inside(**more, **({"right": ball(right, 0.2, [0.3, -0.3, -0.2])} if right else {}))
 
 
 def outside(**more):
     """Three separated balls in the open."""
     return {
         "sensor": camera(origin=(0, 0.3, 4), target=(0, 0, 0), fov=35),
-        "a": ball(matte(*MATTE), [-0.75, 0, 0], 0.5),
-        "b": ball(ROUGH, [0.65, 0.2, -0.3], 0.5),
-        "c": ball(matte(*MATTE), [0, -1.6, -0.2], 0.8),
+        "a": ball(matte(*MATTE), 0.5, [-0.75, 0, 0]),
+        "b": ball(ROUGH, 0.5, [0.65, 0.2, -0.3]),
+        "c": ball(matte(*MATTE), 0.8, [0, -1.6, -0.2]),
         **more,
     }
 
@@ -102,11 +98,11 @@ def gold():
     """Under a lamp of another colour."""
     glow = {"type": "spectrum", "value": [(400, 1), (500, 3), (600, 6), (700, 8)]}
     metal = {"type": "roughconductor", "material": "Au", "alpha": 0.3}
-    return inside(lamp=fogs.lamp(emitter=area(glow)), gold=ball(metal, [-0.35, -0.25, -0.25], 0.3))
+    return inside(lamp=fogs.lamp(emitter=area(glow)), gold=ball(metal, 0.3, [-0.35, -0.25, -0.25]))
 
 
 def open_air():
-    lamp = ball(matte(0), [0, 1.4, 0.6], 0.4, emitter=area(8.0))
+    lamp = ball(matte(0), 0.4, [0, 1.4, 0.6], emitter=area(8.0))
     return outside(sky=fogs.sky(), sun=fogs.sun(), lamp=lamp)
 
 
@@ -329,14 +325,6 @@ def test_glowing_wall_is_known():
     assert_agree(family, 100)
 
 
-def test_unweighted_strategies_ignore_counts_and_coefficients():
-    """A quarter of the light subpaths, kappa = n / 4."""
-    thinned = techniques("rough metal", 10, light_paths=0.25, skip="impossible")
-    full = techniques("rough metal", 0)
-    # A pinhole has no t = 0.
-    assert_agree([st.compare_images(thinned[k, s][1], full[k, s][1]) for k, s in full if s <= k], 100)
-
-
 @pytest.mark.parametrize(
     "options",
     [{}, {"light_paths": 0.25}, {"heuristic": "power"}, {"light_paths": 0}, {"connections": "none"}],
@@ -411,10 +399,3 @@ def test_statistics_find_what_they_should_and_no_more():
         st.assert_agree(st.welch(constant, constant))
     with pytest.raises(AssertionError, match="uniform"):  # one image compared with itself
         st.assert_agree(st.welch(a[0], a[0] + rng.normal(0, 1e-3, a[0].shape)))
-
-
-def test_tile_means():
-    image = np.arange(4 * 8 * 2, dtype=float).reshape(4, 8, 2)
-    tiles = st.tile_means(image, 2)
-    assert tiles.shape == (4, 2)
-    np.testing.assert_allclose(tiles[1], image[:2, 4:].mean((0, 1)))

@@ -49,7 +49,7 @@ KNOWN = {
     "merging": Component(
         asked={"merging": True},
         tests=(
-            *("images/test_near_specular_merging.py", "images/test_merging.py", "images/test_sds_paths.py"),
+            *("images/test_merging.py", "images/test_sds_paths.py"),
             "planning/test_undersampled.py",
         ),
     ),
