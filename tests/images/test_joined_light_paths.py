@@ -116,13 +116,6 @@ def test_short_renders_are_not_joined():
     assert 8 * 64**2 < planner.JOINED_SAMPLES
 
 
-def test_what_is_counted():
-    """At most one pair is evaluated for each camera vertex."""
-    _, method = rendered(cornell(), 64)
-    counted, rays = method.statistics["connections"], method.statistics["rays"]
-    assert 0 < counted["zero"] < counted["evaluated"] <= rays["camera"]
-
-
 def test_the_same_seed_gives_the_same_image():
     scene = cornell()
     whole, _ = rendered(scene, 64, 3, spp_per_pass=16)

@@ -167,13 +167,6 @@ def test_a_pattern_may_match_no_emitter(parameters):
     np.testing.assert_allclose(resumed[..., :3], image, **ROUNDING)
 
 
-def test_groups_without_any_emitter():
-    made = LightGroups.of(scene(), "a: x*; b: y?")
-    assert made.names == ("a", "b", "rest") and set(made.of_emitters) == {2}
-    made = LightGroups.of(scene(), "a: x*, panel")
-    assert made.of_emitters.count(0) == 1 and "the group a is without it" in made.warnings[0]
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [

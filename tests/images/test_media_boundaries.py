@@ -226,12 +226,6 @@ def test_media_are_told_apart_by_what_they_are(variant):
         assert representatives([MediumProperties(m) for m in media]) == [0, 1, 1 if equal else 2], name
 
 
-def test_media_that_hold_one_grid():
-    volume = mi.load_dict(grid()["sigma_t"])
-    media = [mi.load_dict(grid(scale=scale) | {"sigma_t": volume}) for scale in (3.0, 3.0, 2.9)]
-    assert representatives([MediumProperties(m) for m in media]) == [0, 0, 2]
-
-
 def test_media_of_python_are_equal_to_themselves_only():
     parts.register_plugins()
     own_fog = {"type": "own_fog", "extinction": 4.0, "albedo": 0.9}

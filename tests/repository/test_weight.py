@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28662}
-MOST_WORDS = 28893
+OUTSIDE = {"scripts": 2961, "tests": 28151}
+MOST_WORDS = 28891
 
 
 def _lines(files):
