@@ -14,7 +14,6 @@ from mitsuba_bdpt.cli.arguments import build_parser
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import read_toml
 from mitsuba_bdpt.measure import analysis, reference, report
-from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results, Unavailable
 from mitsuba_bdpt.measure.models import PresetFile
 from mitsuba_bdpt.measure.project import Project
@@ -22,41 +21,9 @@ from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.report import Report
 from mitsuba_bdpt.measure.results import load
 from mitsuba_bdpt.measure.scenes import digest
+from support.measured import KNOWN, TRUE, row
 
 ROOT = Path(__file__).resolve().parents[2]
-TRUE = np.full(51, 2.0)
-
-
-def row(method="bdpt", seed=1, **values):
-    """A render of 64 samples in 1 second with relMSE 0.02, raw and trimmed."""
-    plain = {
-        "scene": "box",
-        "method": method,
-        "budget": 64,
-        "spp": 64,
-        "seed": seed,
-        "seconds": 1.0,
-        "rel_mse": 0.02,
-        "rel_mse_trimmed": 0.02,
-        "reference_rel_mse": 0.0,
-        "reference_rel_mse_trimmed": 0.0,
-        "resolution": 8,
-        "width": 8,
-        "height": 8,
-        "max_depth": 3,
-        "machine": "a machine",
-        "started": "2026-11-28T15:23:37+00:00",
-        "versions": '{"mitsuba": "3.9.1", "source": "s"}',
-        "first": "bdpt",
-        "reference_sha256": "",
-        "tile_means": list(TRUE),
-        "decisions": json.dumps([{"light_paths": 0.25, "connections": "one"}]),
-        "statistics": json.dumps(
-            {"seconds": {"pilot": 0.02}, "skipped": [{"class": "t=0", "level": "impossible", "why": "x"}]}
-        ),
-    }
-    rays = {f"rays_{kind}": 640 for kind in ("camera", "light", "shadow_s1", "shadow_t1", "shadow_inner")}
-    return plain | rays | values
 
 
 def runs(method, count, **values):
@@ -74,7 +41,6 @@ def noisy(method, count, factor=1.0, **values):
     return [row(method, i + 1, tile_means=list(m), **values) for i, m in enumerate(means)]
 
 
-KNOWN = Means.known(np.full((4, 4, 3), 2.0))
 BY_PATH = Reference(None, None, KNOWN, {"integrator": {"type": "path"}})
 MADE = {"box": BY_PATH, "dark": BY_PATH}
 

@@ -10,7 +10,7 @@ from mitsuba_bdpt.measure import estimates, metrics
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
-from mitsuba_bdpt.measure.results import relative_errors
+from support.measured import judged
 
 SHAPE = (64, 64, 3)
 TRUTH = np.random.default_rng(1).uniform(0.5, 2, SHAPE)
@@ -31,22 +31,8 @@ def halves(sigma, truth=TRUTH):
 def rows_of(images, reference, method="bdpt"):
     """What a sweep stores of the images of one budget."""
     spread = metrics.spread(images, reference.image) if len(images) > 1 else [None]
-    rows = [
-        {
-            "scene": "box",
-            "method": method,
-            "first": "bdpt",
-            "budget": 64,
-            "spp": 64,
-            "seed": seed,
-            "seconds": 1.0,
-            "tile_means": tile_columns(image).tolist(),
-            "variance": spread[seed - 1],
-            **relative_errors(image, reference),
-        }
-        for seed, image in enumerate(images, 1)
-    ]
-    return pd.DataFrame(rows)
+    found = enumerate(zip(images, spread, strict=True), 1)
+    return pd.DataFrame([judged(method, seed, x, reference, variance=v) for seed, (x, v) in found])
 
 
 def results_of(reference, *rows):

@@ -11,14 +11,13 @@ import pytest
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.measure import crops, figures, report
-from mitsuba_bdpt.measure.agreement import Means
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.estimates import RelativeError
 from mitsuba_bdpt.measure.metrics import Estimate
 from mitsuba_bdpt.measure.results import image_file
+from support.measured import KNOWN, row
 
 METHODS = ("bdpt", "path", "path multijitter", "bdpt skip=none", "an integrator with a long name of its own")
-KNOWN = Means.known(np.full((4, 4, 3), 2.0))
 
 
 @pytest.fixture(autouse=True)
@@ -36,23 +35,17 @@ def results(scenes=("a_caustic_with_a_long_name", "b")):
             error = (i + 1) / budget * rng.lognormal(0, 0.2)
             level = 1.8 if method == "path" else 2.0
             rows.append(
-                {
-                    "scene": scene,
-                    "method": method,
-                    "first": "bdpt",
-                    "budget": budget,
-                    "spp": budget,
-                    "seed": seed,
-                    "seconds": budget / 100,
-                    "rel_mse": 2 * error,
-                    "rel_mse_trimmed": error,
-                    "reference_rel_mse": 0.0,
-                    "reference_rel_mse_trimmed": 0.0,
-                    "width": 8,
-                    "height": 8,
-                    "tile_means": (level + 0.01 * rng.standard_normal(51)).tolist(),
-                }
-                | {f"rays_{kind}": 64 * budget for kind in figures.RAYS}
+                row(
+                    method,
+                    seed,
+                    scene=scene,
+                    budget=budget,
+                    spp=budget,
+                    seconds=budget / 100,
+                    rel_mse=2 * error,
+                    rel_mse_trimmed=error,
+                    tile_means=(level + 0.01 * rng.standard_normal(51)).tolist(),
+                )
             )
     return Results(pd.DataFrame(rows), dict.fromkeys(scenes, KNOWN))
 

@@ -11,24 +11,12 @@ from mitsuba_bdpt.measure import figures, metrics, report, tables
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
-from mitsuba_bdpt.measure.results import COLUMNS, relative_errors, write_tables
+from mitsuba_bdpt.measure.results import COLUMNS, write_tables
 from mitsuba_bdpt.run.statistics import RAYS
+from support.measured import judged
 
 SHAPE = (32, 32, 3)
 TRUTH = np.random.default_rng(1).uniform(0.5, 2, SHAPE)
-PLAIN = {
-    "scene": "box",
-    "first": "bdpt",
-    "parameters": '{"type": "any"}',
-    "sampler": "independent",
-    "decisions": "[]",
-    "statistics": "{}",
-    "versions": "{}",
-    "machine": "a",
-    "started": "2026-11-28T15:23:37+00:00",
-    "budget": 64,
-    "spp": 64,
-}
 
 
 def rendered(own):
@@ -53,11 +41,9 @@ def rendered(own):
     for method, images in sides.items():
         variances = metrics.spread(images, kept.image)
         for seed, (image, variance) in enumerate(zip(images, variances, strict=True), 1):
-            seconds = {"seconds": float(rng.uniform(1, 2)), "cpu_seconds": 2.0}
-            names = {"method": method, "key": f"{method}{seed}", "seed": seed, "variance": variance}
-            measured = relative_errors(image, kept) | {"tile_means": tile_columns(image).tolist()}
-            measured |= {"mean": float(image.mean())}
-            rows.append(PLAIN | names | seconds | measured)
+            more = {"seconds": float(rng.uniform(1, 2)), "cpu_seconds": 2.0, "variance": variance}
+            more |= {"parameters": '{"type": "any"}'}
+            rows.append(judged(method, seed, image, kept, **more))
     return pd.DataFrame(rows), kept.means
 
 

@@ -39,7 +39,7 @@ from .metrics import Estimate, rel_mse_epsilon
 from .project import Project
 from .reference import Reference
 from .results import load, missing_of
-from .tables import markdown, spanned
+from .tables import markdown, spanned, table
 
 Figure = Callable[[str], object]
 """A figure of a scene, see `said`."""
@@ -280,8 +280,11 @@ def conditions_table(results: Results) -> str:
     for scene in results.scenes:
         for condition in _conditions(results, scene):
             found[condition].append(f"`{scene}`")
-    lines = [{"condition": text, "scenes": ", ".join(scenes)} for text, scenes in found.items()]
-    return markdown(pd.DataFrame(lines)) if lines else ""
+    return (
+        table(["condition", "scenes"], [[text, ", ".join(names)] for text, names in found.items()])
+        if found
+        else ""
+    )
 
 
 def _conditions(results: Results, scene: str) -> Iterator[str]:
@@ -315,6 +318,11 @@ MARK = "Made by `mitsuba-bdpt report`"
 """What every report has in it."""
 
 TEMPLATE = Path(__file__).with_suffix(".md.jinja")
+TABLES = (
+    *(machine, stronger, conditions_table, efficiency_table, budgets_table),
+    *(gaps_table, errors_table, checks_table, references_table),
+)
+"""What the template calls."""
 
 
 @dataclass(frozen=True)
@@ -341,34 +349,19 @@ class Report:
 
     def text(self) -> str:
         """Return the page of all tables, as Markdown."""
-        results, rows = self.results, self.results.rows
+        results = self.results
         notes: dict[str, list[str]] = defaultdict(list)
         for scene, text in self.notes.items():
             notes[text].append(f"`{scene}`")
         others = [name for name in results.methods if results.kind(name) != "bdpt"]
         template = Template(TEMPLATE.read_text(encoding="utf-8"), trim_blocks=True)
         return template.render(
-            title=self.title,
+            {one.__name__: one for one in TABLES},
             mark=MARK,
-            missing=self.missing,
-            commands=list(dict.fromkeys(one["command"] for one in self.missing.values() if one["command"])),
-            conditions=conditions_table(results),
-            machine=machine(rows),
-            spp=results.deciding,
-            ours=results.methods[0],
-            has_equal_time=set(results.methods[1:]) != {*results.at_equal_samples},
-            at_equal_samples=results.at_equal_samples,
-            is_of_processor="clock" in rows and (rows["clock"] == "processor").any(),
-            efficiency=efficiency_table(results),
-            has_known_differences=any(results.lacks(s, name) for s in results.scenes for name in others),
-            has_efficiency=results.has_efficiency(results.scenes),
-            budgets=budgets_table(results),
-            stronger=stronger(results),
-            gaps=gaps_table(results),
-            errors=errors_table(results),
-            checks=checks_table(results, self.made, self.notes),
+            report=self,
+            results=results,
             notes=notes,
-            references=references_table(self.made),
+            has_known_differences=any(results.lacks(s, name) for s in results.scenes for name in others),
         )
 
     def draw(self, folder: Path) -> None:
