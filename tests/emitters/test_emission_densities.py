@@ -34,7 +34,7 @@ ON_SURFACES = [
 
 
 def emission(name, **others):
-    """Scene, tables and `COUNT` sampled emissions of the emitter ``name``, which is alone but for a ball."""
+    """The emitter ``name`` alone but for a ball: scene, tables and `COUNT` emissions."""
     parts.register_plugins()
     ball = {"type": "sphere", "center": [0.3, 0.5, 0], "radius": 0.5}
     scene = mi.load_dict({"type": "scene", "ball": ball, "lamp": parts.EMITTERS[name]()} | others)
@@ -69,8 +69,8 @@ def column(x):
 
 
 def agree(sampled, uniform, density, measure):
-    """``sampled`` bins (numbers) of emissions; ``uniform`` bins of places that are uniform in a region of
-    the given ``measure``, with the stated ``density`` there."""
+    """``sampled`` bins of emissions; ``uniform`` bins in a region of this ``measure``, with the stated
+    ``density``."""
     bins = int(max(sampled.max(), uniform.max())) + 1
     value = measure * density
     share = np.bincount(sampled, minlength=bins) / COUNT
@@ -126,7 +126,7 @@ def test_directions_from_a_point(name):
 
 @pytest.mark.parametrize("name", AT_INFINITY)
 def test_directions_from_infinity(name):
-    """The density that a camera ray that leaves the scene states is that of the sampled emissions."""
+    """As a camera ray that leaves the scene states it."""
     scene, emitters, e = emission(name)
     d = column(e.d)
     u = numbers(2, 12)
@@ -148,8 +148,8 @@ def test_directions_from_infinity(name):
 
 @pytest.mark.parametrize("name", [*AT_INFINITY, "directional"])
 def test_light_from_infinity_covers_the_scene_evenly(name):
-    """Mitsuba's `envmap` starts from a wrong disk if it is rotated. Emissions start before the scene's
-    bounding sphere (1e-4 of the radius), evenly on the disk that covers it (Kolmogorov-Smirnov at 1e-4)."""
+    """Mitsuba's `envmap` starts from a wrong disk if it is rotated. Before the scene's bounding sphere (1e-4
+    of the radius), evenly on the disk that covers it (Kolmogorov-Smirnov at 1e-4)."""
     _, emitters, e = emission(name)
     d, around = column(e.d), emitters.disks.scene
     radius = float(around.radius[0])
@@ -172,8 +172,7 @@ def place_bins(p, low, high, cells=6):
 
 @pytest.mark.parametrize("name", ON_SURFACES)
 def test_places_on_a_surface(name):
-    """Directions have the density cos / pi about the normal (a directionalarea: one), by
-    Kolmogorov-Smirnov."""
+    """Directions have the density cos / pi about the normal (a directionalarea: one)."""
     scene, emitters, e = emission(name)
     shape = scene.emitters()[0].get_shape()
     u = numbers(2, 12)
@@ -198,8 +197,7 @@ def test_places_on_a_surface(name):
 
 
 def test_selection_beside_what_cannot_be_traced():
-    """Half of the emissions carry light, and their mean is the point light's power. Tolerance: five standard
-    errors."""
+    """Half of the emissions carry light. Tolerance: five standard errors."""
     parts.register_plugins()
     _, _, e = emission("point", other=parts.EMITTERS["own lamp"]())
     weight = column(e.weight)[0]
@@ -229,9 +227,9 @@ FROM_INFINITY = {
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_emission(name):
-    """Half of the light subpaths from infinity are aimed at the block on the ground. Where they pass, per
-    area across their direction, is what `Emitters` states at any point of that line, and integrates to the
-    disk of the scene, and to that of the block. Tolerance: five standard errors."""
+    """Half of the light subpaths are aimed at the block. Where they pass, per area across their direction, is
+    what `Emitters` states at any point of that line, and integrates to the disk of the scene, and to that of
+    the block."""
     emitters = Emitters(meadow(FROM_INFINITY[name]))
     e = sampled(emitters)
     stated = column(e.pdf_second)
@@ -255,8 +253,8 @@ def test_aimed_emission(name):
 
 
 def test_details():
-    """Small shapes that lie together are details; not those spread over the scene, nor without extent, nor,
-    since rounding decides, those tiny beside the scene or far from the origin."""
+    """Not those spread over the scene, nor without extent, nor, since rounding decides, those tiny beside the
+    scene or far from the origin."""
     box = mi.ScalarBoundingBox3f
 
     def found(*small, at=0.0):
@@ -321,8 +319,8 @@ def room_of_rectangles(bsdf=GREY):
 
 @pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=str)
 def test_a_room_of_merged_rectangles(parameters):
-    """Shadow rays of `path` towards the sky end at the box of the cube, and meet no wall: it differs.
-    Tolerance: 1e-5 of the mean for sums in another order."""
+    """Shadow rays of `path` towards the sky end at the box of the cube, and meet no wall. Tolerance: 1e-5 of
+    the mean for sums in another order."""
     merged, apart = (mi.load_dict(room_of_rectangles(), optimize=on) for on in (True, False))
     assert len(merged.shapes()) == 2 and len(apart.shapes()) == 6
     ours = mi.load_dict({"type": "bdpt", "max_depth": 4} | parameters)
@@ -355,8 +353,7 @@ def test_the_size_of_a_scene_with_rectangles_merged_with_a_cube():
 
 @pytest.mark.parametrize("name", FROM_INFINITY)
 def test_aimed_light_subpaths(name):
-    """Next-event estimation and light tracing alone each give the image of light that is reflected once, and
-    so do all together."""
+    """Next-event estimation and light tracing alone, and all together."""
     scene = meadow(FROM_INFINITY[name])
     bdpt = integrator(max_depth=2, light_paths=1, layers="strategies", hide_emitters=True)
     assert Emitters(scene).disks.details is not None

@@ -36,12 +36,10 @@ agree = partial(welch.agree, rounding=2e-4)
 
 
 def like_of_rgb():
-    """Time and wavelengths of the RGB variant."""
     return Shared(mi.Float(0), mi.Color0f(), mi.Spectrum(1), mi.Float(0.5))
 
 
 def emission(count, **lamps):
-    """Scene, tables, and ``count`` sampled emissions of ``lamps``."""
     scene = mi.load_dict(room() | lamps)
     emitters = Emitters(scene)
     return scene, emitters, sampled_emission(emitters, count)[0]
@@ -49,7 +47,7 @@ def emission(count, **lamps):
 
 @pytest.mark.parametrize("name", EMITTERS)
 def test_groups_that_a_scene_has_not_are_not_asked(name, monkeypatch):
-    """A scene without a kind of emitter records the same kernels as if there were none."""
+    """It records the same kernels as if there were none."""
     register_plugins()
     scene = mi.load_dict(room() | {"lamp": EMITTERS[name]()})
     own = group_of(scene.emitters()[0])
@@ -107,8 +105,7 @@ HITTABLE = [k for k in EMITTERS if emitter_part(k).hit and emitter_part(k).trace
 
 @pytest.mark.parametrize("name", [k for k in HITTABLE if k != "timed_sunsky"])
 def test_emission_agrees_with_hits(name):
-    """Tracing back to y_0 from the first hit finds the same radiance and densities. Tolerance: 2e-3 relative
-    for all but 2 % (poles of a textured sphere; edges of textures and pixels of an environment)."""
+    """Tracing back from the first hit. 2 %: poles of a textured sphere; edges of textures and pixels."""
     n = 20_000
     scene, emitters, e = emission(n, lamp=EMITTERS[name]())
     ray = mi.Ray3f(e.anchor.towards(e.d), e.d)
@@ -132,8 +129,7 @@ def test_emission_agrees_with_hits(name):
 
 @pytest.mark.parametrize("name", [k for k in EMITTERS if emitter_part(k).direct and k != "timed_sunsky"])
 def test_direct_sample_agrees_with_hits(name):
-    """Next-event estimation and a hit of the same point have the same densities and radiance. Tolerance: 2e-3
-    relative for all but 1 % of the samples (edges of textures), 2 % on a textured sphere (its poles)."""
+    """1 % of the samples: edges of textures; 2 % on a textured sphere: its poles."""
     n = 20_000
     rng = np.random.default_rng(12)
     register_plugins()
@@ -170,7 +166,7 @@ def test_direct_sample_agrees_with_hits(name):
 
 @pytest.mark.parametrize("scale", [3, 0.2, [-1, 1, 1], [0.5, -0.5, 0.5]], ids=str)
 def test_spots_that_are_scaled_or_mirrored(scale):
-    """They have the same flux by the same random numbers. Tolerance: 1e-4, rounding of the falloff."""
+    """By the same random numbers. Tolerance: 1e-4, rounding of the falloff."""
     flux = []
     for matrix in (T(), T().scale(scale)):
         lamp = EMITTERS["spot"]()
@@ -181,15 +177,13 @@ def test_spots_that_are_scaled_or_mirrored(scale):
 
 @pytest.mark.parametrize("weight", [float("nan"), float("inf")])
 def test_a_sampling_weight_that_is_no_number_is_named(weight):
-    """One NaN made the probabilities of all emitters NaN, and the image black."""
     lamps = {"a": EMITTERS["point"](), "b": {"type": "spot", "sampling_weight": weight}}
     with pytest.raises(ValueError, match=rf"'b' has sampling_weight={weight:g}; set a finite number"):
         Emitters(mi.load_dict(room() | lamps))
 
 
 def test_emitters_are_chosen_by_sampling_weight():
-    """The emitted power stays the sum, but for a weight of zero, which `path` does not see either. Tolerance:
-    five standard errors."""
+    """The emitted power stays the sum, but for a weight of zero. Tolerance: five standard errors."""
     lamps = {
         "a": EMITTERS["point"]() | {"sampling_weight": 0.5},
         "b": EMITTERS["sphere"]() | {"emitter": {"type": "area", "radiance": 5.0, "sampling_weight": 3.0}},
@@ -207,7 +201,7 @@ def test_emitters_are_chosen_by_sampling_weight():
 
 
 def egg_with_coordinates(folder):
-    """The egg's smooth mesh with texture coordinates, four patches of the same ones."""
+    """With texture coordinates, four patches of the same ones."""
     egg = mi.load_dict({"type": "ply", "filename": str(EGG)})
     params = mi.traverse(egg)
     uv = mi.Mesh(
@@ -239,8 +233,8 @@ def test_a_texture_needs_coordinates():
 )
 @pytest.mark.parametrize("parameters", [{"light_paths": 0}, {"skip": "none"}], ids=["path tracing", "all"])
 def test_a_lamp_of_glass_does_not_light_itself(bsdf, parameters):
-    """By rounding a point of a sphere may count as outside of it. A sphere alone that shines outwards has the
-    image of a black one, with the same seed, to 1e-3 of its mean (rays through the sphere meet nothing)."""
+    """By rounding a point of a sphere may count as outside of it. The image of a black one, with the same
+    seed, to 1e-3 of its mean (rays through the sphere meet nothing)."""
     base = {"type": "scene", "sensor": perspective((0, 0, 4), (0, 0, 0))}
     ball = {"type": "sphere", "radius": 0.6, "emitter": {"type": "area", "radiance": 3.0}}
     means = []
@@ -284,7 +278,7 @@ def grid_lamp():
 @pytest.mark.parametrize("lamp", [attributed_lamp, grid_lamp])
 def test_lamps_that_do_not_tell_their_points(lamp):
     """An attribute of a mesh needs the number of a face, which a sampled point lacks. Beside another lamp the
-    image is the sum of what s = 0 finds alone, and of the image of the other lamp."""
+    image is the sum of s = 0 alone and the other lamp's."""
     odd, other = {"lamp": lamp()}, {"other": EMITTERS["point"]()}
     everything = integrator(skip="none", max_depth=3, layers="strategies")
     alone = renders(mi.load_dict(room() | odd), everything, 512, 10, 100)
@@ -335,8 +329,7 @@ def own_area_class():
 
 @pytest.mark.parametrize("height", [0.5, 2.0], ids=["near", "far"])
 def test_a_lamp_of_the_users_on_a_surface(height):
-    """A user's class that repeats `area` gives the image of `area` by `path`: densities of s = 0 and
-    s = 1 are in the same measure."""
+    """Densities of s = 0 and s = 1 are in the same measure."""
     mi.register_emitter("own_area", own_area_class())
     lamp = square((0, 2, 0), DOWNWARDS, 0.6, grey(0))
     sensor = perspective(origin=(0, 2 - height / 2, 5), target=(0, 2 - height, 0), fov=30)
@@ -350,8 +343,7 @@ def test_a_lamp_of_the_users_on_a_surface(height):
 
 
 def test_a_timed_sky_elsewhere_does_no_harm():
-    """Calls visit every living emitter, and `timed_sunsky` cannot be called while a kernel is recorded: the
-    image is that without it, to the rounding of sums (1e-4)."""
+    """Calls visit every living emitter, and `timed_sunsky` cannot be called while a kernel is recorded."""
     lit = mi.load_dict(room() | {"lamp": EMITTERS["point"]()})
     bdpt = integrator(max_depth=3)
     before = np.array(bdpt.render(lit, spp=4))

@@ -7,7 +7,9 @@ of reflectance r gives the radiance r + r^2 + ... everywhere, and most of it can
 import mitsuba as mi
 import numpy as np
 import pytest
-from welch import assert_agree, compare_images, compare_known
+from welch import assert_agree, compare_images, compare_known, tiles
+
+from scenes import renders
 
 T = mi.ScalarTransform4f
 
@@ -61,18 +63,6 @@ def integrator(kind="bdpt", **parameters):
     return mi.load_dict({"type": kind, **parameters})
 
 
-def renders(scene, method, seeds, spp):
-    """Images of many seeds: (seeds, height, width, channels)."""
-    return np.stack([np.array(method.render(scene, seed=seed, spp=spp), dtype=np.float64) for seed in seeds])
-
-
-def tiles(images, size=4):
-    """Means of tiles of size x size pixels: (seeds, tiles x channels)."""
-    n, h, w, channels = images.shape
-    cut = images.reshape(n, h // size, size, w // size, size, channels)
-    return cut.mean((2, 4)).reshape(n, -1)
-
-
 def layer_names(scene):
     return [channel.name for channel in scene.sensors()[0].film().bitmap().struct_()]
 
@@ -92,7 +82,7 @@ def test_bands_are_known(parameters, film):
     seeds with Sidak's correction."""
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(**film))
-    images = renders(scene, integrator(max_depth=4, **parameters), range(12), 64)
+    images = renders(scene, integrator(max_depth=4, **parameters), 64, 12)
     assert layer_names(scene) == ["visible", "infrared"] and images.shape[-1] == 2
     images /= known(4)
     border = np.concatenate(
@@ -128,8 +118,8 @@ def test_overlapping_bands_equal_path(film):
         "ball": {"type": "sphere", "radius": 0.4, "center": [0.1, -0.2, -1.5], "bsdf": metal},
     }
     scene = mi.load_dict({"type": "scene"} | parts)
-    a = renders(scene, integrator(max_depth=4), range(12), 64)
-    b = renders(scene, integrator("path", max_depth=4), range(50, 62), 256)
+    a = renders(scene, integrator(max_depth=4), 64, 12)
+    b = renders(scene, integrator("path", max_depth=4), 256, 12, 50)
     assert layer_names(scene) == list(COLOURFUL)
     scale = b.mean((0, 1, 2))
     assert_agree(compare_images(tiles(a / scale), tiles(b / scale)), at_least=15)
@@ -147,7 +137,7 @@ def test_unit_of_a_response_does_not_matter():
     images, ended = [], []
     for film in (spectral_film(), spectral_film(loud), rgb_film()):
         bdpt = integrator(max_depth=6, spp_per_pass=2)  # roulette begins with the second pass
-        images += list(renders(lamp_in_a_sphere(film, flat), bdpt, [1], 16))
+        images += list(renders(lamp_in_a_sphere(film, flat), bdpt, 16, 1, 1))
         counts = bdpt.statistics["connections"]
         ended.append(counts["rouletted"] / (counts["evaluated"] + bdpt.statistics["rays"]["shadow_t1"]))
     np.testing.assert_allclose(images[1], 1000 * images[0], rtol=1e-3)
@@ -162,7 +152,7 @@ def test_variance_of_bands():
     mi.set_variant(SPECTRAL)
     scene = lamp_in_a_sphere(spectral_film(rfilter="gaussian"))
     bdpt = integrator(max_depth=3, layers="variance")
-    result = renders(scene, bdpt, range(12), 16)
+    result = renders(scene, bdpt, 16, 12)
     assert layer_names(scene) == ["visible", "infrared", "variance.visible", "variance.infrared"]
     images, estimates = result[..., :2], result[..., 2:]
     expected = images.var(0, ddof=1).mean((0, 1))
@@ -179,7 +169,7 @@ def test_one_band_without_noise():
     sky = {"type": "constant", "radiance": {"type": "uniform", "value": 0.7}}
     film = spectral_film({"only": BANDS["infrared"]}, rfilter="gaussian")
     scene = mi.load_dict({"type": "scene", "sensor": camera(film), "sky": sky})
-    image = renders(scene, integrator(max_depth=1, light_paths=0), [0], 4)[0]
+    image = renders(scene, integrator(max_depth=1, light_paths=0), 4, 1)[0]
     assert image.shape == (16, 16, 1)
     np.testing.assert_allclose(image, 70, rtol=1e-4)
 
@@ -244,8 +234,8 @@ def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
     Sidak; the mean of each channel is compared to 2 %."""
     keys = {"pixel_format": pixel_format, "rfilter": rfilter, "sample_border": border, **CROP}
     scene = lamps_and_sky(rgb_film(**keys), sky)
-    a = renders(scene, integrator(max_depth=3, hide_emitters=hide, skip="none"), range(24), 64)
-    b = renders(scene, integrator("path", max_depth=3, hide_emitters=hide), range(50, 74), 256)
+    a = renders(scene, integrator(max_depth=3, hide_emitters=hide, skip="none"), 64, 24)
+    b = renders(scene, integrator("path", max_depth=3, hide_emitters=hide), 256, 24, 50)
     alpha = pixel_format.endswith("a")
     assert a.shape == b.shape == (24, 12, 8, (1 if "lum" in pixel_format else 3) + alpha)
     scale = b.mean((0, 1, 2))
@@ -260,5 +250,5 @@ def test_cropped_formats_equal_path(pixel_format, rfilter, border, hide, sky):
 def test_depth_zero_is_black_and_clear(hide):
     scene = lamps_and_sky(rgb_film(pixel_format="rgba"), True)
     for kind in ("bdpt", "path"):
-        image = renders(scene, integrator(kind, max_depth=0, hide_emitters=hide), [0], 4)
+        image = renders(scene, integrator(kind, max_depth=0, hide_emitters=hide), 4, 1)
         assert (image == 0).all()

@@ -6,6 +6,8 @@ import pytest
 from mitsuba_bdpt.image.replicates import Replicates
 from mitsuba_bdpt.run import schedule
 
+from scenes import renders
+
 
 def scene(rfilter="box", width=12, sampler="independent"):
     box = mi.cornell_box()
@@ -17,11 +19,6 @@ def scene(rfilter="box", width=12, sampler="independent"):
 
 def bdpt(**parameters):
     return mi.load_dict({"type": "bdpt", "max_depth": 4, "layers": "variance"} | parameters)
-
-
-def renders(integrator, target, seeds, spp):
-    images = [np.array(integrator.render(target, seed=s, spp=spp), dtype=np.float64) for s in seeds]
-    return np.stack(images)
 
 
 def test_weighted_variance_of_a_mean():
@@ -85,7 +82,7 @@ def test_variance_is_the_spread_over_seeds(rfilter, parameters):
     target = scene(rfilter)
     integrator = bdpt(**parameters)
     assert integrator.aov_names() == ["variance.R", "variance.G", "variance.B"]
-    result = renders(integrator, target, range(32), 16)
+    result = renders(target, integrator, 16, 32)
     images, estimates = result[..., :3], result[..., 3:]
     scale = images.mean(0) ** 2 + 0.01 * images.mean() ** 2
     expected = (images.var(0, ddof=1) / scale).mean()
@@ -109,9 +106,9 @@ def test_the_image_is_as_good_with_it():
     count."""
     target = scene()
     integrator = bdpt()
-    a = renders(integrator, target, range(8), 100)[..., :3]
+    a = renders(target, integrator, 100, 8)[..., :3]
     assert sum(integrator.statistics["passes"]) == 100
-    b = renders(bdpt(layers=""), target, range(20, 28), 100)
+    b = renders(target, bdpt(layers=""), 100, 8, 20)
     assert b.shape[-1] == 3 and "error" not in bdpt(layers="").statistics
     assert a.mean() == pytest.approx(b.mean(), rel=0.02)
 
