@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28131}
+OUTSIDE = {"scripts": 2961, "tests": 28095}
 MOST_WORDS = 28891
 
 
