@@ -270,7 +270,6 @@ OWN = "--integrator", "scene", "-D", "integrator=bdpt"
         ([], ["-P", "max_dept=4"], r"max_dept=4 is not a parameter; did you mean max_depth\? Parameters:"),
         ([], ["-P", "decisions=[]"], r"decisions='\[\]' is not a parameter; set light_paths and"),
         ([], ["--spp", "9999999999"], "spp=9999999999 must be an integer from 1 to 4294967295, or 0"),
-        ([('"width" value="6"', '"width" value="1000001"')], [], "for a PNG, whose sides have 1000000"),
         ([('count" value="4"', 'count" value="0"')], [], "sample_count=0: nothing is to"),
         ([(SENSOR, ""), ('<default name="format" value="float32"/>', "")], [], "no sensor"),
         ([(SCENE, '<bsdf version="3.0.0" type="diffuse"/>')], [], "holds a single object.*no <scene>"),

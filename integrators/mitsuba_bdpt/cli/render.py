@@ -20,14 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import CommandError, FailureError
-from ..files.images import (
-    STATISTICS,
-    check_channels,
-    check_output,
-    check_png,
-    write_images,
-    write_png,
-)
+from ..files.images import STATISTICS, check_channels, check_output, write_images, write_png
 from ..files.loading import Loaded, check_file, choose_sensor, load
 from ..files.texts import write_json
 from ..files.whole import check_writable
@@ -80,7 +73,6 @@ def _run(options: Namespace, ending: Ending) -> int:
     scene, integrator, used = loaded(options, ending)
     check_integrator(options, integrator)
     film = choose_sensor(scene, options.sensor).film()
-    check_png(film)
     check_channels(film, integrator.aov_names())
     spp = samples_per_pixel(scene, options)
     print(f"integrator: {used}", file=sys.stderr)

@@ -17,9 +17,6 @@ from ..host.jit import two_threads
 from ..image.layers import DENOISED
 from .whole import MAGIC, check_format, check_writable, replacing, utf8
 
-PNG_SIDE = 1_000_000
-"""Pixels in a row or column of a PNG, at most: libpng's limit."""
-
 MOST_CHANNELS = 1023
 """Of an image file, the weight of a pixel among them: Mitsuba's bitmaps have 4095 bytes for a pixel."""
 
@@ -31,16 +28,6 @@ def check_channels(film: mi.Film, layers: list[str]) -> None:
         raise CommandError(
             f"the image has {count} channels, {len(layers)} of them layers, and Mitsuba's images hold "
             f"{MOST_CHANNELS} at most; ask for fewer layers: of strategies, by a smaller max_depth."
-        )
-
-
-def check_png(film: mi.Film) -> None:
-    """Raise ``CommandError``, before the render, for an image too large for a PNG."""
-    width, height = film.crop_size()
-    if max(width, height) > PNG_SIDE:
-        raise CommandError(
-            f"the image of {width} x {height} is too long for a PNG, whose sides have {PNG_SIDE} "
-            "pixels at most; render crop windows."
         )
 
 
