@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28094}
+OUTSIDE = {"scripts": 2961, "tests": 28087}
 MOST_WORDS = 28891
 
 

@@ -7,7 +7,7 @@ from scene_parts import T
 from warned import Warned
 
 from .compare import WAYS, agree, tiles
-from .rooms import area, camera, diffuse
+from .rooms import area, camera, diffuse, loaded
 
 SEEDS, SPP, DEPTH = range(8), 64, 5
 
@@ -32,13 +32,7 @@ def box(size: float = 0.3, **sides) -> dict:
 def room(**found):
     """A matte sphere around a camera and a glowing ball."""
     lamp = {"type": "sphere", "center": [0.3, 0.35, -0.3], "radius": 0.15, "emitter": area(4.0)}
-    scene = {
-        "type": "scene",
-        "sensor": camera(),
-        "wall": {"type": "sphere", "bsdf": diffuse(0.6)},
-        "lamp": lamp,
-    }
-    return mi.load_dict(scene | found)
+    return loaded(camera(), **{"wall": {"type": "sphere", "bsdf": diffuse(0.6)}, "lamp": lamp} | found)
 
 
 def like(scene, other, reach=0.01, light=True, **integrator) -> None:

@@ -1,5 +1,7 @@
 """NaN and infinity from BSDFs, lamps, textures and vertices of meshes, mostly compared with their twins."""
 
+from functools import partial
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -79,46 +81,46 @@ POWER = EVERYTHING | UNSEEN | {"heuristic": "power"}
 
 # Values that count of the bad texels: of s = 1 and of the subpath that would go on; of what is seen directly.
 TEXELS = int(SIZE**2 * BAD_TEXELS) * SPP
-BOTH = {"count": 2 * TEXELS}
-
-# Names, arguments of `compare_with_twin`, and its ``count``.
-TWINS = [
-    *(
-        (f"{n} {bad}, {way}", BSDFS[n], bad, *RENDERS[way])
-        for n in BSDFS
-        for bad in (NAN, INF)
-        for way in RENDERS
-    ),
-    *(
-        (f"{n}, {way}", *LAMPS[n], RENDERS[way][0] | UNSEEN, RENDERS[way][1])
-        for n in LAMPS
-        for way in RENDERS
-    ),
-    *((f"pdf {bad}, power", BSDFS["pdf"], bad, POWER) for bad in (NAN, INF)),
-    *((f"densities {bad}, power", sky_of("pdf"), bad, POWER) for bad in (NAN, INF)),
-    ("strategies", BSDFS["eval"], NAN, EVERYTHING | {"layers": "strategies"}),
-    ("reflectance", reflecting, NAN, BY_CAMERA, BOTH),
-    ("red", lambda x: filled(painted([x, 0, 0])), NAN, BY_CAMERA, BOTH),  # in part NaN is not black
-    ("passes", reflecting, NAN, BY_CAMERA | {"spp_per_pass": 3}, BOTH),
-    ("variance", reflecting, NAN, BY_CAMERA | {"layers": "variance"}, BOTH),
-    ("radiance", glowing_plate, NAN, {"light_paths": 0, "max_depth": 1}, {"count": TEXELS}),
-    ("feature", reflecting, NAN, {"aovs": "a:albedo", "max_depth": 0}, {"count": TEXELS}),
-]
-SPECTRAL = [
-    *(
-        (n, *LAMPS[n], EVERYTHING | UNSEEN)
-        for n in ("radiance NaN", "densities infinite", "point NaN", "sky NaN")
-    ),
-    ("eval", BSDFS["eval"], NAN, EVERYTHING),
-    ("texels", spectrally_painted, NAN, BY_CAMERA, BOTH),
-]
-TWINS = [("llvm_ad_rgb", *case) for case in TWINS] + [("llvm_ad_spectral", *case) for case in SPECTRAL]
 
 
-@pytest.mark.parametrize(
-    "case", TWINS, ids=lambda case: f"{case[1]}" + ", spectral" * case[0].endswith("spectral")
-)
-def test_twins(case):
+def spectral(*arguments, **count):
+    mi.set_variant("llvm_ad_spectral")
+    compare_with_twin(*arguments, **count)
+
+
+# Comparisons by their names.
+TWINS = {
+    f"{name} {bad}, {way}": partial(compare_with_twin, make, bad, *RENDERS[way])
+    for name, make in BSDFS.items()
+    for bad in (NAN, INF)
+    for way in RENDERS
+}
+for way, (parameters, spp) in RENDERS.items():
+    for name, lamp in LAMPS.items():
+        TWINS[f"{name}, {way}"] = partial(compare_with_twin, *lamp, parameters | UNSEEN, spp)
+for name, make in ("pdf", BSDFS["pdf"]), ("densities", sky_of("pdf")):
+    for bad in (NAN, INF):
+        TWINS[f"{name} {bad}, power"] = partial(compare_with_twin, make, bad, POWER)
+for name, make, parameters, values in (
+    ("reflectance", reflecting, BY_CAMERA, 2),
+    ("red", lambda x: filled(painted([x, 0, 0])), BY_CAMERA, 2),  # in part NaN is not black
+    ("passes", reflecting, BY_CAMERA | {"spp_per_pass": 3}, 2),
+    ("variance", reflecting, BY_CAMERA | {"layers": "variance"}, 2),
+    ("radiance", glowing_plate, {"light_paths": 0, "max_depth": 1}, 1),
+    ("feature", reflecting, {"aovs": "a:albedo", "max_depth": 0}, 1),
+):
+    TWINS[name] = partial(compare_with_twin, make, NAN, parameters, count=values * TEXELS)
+for name in ("radiance NaN", "densities infinite", "point NaN", "sky NaN"):
+    TWINS[f"{name}, spectral"] = partial(spectral, *LAMPS[name], EVERYTHING | UNSEEN)
+TWINS |= {
+    "strategies": partial(compare_with_twin, BSDFS["eval"], NAN, EVERYTHING | {"layers": "strategies"}),
+    "eval, spectral": partial(spectral, BSDFS["eval"], NAN, EVERYTHING),
+    "texels, spectral": partial(spectral, spectrally_painted, NAN, BY_CAMERA, count=2 * TEXELS),
+}
+
+
+@pytest.mark.parametrize("name", TWINS)
+def test_twins(name):
     """NaN or infinity: of a user's BSDF on half a plate (weight of sampled directions, these, the index of
     refraction beside glass, value, density), of half a user's environment, of Mitsuba's lamps, of texels of a
     spot, a reflectance, a lamp, an albedo; all strategies, and by default with so many samples that a pilot
@@ -128,10 +130,7 @@ def test_twins(case):
     order of sums differs); counted, of texels in the number that follows from the scene; one warning; the
     pilot finds the same mean, and the twin renders by its decision.
     """
-    variant, _, *arguments = case
-    mi.set_variant(variant)
-    count = arguments.pop() if isinstance(arguments[-1], dict) and "count" in arguments[-1] else {}
-    compare_with_twin(*arguments, **count)
+    TWINS[name]()
 
 
 def test_pilot():

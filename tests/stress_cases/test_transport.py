@@ -9,14 +9,14 @@ from warned import Warned
 from scenes import DOWNWARDS, area, floor, square
 
 from .compare import WAYS, agree, tiles
-from .rooms import camera, diffuse, view
+from .rooms import camera, diffuse, loaded, view
 
 SEEDS = range(8)
 
 
 def scene(sensor=None, **found):
     """A scene of these parts, seen from within the unit sphere unless a ``sensor`` is given."""
-    return mi.load_dict({"type": "scene", "sensor": sensor or camera(), **found})
+    return loaded(sensor or camera(), **found)
 
 
 def look(origin, target, fov):
