@@ -123,20 +123,6 @@ def test_a_scene_of_the_users_is_swept_reported_and_shown(here, command):
     assert not (here / "references").exists() and not (here / "results").exists()
 
 
-def test_other_commands_take_the_users_scene(here, capsys):
-    common = ["--resolution", "16", "--project", "project"]
-    room = "elsewhere/room.xml"
-    words = ["compare", "bdpt skip=none", "path sampler=stratified", "--scenes", room, "--spp", "4"]
-    assert main([*words, "--pairs", "1", *common]) == 0
-    out = capsys.readouterr().out
-    assert "making one" in out and re.search(r"\| `room` +\| 4 +\|", out)
-    assert main(["equal-time", room, "--spp", "4", *common]) == 0
-    assert main(["pyramid", room, "--spp", "4", *common]) == 0
-    assert "making one" not in capsys.readouterr().out
-    made = {path.name for path in (here / "project" / "renders").iterdir()}
-    assert {"equal_time_room.png", "pyramid_room.exr", "pyramid_room_weighted.png"} <= made
-
-
 def test_the_first_integrator_may_be_any(here, monkeypatch, capsys):
     preset = here / "project" / "presets" / "alone.toml"
     head = PRESET.partition("[[integrator]]")[0]
@@ -198,21 +184,28 @@ def test_mistakes_are_answered_with_what_to_do(here, capsys, words, message):
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("words", "made"),
     [
-        "reference elsewhere/room.xml --seconds 0",
-        "compare bdpt path --pairs 1 --spp 1 --reference-seconds 0 --scenes elsewhere/room.xml",
-        "equal-time elsewhere/room.xml --spp 1 --reference-seconds 0",
+        ("reference elsewhere/room.xml --seconds 0", []),
+        ("compare bdpt path --pairs 1 --spp 1 --reference-seconds 0 --scenes elsewhere/room.xml", []),
+        ("equal-time elsewhere/room.xml --spp 1 --reference-seconds 0", ["equal_time_room.png"]),
     ],
-    ids=lambda words: words.split()[0],
+    ids=["reference", "compare", "equal-time"],
 )
-def test_commands_render_at_a_width_that_fits(here, capsys, words):
+def test_commands_take_the_users_scene_at_a_width_that_fits(here, capsys, words, made):
     """All do as `sweep`, and say it, first: of 64 x 36 pixels and a width of 16 these are 8 x 4."""
     (here / "elsewhere" / "room.xml").write_text(ROOM.format(height=36, sampler=""))
     assert main([*words.split(), "--resolution", "16"]) in (0, 1)
     said = capsys.readouterr().out
     assert said.startswith("room: rendered with 8 x 4 pixels: the 16 x 9 of resolution=16 do not divide")
+    assert ("| `room` " in said) == (words.split()[0] == "compare")
     assert [file.name for file in (here / "references").iterdir()] == ["room_8_4.exr"]
+    assert [file.name for file in here.glob("renders/*")] == made
+
+
+def test_a_pyramid_is_of_the_users_scene(command, here):
+    command("pyramid", "elsewhere/room.xml", "--spp", "4", "--resolution", "16")
+    assert {"pyramid_room.exr", "pyramid_room_weighted.png"} <= {file.name for file in here.glob("renders/*")}
 
 
 def test_samples_are_those_that_a_sampler_takes(here, capfd):
@@ -251,29 +244,22 @@ def test_a_sample_is_timed_where_a_sampler_rounds_up(here, monkeypatch):
     assert bench.equal(cells.of(32, 1)[1])["samples"] == pytest.approx(1)
 
 
-CROPPED = "".join(
-    f'<integer name="crop_{name}" value="{value}"/>'
-    for name, value in (("offset_x", 4), ("offset_y", 4), ("width", 16), ("height", 8))
-)
-
-
 @pytest.mark.parametrize("wanted", [64, 80])
-@pytest.mark.parametrize(("sensors", "crop"), [(1, ""), (2, CROPPED)])
 @pytest.mark.parametrize(
     ("width", "height"),
     [("$resolution", "48"), ("160", "$resolution"), ("$resolution", "$resolution_y"), ("160", "48")],
 )
-def test_films_keep_their_shape(here, width, height, sensors, crop, wanted):
-    film = f'"{{width}}"/><integer name="height" value="{{height}}"/>{crop}'
-    start, _, rest = ROOM.format(height=32, sampler="").partition('"64"/><integer name="height" value="32"/>')
-    camera, end, shapes = (start + film + rest).partition("</sensor>")
-    head, sensor, camera = camera.partition("<sensor")
+def test_films_keep_their_shape(here, width, height, wanted):
+    """Sizes from parameters of the file; without its crop window; of the first of two sensors."""
     defaults = {"resolution": 48 if height == "$resolution" else 160, "resolution_y": 48}
     declared = "".join(f'<default name="{name}" value="{value}"/>' for name, value in defaults.items())
-    first = (sensor + camera + end).format(width=width, height=height)
-    others = (sensors - 1) * (sensor + camera + end).format(width=100, height=100)
+    window = {"crop_offset_x": 4, "crop_offset_y": 4, "crop_width": 16, "crop_height": 8}
+    cropped = "".join(f'<integer name="{name}" value="{value}"/>' for name, value in window.items())
+    text = ROOM.format(height=height, sampler="").replace('value="64"', f'value="{width}"')
+    text = text.replace("<integrator", f"{declared}<integrator", 1).replace("</film>", f"{cropped}</film>")
+    second = '<sensor type="perspective"/></scene>'
     file = here / "elsewhere" / "room.xml"
-    file.write_text(head.replace("<integrator", f"{declared}<integrator") + first + others + shapes)
+    file.write_text(text.replace("</scene>", second))
     scene = SceneFile("room", file)
     nearest = making.fitted(scene, wanted)
     assert nearest == {64: 68, 80: 80}[wanted] and scene.size() == (160, 48)
@@ -351,17 +337,6 @@ def test_the_parser_needs_nothing_of_the_extra():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_an_interrupted_command_says_what_is_kept(here, monkeypatch, capsys):
-    parsed = build_parser().parse_args(["report", "x"])
-
-    def interrupted(arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(report, "run", interrupted)
-    assert measuring.run(parsed) == measuring.mistakes.INTERRUPTED
-    assert capsys.readouterr().err == "interrupted; what was finished is kept, and the same command goes on\n"
 
 
 def test_mistakes_that_only_a_render_finds_are_one_line(here, refused):
@@ -467,21 +442,8 @@ def test_samples_of_a_render_that_stops_are_its_own(here, command):
     own = '[[integrator]]\ntype = "bdpt"\ntarget_error = 100.0\n'
     (here / "project" / "presets" / "mine.toml").write_text(stopping + own)
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
-    rows = pd.read_parquet(here / "out" / "rows.parquet")
-    assert (rows["budget"][0], rows["spp"][0]) == (256, 32) and sweep.short_of_target(rows) == []
-    (here / "project" / "presets" / "mine.toml").write_text(stopping + own.replace("100.0", "1e-9"))
-    said = command("sweep", "mine", "--project", "project", "-o", "out")
-    assert "room, 256 spp, bdpt: 1 of 1 renders did not reach target_error=1e-09\n" in said
-
-
-def test_an_edit_during_a_sweep_keeps_its_rows(here, monkeypatch):
-    digests = iter("abcdefgh" * 99)
-    monkeypatch.setattr("mitsuba_bdpt.measure.preset.source_digest", lambda: next(digests))
-    preset = PRESET.partition("[[integrator]]")[0].replace("[8, 2]", "2") + '[[integrator]]\ntype = "path"\n'
-    (here / "project" / "presets" / "mine.toml").write_text(preset)
-    words = ["sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1"]
-    assert main(words) == 0
-    assert pyarrow.parquet.read_table(here / "out" / "rows.parquet").num_rows == 4
+    rows = pd.read_csv(here / "out" / "rows.csv")
+    assert (rows["budget"][0], rows["spp"][0]) == (256, 32)
 
 
 def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):

@@ -148,7 +148,7 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swep
     for row in table:
         assert row["seconds"] > 0 and row["rel_mse_trimmed"] <= row["rel_mse"] and row["max_depth"] == 3
         assert row["spp"] == row["budget"] or row["method"] == "path"
-        assert row["first"] == "ours" and row["seconds_compile"] >= 0 and "cores" in row["machine"]
+        assert row["first"] == "ours" and row["seconds_pilot"] >= 0 and "cores" in row["machine"]
         assert json.loads(row["parameters"])["type"] in ("bdpt", "path")
     assert all(r["rays_camera"] > 0 for r in table if r["method"] == "ours")
     (output / "cells" / f"{table[3]['key']}.json").unlink()
@@ -303,19 +303,22 @@ def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
         (("[2, 4]", "[2, 2]"), r"spp=\[2, 2\] must differ"),
         (("[2, 4]", "[true]"), r"spp.0=True: .* integer"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] be as many"),
-        (("seeds = 2", "seed = 2"), r"seed=2: there is no such key; did you mean seeds\?"),
+        (("seeds = 2", "seed = 2"), "seed=2: Extra inputs are not permitted"),
         (('scenes = ["cornell_box"]', ""), "scenes is missing"),
         (("cornell_box", "nowhere"), "scene='nowhere'"),
         (('type = "bdpt"', 'type = "bdpt"\nseeds = 1'), "the first integrator, 'ours', sets the time"),
         (('type = "bdpt"', 'type = "bdpt"\nmatch = "seconds"'), "the first integrator, 'ours', sets"),
         (('match = "seconds"', 'scenes = ["pool"]'), "scenes of integrator 'path': 'pool' is not among"),
-        (('type = "path"', 'name = "path"'), "tiny.toml: integrator.1.type is missing$"),
+        (('type = "path"', 'name = "path"'), "tiny.toml: integrator.1.type=.*: Field required"),
         (('type = "path"', 'type = "path"\nmax_depth = 3'), "max_depth of one integrator would compare"),
         (('type = "path"', 'type = "path"\nname = "ours"'), "two integrators have the same name"),
         (('match = "seconds"', "x = [1]"), r"integrator.1.x=\[1\]: must be a number, a text"),
         (('match = "seconds"', "[scene.pool]\nspp = [1]\nseeds = 1"), r"\[scene.pool\]: 'pool' is not among"),
-        (('match = "seconds"', "[scene.cornell_box]\ndepth = 1"), "cornell_box.depth=1: .*max_depth"),
-        (('match = "seconds"', "[more]\nspp = 4"), "more={'spp': 4}: there is no such key"),
+        (
+            ('match = "seconds"', "[scene.cornell_box]\ndepth = 1"),
+            "cornell_box.depth=1: Extra inputs",
+        ),
+        (('match = "seconds"', "[more]\nspp = 4"), "more={'spp': 4}: Extra inputs are not permitted"),
     ],
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
@@ -491,17 +494,17 @@ def test_the_table_is_tidy(tmp_path):
     assert not list(tmp_path.rglob(".*"))
 
 
-@pytest.mark.parametrize(("more", "points"), [("", "sobol"), ('points = "independent"\n', "independent")])
-def test_samplers_of_rows_are_those_of_the_table(folder, known, swept, more, points):
-    text = PRESET.replace('type = "bdpt"\n', f'type = "bdpt"\nsampler = "multijitter"\n{more}')
-    path, output = preset_file(folder, text.replace("[2, 4]", "[2]")), folder / "out"
-    assert swept(path, "-o", output) == 0
-    for table, name in (
-        (pd.read_parquet(output / "rows.parquet"), "method"),
-        (pd.read_csv(output / "rows.csv"), "integrator"),
-    ):
-        samplers = dict(zip(table[name], table["sampler"], strict=True))
-        assert len(table) == 4 and samplers == {"ours": points, "path": "independent"}
+@pytest.mark.parametrize("points", ["sobol", "independent"])
+def test_samplers_of_rows_are_those_of_the_table(folder, known, swept, points):
+    own = f'type = "bdpt"\nsampler = "multijitter"\npoints = "{points}"\n'
+    text = PRESET.replace('type = "bdpt"\n', own).replace("[2, 4]", "[2]")
+    assert swept(preset_file(folder, text), "-o", folder / "out") == 0
+    table = pd.read_csv(folder / "out" / "rows.csv")
+    assert len(table) == 4
+    assert set(zip(table["integrator"], table["sampler"], strict=True)) == {
+        ("ours", points),
+        ("path", "independent"),
+    }
 
 
 def test_what_time_does_not_allow_is_cut(folder, monkeypatch):
@@ -599,7 +602,7 @@ def test_equal_time_is_measured_at_a_budget_that_time_allows(folder, monkeypatch
     text = PRESET.replace("[2, 4]", "[4, 40, 400]")
     (cells,) = read_preset(preset_file(folder, text), Project(folder)).cells
     monkeypatch.setattr(Clock, "timed", lambda self, cell, spp, seed: Timed(None, spp * PER[cell.method], 0))
-    monkeypatch.setattr(Clock, "first_seconds", lambda self, cell, spp: None)
+    monkeypatch.setattr(Clock, "warm", lambda self, cell, spp: None)
     for seconds, budget in ((0.016, 4), (1.6, 40), (math.inf, 400)):
         bench = Clock(cells, folder / f"{budget}", seconds)
         assert bench.spp_of(cells.of(4, 1)[1]) == 16 and bench.spp_of(cells.of(400, 1)[1]) == 1600

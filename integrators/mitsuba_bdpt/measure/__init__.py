@@ -15,19 +15,15 @@ as a dictionary (that of ``mi.load_dict``) where the command takes a file::
 References, pictures and rows lie in the folder ``project``, by the scene's name. A dictionary is written into
 a scene file there, named by its content unless it is given as ``measure.SceneDict(name, dictionary)``.
 
-Needs the extra ``[measure]``. Within the package nothing but the commands import it (see `cli.measuring`).
+Needs the extra ``[measure]``. Within the package only the commands import it (see `cli.measuring`).
 
-* For Python: `api`; options, their defaults and bounds: `options`.
-* Scenes: `project` (the user's folder), `scenes` (any scene file, at any size).
-* Renders: `timing` (a render, and several sides in turns).
-* Errors: `metrics` (of an image), `agreement` (bias), `reference` (stored references), `making` (how they are
-  made).
-* Sweeps: `models` (contents of TOML files), `preset` (which renders), `limited` (which fit into a time),
-  `sweep`, `results` (their files and tables).
-* Reports: `analysis` (figures, or why there are none), `tables`, `figures` (plots), `crops` (images side by
-  side), `paper` (widths and formats for print), `report` (Markdown), `page` (HTML).
+* A user's folder is a `project`, its files `scenes`; `api` and `options` are for Python and the command.
+* Renders are timed by `timing`; `metrics` are errors of an image, `agreement` is bias, `making` makes each
+  `reference`.
+* A sweep's TOML file is checked by `models`, `preset` lists its renders, `limited` orders them under a time
+  limit, `sweep` renders them, `results` are its files.
+* `analysis` of the rows is shown by `report`, `figures`, `crops` and `page`, with `tables` and `paper`.
 * A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.
-* Progress and time left: `showing`.
 """
 
 from .api import (

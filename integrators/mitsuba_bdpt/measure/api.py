@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from ..errors import CommandError, FailureError, did_you_mean
+from ..errors import CommandError, FailureError
 from . import options as available
 from .options import VARIANT
 
@@ -158,13 +158,9 @@ def _file(project: Project, scene: Scene) -> str:
 
 
 def _options(kind: type[OptionsT], given: dict) -> OptionsT:
-    known = {field.name: field for field in available.options_of(kind)}
-    for name in given:
-        if name not in known:
-            question = did_you_mean(name, known)
-            raise CommandError(f"{name}={given[name]!r} is no option; {question}there are {', '.join(known)}")
     # An option of several values accepts a single one.
-    several = [name for name in given if available.takes_several(known[name]) and given[name] is not None]
+    takes_several = {field.name for field in available.options_of(kind) if available.takes_several(field)}
+    several = [name for name in given if name in takes_several and given[name] is not None]
     alone = {name: (given[name],) for name in several if not isinstance(given[name], list | tuple)}
     return kind(**given | alone)
 

@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic import model_validator as validator
 
-from ..errors import CommandError, did_you_mean
+from ..errors import CommandError
 from .agreement import FEWEST_RUNS, TILES
 from .options import RESOLUTION
 
@@ -44,23 +44,11 @@ def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> Model
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        found = error.errors(include_url=False)
-        # A list is too short, too, if its entries are wrong.
-        errors = [one for one in found if one["type"] != "too_short" or len(found) == 1]
-        raise CommandError(f"{where}: {'; '.join(_text(kind, one) for one in errors)}") from error
-
-
-def _text(kind: type[Model], found: Mapping[str, Any]) -> str:
-    key, value, text = ".".join(map(str, found["loc"])), found["input"], found["msg"]
-    if found["type"] == "extra_forbidden":
-        schema = kind.model_json_schema()
-        tables = schema, *schema.get("$defs", {}).values()
-        known = sorted({name for table in tables for name in table.get("properties", ())})
-        text = f"there is no such key; {did_you_mean(str(found['loc'][-1]), known)}".rstrip("; ")
-    if found["type"] == "missing":
-        return f"{key} is missing"
-    text = text.removeprefix("Value error, ")
-    return f"{key}={value!r}: {text}" if key else text
+        texts = []
+        for one in error.errors(include_url=False):
+            key, text = ".".join(map(str, one["loc"])), one["msg"].removeprefix("Value error, ")
+            texts.append(f"{key}={one['input']!r}: {text}" if key else text)
+        raise CommandError(f"{where}: {'; '.join(texts)}") from error
 
 
 def _of_plugin(value: Any) -> Any:

@@ -26,7 +26,7 @@ from ..run.rendering import raise_interrupt
 from .making import Job, fitted
 from .models import PresetFile, checked
 from .project import Project
-from .reference import Reference, load_reference, reference_path, source_digest
+from .reference import Reference, load_reference, source_digest
 from .scenes import SceneFile, digest
 
 FIRST_SEED = 1  # seed 0 warms up
@@ -137,7 +137,7 @@ class Cells:
     @cached_property
     def judge(self) -> tuple[Reference, str]:
         """The stored reference, and the SHA-256 of its file, computed before reading."""
-        path = reference_path(self.project, self.scene.name, self.resolution, self.max_depth)
+        path = self.job.path
         sha256 = digest(path) if path.exists() else ""
         return load_reference(*self.where), sha256
 

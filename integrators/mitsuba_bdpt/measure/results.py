@@ -155,7 +155,7 @@ def missing_of(output: Path) -> dict[str, dict[str, str]]:
 
 COLUMNS = (
     *("scene", "integrator", "parameters", "sampler", "spp", "seed", "clock", "budget", "equal_time_spp"),
-    *("seconds", "cpu_seconds", "seconds_compile", "seconds_pilot"),
+    *("seconds", "cpu_seconds", "seconds_pilot"),
     *("rel_mse", "rel_mse_trimmed", "reference_rel_mse", "reference_rel_mse_trimmed", "variance"),
     *("flip", "delta_e_itp", "mean", "energy", "width", "height", "max_depth"),
 )

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mitsuba as mi
 
@@ -23,15 +23,6 @@ from ..files.loading import (
     unless_incompatible,
 )
 from ..host.introspection import media_of
-
-
-class _Look(NamedTuple):
-    """A scene's ``max_depth``, `has_media`, the size of its film, and whether that has colours."""
-
-    max_depth: int
-    has_media: bool
-    size: tuple[int, int]
-    has_colours: bool
 
 
 @dataclass(frozen=True)
@@ -80,32 +71,32 @@ class SceneFile:
 
         Raises ``CommandError`` for a film without colours.
         """
-        if not self._look.has_colours:
+        _, _, size, channels = self._look
+        if channels < 3:
             raise CommandError(
                 f"scene={str(self.file)!r}: its film has no colours, of which errors are taken; give it the "
                 'pixel_format "rgb"'
             )
-        return self._look.size if resolution is None else _widened(self._look.size, resolution)
+        return size if resolution is None else _widened(size, resolution)
 
     @property
     def max_depth(self) -> int:
         """The integrator's ``max_depth``; -1 (no limit) without one."""
-        return self._look.max_depth
+        return self._look[0]
 
     @property
     def has_media(self) -> bool:
         """Whether a sensor is in a medium, or a shape bounds one."""
-        return self._look.has_media
+        return self._look[1]
 
     @cached_property
-    def _look(self) -> _Look:
-        """Loads the scene once, which may be slow."""
+    def _look(self) -> tuple[int, bool, tuple[int, int], int]:
+        """Load the scene once; returns `max_depth`, `has_media`, the film's size and number of channels."""
         scene = self.load()
         film = choose_sensor(scene, 0).film()
         width, height = map(int, film.size())
         has_media = bool(media_of(scene, scene.sensors()))
-        has_colours = film.base_channels_count() >= 3
-        return _Look(depth_of(scene.integrator()), has_media, (width, height), has_colours)
+        return depth_of(scene.integrator()), has_media, (width, height), film.base_channels_count()
 
 
 def digest(*paths: Path) -> str:

@@ -15,13 +15,11 @@ import math
 import time
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pandas as pd
@@ -58,7 +56,7 @@ class Bench:
         self.cells, self.output, self.seconds = cells, output, seconds
         self.scene = cache(lambda sampler: cells.scene.load(cells.resolution, sampler))
         self._loaded = cache(lambda parameters: integrator_of(dict(parameters), cells.max_depth))
-        self._first: dict[tuple[str, int], tuple[float, float]] = {}
+        self._pilots: dict[tuple[str, int], float] = {}
         self._spp: dict[str, dict[str, float]] = {}
 
     def integrator(self, cell: Cell) -> mi.Integrator:
@@ -67,23 +65,14 @@ class Bench:
     def timed(self, cell: Cell, spp: int, seed: int) -> Timed:
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
-    def first_seconds(self, cell: Cell, spp: int) -> tuple[float, float]:
-        """Return the seconds of an integrator's first render for compiling and for pilots.
-
-        Less with a cache on disk. Mitsuba's integrators compile for each number of samples; later renders use
-        the pilots' cached results.
-        """
+    def warm(self, cell: Cell, spp: int) -> float:
+        """Render once, which compiles for ``spp``; returns the seconds of pilots, used again later."""
         key = cell.method, spp
-        if key not in self._first:
-            with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
-                dr.kernel_history_clear()
-                self.timed(cell, spp, 0)
-                kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
-            compiled = sum(k["codegen_time"] + k["backend_time"] for k in kernels) / 1000
+        if key not in self._pilots:
+            self.timed(cell, spp, 0)
             statistics = getattr(self.integrator(cell), "statistics", None)
-            own = statistics["seconds"] if statistics else {"compile": compiled, "pilot": 0.0}
-            self._first[key] = own["compile"], own["pilot"]
-        return self._first[key]
+            self._pilots[key] = statistics["seconds"]["pilot"] if statistics else 0.0
+        return self._pilots[key]
 
     def spp_of(self, cell: Cell) -> int:
         """Return the samples of a cell: its budget, or those for equal time."""
@@ -115,27 +104,26 @@ class Bench:
         """Return the seconds of a sample by the ``first`` integrator over those by a cell's."""
         sides = [(one, self._taken(one, budget)) for one in (first, cell)]
         for one, spp in sides:
-            self.first_seconds(one, spp)
+            self.warm(one, spp)
         turns = alternating([partial(self.timed, *side) for side in sides], CALIBRATIONS, is_warm=True)
         seconds = [[decided(one._asdict() | {"clock": cell.clock}) for one in both] for both in turns]
         (_, ours), (_, theirs) = sides
         return float(np.median([a / ours / (b / theirs) for a, b in seconds]))
 
     def _calibration_budget(self, first: Cell, cell: Cell) -> int:
-        budgets = sorted(self.cells.spp)
         if self.seconds == math.inf:
-            return budgets[-1]
+            return max(self.cells.spp)
         rivals = sum(m.match == "seconds" for m in self.cells.methods[1:])
-        patience, at, best = CALIBRATED * self.seconds / rivals, 0, budgets[0]
-        # Small renders take longer per sample than large ones, so that more may fit than the first suggest.
-        while best > at:
-            at = best
-            sides = [(one, self._taken(one, at)) for one in (first, cell)]
+        patience = CALIBRATED * self.seconds / rivals
+        budget, *larger = sorted(self.cells.spp)
+        while True:
+            sides = [(one, self._taken(one, budget)) for one in (first, cell)]
             for side in sides:
-                self.first_seconds(*side)
+                self.warm(*side)
             of_a_sample = sum(self.timed(one, spp, 0).seconds / spp for one, spp in sides)
-            best = max((b for b in budgets if (1 + CALIBRATIONS) * b * of_a_sample <= patience), default=at)
-        return at
+            if not larger or (1 + CALIBRATIONS) * larger[0] * of_a_sample > patience:
+                return budget
+            budget = larger.pop(0)
 
     def _taken(self, cell: Cell, spp: int) -> int:
         return samples_taken(self.scene(cell.sampler), self.integrator(cell), spp)
@@ -144,7 +132,7 @@ class Bench:
 def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
     """Render a cell; returns its row, without errors, and its image."""
     spp = bench.spp_of(cell)
-    compile_seconds, pilot_seconds = bench.first_seconds(cell, spp)
+    pilot_seconds = bench.warm(cell, spp)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     image, seconds, cpu_seconds = bench.timed(cell, spp, cell.seed)
     statistics = getattr(bench.integrator(cell), "statistics", {})
@@ -164,7 +152,6 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "equal_time_spp": None if cell.match == "spp" else int(bench.equal(cell)["spp"]),
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
-        "seconds_compile": compile_seconds,
         "seconds_pilot": pilot_seconds,
         "statistics": json.dumps(statistics),
         "decisions": json.dumps(statistics.get("decisions")),
@@ -269,31 +256,19 @@ def _work(cell: Cell) -> float:
     return float(cell.budget) * cell.resolution**2
 
 
-def poor_reference(cells: Cells, table: pd.DataFrame) -> list[str]:
+def poor_reference(cells: Cells, table: pd.DataFrame) -> str:
     """Return a message about rows that the reference is too noisy for, with the command that refines it."""
     here = table[table["scene"] == cells.scene.name]
     groups = here.groupby(["method", "budget"], sort=False)
     poor = [key for key, at in groups if seed_errors(at, "rel_mse_trimmed", False)[1]]
     if not poor:
-        return []
+        return ""
     project, scene, resolution, depth = cells.where
     make = make_command(project, project.called(scene), resolution, depth, "--spp", str(max(cells.spp)))
     others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
     method, budget = poor[-1]
     text = f"{scene.name}: the reference is noisier than the renders of {method} at {budget} spp{others}, "
-    return [f"{text}whose trimmed errors are upper bounds. To go on: {make}"]
-
-
-def short_of_target(table: pd.DataFrame) -> list[str]:
-    """Return messages about integrators that ended before the preset's target error."""
-    found = []
-    for (scene, budget, method), renders in table.groupby(["scene", "budget", "method"], sort=False):
-        target = json.loads(renders["parameters"].iloc[0]).get("target_error", 0)
-        errors = [json.loads(text)["error"] for text in renders["statistics"]] if target > 0 else []
-        if short := sum(error is None or not error <= target for error in errors):
-            text = f"{short} of {len(errors)} renders did not reach target_error={target:g}"
-            found.append(f"{scene}, {budget} spp, {method}: {text}")
-    return found
+    return f"{text}whose trimmed errors are upper bounds. To go on: {make}"
 
 
 def swept(
@@ -317,8 +292,6 @@ def swept(
     sweep = Sweep(whole, output)
     sweep.check()
     check_output(output / "rows.csv", ".csv")  # fail before rendering
-    if options.output is None:
-        print(f"rows and images go to {output}", flush=True)
     limit = math.inf if options.seconds is None else options.seconds
     sweep.prepare(options.reference_seconds, limit)
     left = max(limit - (time.monotonic() - began), 0.0)
@@ -332,8 +305,6 @@ def swept(
     again = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
     names = [cells.scene.name for cells in whole.cells]
     keep_missing(output, names, sweep.cut, again and f"{again} --seconds {sweep.wanted}")
-    with suppress(OSError):  # not empty
-        output.rmdir()
     _tell(sweep, table)
     return table, sweep.failed
 
@@ -344,14 +315,8 @@ def _tell(sweep: Sweep, table: pd.DataFrame) -> None:
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
-    if len(table):
-        if table["method"].nunique() == 1:
-            print(
-                f"{table['method'].iloc[0]} is the only integrator, and compared with none; tables "
-                "[[integrator]] of the preset replace the default ones: list these too"
-            )
-        poor = [text for cells in sweep.scenes for text in poor_reference(cells, table)]
-        for text in [*short_of_target(table), *poor]:
+    for cells in sweep.scenes if len(table) else ():
+        if text := poor_reference(cells, table):
             print(f"warning: {text}")
     print(f"{sweep.output}: {len(table)} rows" + "".join(f"\nfailed: {text}" for text in sweep.failed))
 
