@@ -1,4 +1,4 @@
-"""References and sweeps: what is stored, what a restart keeps, what is refused."""
+"""Sweeps: what is stored, what a restart keeps, what is refused."""
 
 import csv
 import json

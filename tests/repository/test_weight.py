@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5313,
+    "measure": 5249,
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28087}
-MOST_WORDS = 28891
+OUTSIDE = {"scripts": 2961, "tests": 28037}
+MOST_WORDS = 28888
 
 
 def _lines(files):
