@@ -8,6 +8,7 @@ from pathlib import Path
 import goals
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
 import numpy as np
+import pages
 import pandas as pd
 import pytest
 from mitsuba_bdpt.cli.arguments import build_parser
@@ -206,6 +207,7 @@ def test_tables_say_what_the_rows_say(results):
     assert checks[:3] == ["1x (1–1)", "3x (3–3)", "fewer than two budgets with two renders"]
     assert checks[3].startswith("passed, p = ")
     assert checks[4].startswith("≥ 1x (1–1); 50 % of the energy is missing")
+    assert "![box](../images/gallery/box.png)<br>`box`<br>0.8x (0.8–0.8) " in pages.gallery(results)
 
 
 def test_goals_stand_beside_what_is_measured(results, monkeypatch, tmp_path):

@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28037}
+OUTSIDE = {"scripts": 2961, "tests": 28039}
 MOST_WORDS = 28888
 
 
