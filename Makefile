@@ -8,7 +8,7 @@ INSTALLED := $(VENV)/.installed
 SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 
 .PHONY: render test costly slow one-core costs lint gallery pictures notebook docs package references benchmark sweep stress same \
-	mutants scale
+	planted-bugs scale
 
 render: $(INSTALLED)
 	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
@@ -111,8 +111,8 @@ same: $(INSTALLED)
 	$(VENV)/bin/python scripts/versus.py $(BEFORE) --same --pairs 1 --spp 16
 
 # Planted bugs, and whether the tests see them: an hour.
-mutants: $(INSTALLED)
-	$(VENV)/bin/python scripts/mutants.py
+planted-bugs: $(INSTALLED)
+	$(VENV)/bin/python scripts/planted_bugs.py
 
 # The references of the benchmark, a few hours on two cores; goes on where it was stopped.
 references: $(INSTALLED)

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import matplotlib.image
 import mitsuba as mi
-import mutants
 import numpy as np
 import pandas as pd
+import planted_bugs
 import pytest
 import versus
 from mitsuba_bdpt.cli import mistakes
@@ -77,7 +77,7 @@ def by_user(monkeypatch, command, *arguments):
         ("equal-time room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
         ("scale.py nothing", "kind='nothing' is not known; use some of spheres, "),
         ("scale.py edits --sizes room", "size='room' is not known; use some of nothing, lamp, "),
-        ("mutants.py nowhere", "no mutant has 'nowhere' in its name"),
+        ("planted_bugs.py nowhere", "no planted bug has 'nowhere' in its name"),
         ("page . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page . -o words.toml/a.html", "words.toml"),
         ("report.py broken", "broken: rows.parquet is missing or not whole; run mitsuba-bdpt sweep"),
@@ -172,14 +172,14 @@ def test_every_script_of_the_documents_exists():
     assert len(named) > 7 and named <= set(COMMANDS)
 
 
-@pytest.mark.parametrize("mutant", mutants.MUTANTS, ids=lambda mutant: mutant.name)
-def test_mutants_can_be_planted(mutant, tmp_path):
-    """`make mutants` sees whether parameters of the tests exist."""
-    copy = mutants.planted(tmp_path, mutant) / mutants.PACKAGE.name / mutant.file
-    original = (mutants.PACKAGE / mutant.file).read_text()
-    assert mutant.old not in copy.read_text() or mutant.old in mutant.new
+@pytest.mark.parametrize("bug", planted_bugs.BUGS, ids=lambda bug: bug.name)
+def test_bugs_can_be_planted(bug, tmp_path):
+    """`make planted-bugs` sees whether parameters of the tests exist."""
+    copy = planted_bugs.planted(tmp_path, bug) / planted_bugs.PACKAGE.name / bug.file
+    original = (planted_bugs.PACKAGE / bug.file).read_text()
+    assert bug.old not in copy.read_text() or bug.old in bug.new
     assert copy.read_text() != original and compile(copy.read_text(), copy, "exec")
-    for test in mutant.tests:
+    for test in bug.tests:
         file, _, name = test.partition("::")
         function = name.partition("[")[0]
         assert f"\ndef {function}(" in (SCRIPTS.parent / file).read_text(), test
@@ -196,8 +196,8 @@ def test_mutants_can_be_planted(mutant, tmp_path):
         (1, "E       assert 1 == 2", False, "fails without the bug"),
     ],
 )
-def test_outcomes_of_mutants_are_judged(status, output, bug, fault):
-    judged = mutants.judged(status, output, bug)
+def test_outcomes_of_planted_bugs_are_judged(status, output, bug, fault):
+    judged = planted_bugs.judged(status, output, bug)
     assert judged.startswith(fault) and bool(judged) == bool(fault)
 
 

@@ -25,7 +25,7 @@ MOST = {
     "": 1317,  # top files
 }
 OUTSIDE = {"scripts": 2961, "tests": 28039}
-MOST_WORDS = 28955
+MOST_WORDS = 29009
 
 
 def _lines(files):

@@ -10,7 +10,7 @@ import resource
 import time
 from pathlib import Path
 
-import mutants
+import planted_bugs
 import pytest
 
 COSTS = Path(__file__).with_name("costs.json")
@@ -26,7 +26,7 @@ def name(nodeid):
 
 
 def needed():
-    return {name(test) for mutant in mutants.MUTANTS for test in mutant.tests}
+    return {name(test) for bug in planted_bugs.BUGS for test in bug.tests}
 
 
 def pytest_addoption(parser):

@@ -1,11 +1,11 @@
 """Plants bugs in a copy of the package, one at a time, and checks that the tests see them.
 
-    python scripts/mutants.py                  # all, an hour
-    python scripts/mutants.py hidden adjoint   # those with such a word in their name
-    python scripts/mutants.py --list           # what is replaced by what
-    python scripts/mutants.py --unchanged      # the same tests on a copy without bugs: they have to pass
+    python scripts/planted_bugs.py                  # all, an hour
+    python scripts/planted_bugs.py hidden adjoint   # those with such a word in their name
+    python scripts/planted_bugs.py --list           # what is replaced by what
+    python scripts/planted_bugs.py --unchanged      # the same tests on a copy without bugs: they have to pass
 
-Each test that is named beside a mutant runs against the copy, in a process of its own, and has to fail by an
+Each test that is named beside a bug runs against the copy, in a process of its own, and has to fail by an
 assertion: one that fails by anything else shows that the bug is not the one that was meant. The exit status
 is 1 if a test did not do what it should, and 2 if the text to replace is not in the module once (the code has
 changed: plant the bug anew).
@@ -34,7 +34,7 @@ PASSED, FAILED = 0, 1  # exit statuses of pytest
 
 
 @dataclass(frozen=True)
-class Mutant:
+class PlantedBug:
     """A planted bug.
 
     ``old`` stands exactly once in the module ``file``; with ``new`` in its place each of ``tests`` (names
@@ -48,30 +48,30 @@ class Mutant:
     tests: tuple[str, ...]
 
 
-MUTANTS = tuple(
-    Mutant(**bug | {"tests": tuple(bug["tests"])})
+BUGS = tuple(
+    PlantedBug(**entry | {"tests": tuple(entry["tests"])})
     for file in sorted((ROOT / "tests" / "planted_bugs").glob("*.toml"))
-    for bug in tomllib.loads(file.read_text())["bug"]
+    for entry in tomllib.loads(file.read_text())["bug"]
 )
 """Bugs of weights, densities, estimators and decisions."""
 
 
-def planted(folder: Path, mutant: Mutant | None) -> Path:
+def planted(folder: Path, bug: PlantedBug | None) -> Path:
     """Copy the package into ``folder``, with the bug if there is one; return what PYTHONPATH begins with.
 
     Raises ``CommandError`` if the text to replace is not there once.
     """
     package = folder / PACKAGE.name
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
-    if mutant is not None:
-        file = package / mutant.file
+    if bug is not None:
+        file = package / bug.file
         text = file.read_text()
-        if (count := text.count(mutant.old)) != 1:
+        if (count := text.count(bug.old)) != 1:
             raise CommandError(
-                f"mutant {mutant.name}: {mutant.old!r} stands {count} times in {mutant.file}, not once; "
+                f"planted bug {bug.name}: {bug.old!r} stands {count} times in {bug.file}, not once; "
                 "plant it anew"
             )
-        file.write_text(text.replace(mutant.old, mutant.new))
+        file.write_text(text.replace(bug.old, bug.new))
     return folder
 
 
@@ -83,56 +83,56 @@ def outcome(folder: Path, test: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def judged(status: int, output: str, bug: bool) -> str:
-    """What is wrong with this outcome of a test, empty if nothing is; ``bug``: there is one to be seen."""
+def judged(status: int, output: str, with_bug: bool) -> str:
+    """What is wrong with this outcome of a test, empty if nothing is."""
     if status not in (PASSED, FAILED):
         return "not run:\n" + output[-1500:]
-    if not bug:
+    if not with_bug:
         return "" if status == PASSED else "fails without the bug:\n" + output[-1500:]
     if status == PASSED:
         return "does not see the bug"
     return "" if ASSERTION.search(output) else "fails by something else:\n" + output[-1500:]
 
 
-def chosen(words: list[str]) -> list[Mutant]:
-    """Mutants with one of these words in their name, all of them if there is no word."""
+def chosen(words: list[str]) -> list[PlantedBug]:
+    """Bugs with one of these words in their name, all of them if there is no word."""
     for word in words:
-        if not any(word in mutant.name for mutant in MUTANTS):
+        if not any(word in bug.name for bug in BUGS):
             raise CommandError(
-                f"no mutant has {word!r} in its name; there are {'; '.join(m.name for m in MUTANTS)}"
+                f"no planted bug has {word!r} in its name; there are {'; '.join(bug.name for bug in BUGS)}"
             )
-    return [mutant for mutant in MUTANTS if not words or any(word in mutant.name for word in words)]
+    return [bug for bug in BUGS if not words or any(word in bug.name for word in words)]
 
 
-def run(mutants: list[Mutant], bug: bool) -> int:
+def run(bugs: list[PlantedBug], with_bug: bool) -> int:
     """Print a line for each test; the number of those that did not do what they should."""
     wrong = 0
-    for mutant in mutants:
-        for test in mutant.tests:
-            with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
-                where = planted(Path(folder), mutant if bug else None)
-                fault = judged(*outcome(where, test), bug)
+    for bug in bugs:
+        for test in bug.tests:
+            with tempfile.TemporaryDirectory(prefix="planted-bug-") as folder:
+                where = planted(Path(folder), bug if with_bug else None)
+                fault = judged(*outcome(where, test), with_bug)
             wrong += bool(fault)
-            seen = "sees it" if bug else "passes without it"
-            print(f"{mutant.name}: {test} {fault or seen}", flush=True)
+            seen = "sees it" if with_bug else "passes without it"
+            print(f"{bug.name}: {test} {fault or seen}", flush=True)
     return wrong
 
 
 def main(arguments=None) -> int:
-    """Run the tests of the mutants, or print these."""
+    """Run the tests of the bugs, or print these."""
     parser = command_line.parser(__doc__)
-    parser.add_argument("words", nargs="*", help="only mutants with one of these words in their name")
+    parser.add_argument("words", nargs="*", help="only bugs with one of these words in their name")
     parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")
     parser.add_argument("--unchanged", action="store_true", help="run the same tests without the bugs")
     options = parser.parse_args(arguments)
-    mutants = chosen(options.words)
+    bugs = chosen(options.words)
     if options.list:
-        for mutant in mutants:
-            print(f"{mutant.name}: {mutant.file}: {mutant.old!r} -> {mutant.new!r}")
+        for bug in bugs:
+            print(f"{bug.name}: {bug.file}: {bug.old!r} -> {bug.new!r}")
         return 0
-    wrong = run(mutants, not options.unchanged)
-    tests = sum(len(mutant.tests) for mutant in mutants)
-    print(f"{len(mutants)} mutants, {tests} tests: {wrong} wrong")
+    wrong = run(bugs, not options.unchanged)
+    tests = sum(len(bug.tests) for bug in bugs)
+    print(f"{len(bugs)} bugs, {tests} tests: {wrong} wrong")
     return 1 if wrong else 0
 
 
