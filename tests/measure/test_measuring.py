@@ -444,6 +444,9 @@ def test_samples_of_a_render_that_stops_are_its_own(here, command):
     command("sweep", "mine", "--project", "project", "-o", "out", "--reference-seconds", "1")
     rows = pd.read_csv(here / "out" / "rows.csv")
     assert (rows["budget"][0], rows["spp"][0]) == (256, 32)
+    (here / "project" / "presets" / "mine.toml").write_text(stopping + own.replace("100.0", "1e-9"))
+    said = command("sweep", "mine", "--project", "project", "-o", "out")
+    assert "warning: room, 256 spp, seed 1, bdpt: ended before target_error=1e-09; give it more spp\n" in said
 
 
 def test_one_scene_does_not_cost_a_sweep_the_others(here, capsys):

@@ -25,7 +25,6 @@ from mitsuba_bdpt.files import whole
 from mitsuba_bdpt.files.images import write_layers
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure import (
-    limited,
     making,
     metrics,
     reference,
@@ -585,7 +584,7 @@ def test_a_second_run_uses_the_seconds_of_the_first(folder, monkeypatch, known):
 def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
     """At least half of the proportion, for noise."""
     preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
-    made = limited.Pending(preset.cells[0], tmp_path)
+    made = sweep.Pending(preset.cells[0], tmp_path)
     for known, budget, expected in (
         ({}, 4, 0),
         ({2: 0.7}, 4, 0.7 + 0.35 * 2),

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5249,
+    "measure": 5227,
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1317,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28039}
+OUTSIDE = {"scripts": 2961, "tests": 28041}
 MOST_WORDS = 29009
 
 

@@ -20,8 +20,8 @@ Needs the extra ``[measure]``. Within the package only the commands import it (s
 * A user's folder is a `project`, its files `scenes`; `api` and `options` are for Python and the command.
 * Renders are timed by `timing`; `metrics` are errors of an image, `agreement` is bias, `making` makes each
   `reference`.
-* A sweep's TOML file is checked by `models`, `preset` lists its renders, `limited` orders them under a time
-  limit, `sweep` renders them, `results` are its files.
+* A sweep's TOML file is checked by `models`, `preset` lists its renders, `sweep` orders and renders them,
+  `results` are its files.
 * `analysis` of the rows is shown by `report`, `figures`, `crops` and `page`, with `tables` and `paper`.
 * A few integrators in one scene: `compare`, `equal_time`; the strategies of one: `pyramid`.
 """

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from ..errors import CommandError, FailureError
 from . import options as available
@@ -38,8 +38,6 @@ _SCENES = (str, Path, Mapping, SceneDict)
 Plugin = str | Mapping[str, Any]
 """An integrator's type, or its parameters as a dictionary; ``sampler`` among them is the sensor's."""
 
-OptionsT = TypeVar("OptionsT", bound=available.Options)
-
 
 def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Reference:
     """Make the reference of a scene, or refine the stored one.
@@ -48,7 +46,7 @@ def make_reference(scene: Scene, *, project: str | Path = ".", **options) -> Ref
     """
     from .making import make, requested
 
-    asked = _options(available.MakeReference, options)
+    asked = available.MakeReference(**options)
     with _measured([scene], project) as (found, (name,)):
         return make(requested(found, name, asked))[0]
 
@@ -63,7 +61,7 @@ def compare_integrators(
     from . import compare as module
     from .tables import described
 
-    asked, ways = _options(available.Compare, options), [_parameters(first), _parameters(second)]
+    asked, ways = available.Compare(**options), [_parameters(first), _parameters(second)]
     with _measured(scenes, project) as (found, names):
         return module.text([described(way) for way in ways], module.lines(found, names, ways, asked))
 
@@ -79,7 +77,7 @@ def compare_at_equal_time(
     from . import equal_time as module
     from .tables import described
 
-    asked = _options(available.EqualTime, options)
+    asked = available.EqualTime(**options)
     ways = {described(way): way for way in map(_parameters, integrators)}
     with _measured([scene], project) as (found, (name,)):
         return module.pictured(found, name, ways, asked)[1]
@@ -93,7 +91,7 @@ def render_pyramid(scene: Scene, *, project: str | Path = ".", **options) -> dic
     """
     from . import pyramid as module
 
-    asked = _options(available.Pyramid, options)
+    asked = available.Pyramid(**options)
     with _measured([scene], project) as (found, (name,)):
         return module.pictured(found, name, asked)[1]
 
@@ -113,7 +111,7 @@ def run_sweep(
     """
     from . import sweep as module
 
-    asked = _options(available.Sweep, options)
+    asked = available.Sweep(**options)
     with _measured(dictionaries, project) as (found, names):
         named = preset if isinstance(preset, Mapping) else available.text_of_path("preset", preset)
         rows, failed = module.swept(found, named, asked, names)
@@ -155,14 +153,6 @@ def _file(project: Project, scene: Scene) -> str:
     file = project.dictionaries / f"{name or 'unnamed'}.xml"
     mi.parser.write_file(mi.parser.parse_dict(mi.parser.ParserConfig(VARIANT), dict(content)), str(file))
     return str(file if name else file.replace(file.with_name(f"scene_{digest(file)[:8]}.xml")))
-
-
-def _options(kind: type[OptionsT], given: dict) -> OptionsT:
-    # An option of several values accepts a single one.
-    takes_several = {field.name for field in available.options_of(kind) if available.takes_several(field)}
-    several = [name for name in given if name in takes_several and given[name] is not None]
-    alone = {name: (given[name],) for name in several if not isinstance(given[name], list | tuple)}
-    return kind(**given | alone)
 
 
 def _parameters(plugin: Plugin) -> dict[str, Any]:

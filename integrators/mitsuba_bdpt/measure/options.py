@@ -10,6 +10,7 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import Field, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -51,31 +52,23 @@ class Number:
         value = given
         with contextlib.suppress(ValueError):
             if isinstance(given, str):
-                value = whole(given) if self.kind is int else float(given)
-        if not self._holds(value):
+                value = _whole(given) if self.kind is int else float(given)
+        numbers = int if self.kind is int else int | float
+        if not isinstance(value, numbers) or isinstance(value, bool) or not self._has(value):
             raise argparse.ArgumentTypeError(f"got {given!r}, which must be {self}")
         return value
 
-    def _holds(self, value: Any) -> bool:
-        if isinstance(value, bool) or not isinstance(value, int if self.kind is int else int | float):
-            return False
-        fits = self.step == 1 or value % self.step == 0
-        finite = isinstance(value, int) or math.isfinite(value)
-        return value == self.apart or (self.least <= value <= self.most and finite and fits)
+    def _has(self, value: float) -> bool:
+        is_within = self.least <= value <= self.most and value < math.inf
+        return value == self.apart or (is_within and (self.step == 1 or value % self.step == 0))
 
 
-MOST_EXACT = 2**53
-"""Up to this all whole numbers are exact as ``float``."""
-
-
-def whole(text: str) -> int:
-    """Parse a whole number, also with an exponent such as ``1e6``; ``ValueError`` for others."""
+def _whole(text: str) -> int | float:
+    """Parse a whole number, also with an exponent such as ``1e6``."""
     with contextlib.suppress(ValueError):
         return int(text)
     value = float(text)
-    if not value.is_integer() or abs(value) > MOST_EXACT:
-        raise ValueError(text)
-    return int(value)
+    return int(value) if value.is_integer() else value
 
 
 WHOLE, SEED, STOPS = Number(int, 1), Number(int, 0, 2**32 - 1), Number(float, -100, 100)
@@ -90,28 +83,30 @@ def option(default: Any, kind: Any, text: str, **declared: Any) -> Any:
     return field(default=default, metadata={"kind": kind, "text": text, "declared": declared})
 
 
-def _width(default: int | None = RESOLUTION) -> Any:
-    return option(default, WIDTH, f"width of image and reference in pixels; default: {RESOLUTION}")
-
-
-def _reference_seconds(default: float = REFERENCE_SECONDS) -> Any:
-    return option(default, SECONDS, "limit of making a missing reference, per scene; default: %(default)g")
-
-
-def _windows() -> Any:
-    text = "centres of two magnified windows, shares of width and height such as 0.3,0.6 0.8,0.2; default: "
-    text += "where the errors of the first and the last image differ most"
-    return option(None, str, text, nargs=2, metavar="X,Y")
-
-
-def _budget() -> Any:
-    text = "budget at which all are compared; default: the largest of which all scenes have two renders"
-    return option(None, WHOLE, text)
-
-
-def _columns(default: int) -> Any:
-    text = "width, in columns of a page: 1 is 8.5 cm, 2 are 17.8 cm; default: %(default)s"
-    return option(default, Number(int, 1, 2), text)
+_width = partial(option, kind=WIDTH, text=f"width of image and reference in pixels; default: {RESOLUTION}")
+_reference_seconds = partial(
+    option, kind=SECONDS, text="limit of making a missing reference, per scene; default: %(default)g"
+)
+_windows = partial(
+    option,
+    None,
+    str,
+    "centres of two magnified windows, shares of width and height such as 0.3,0.6 0.8,0.2; default: where "
+    "the errors of the first and the last image differ most",
+    nargs=2,
+    metavar="X,Y",
+)
+_budget = partial(
+    option,
+    None,
+    WHOLE,
+    "budget at which all are compared; default: the largest of which all scenes have two renders",
+)
+_columns = partial(
+    option,
+    kind=Number(int, 1, 2),
+    text="width, in columns of a page: 1 is 8.5 cm, 2 are 17.8 cm; default: %(default)s",
+)
 
 
 def text_of_path(name: str, value: Any) -> str:
@@ -125,28 +120,28 @@ class Options:
     """Base of all options."""
 
     def __post_init__(self):
-        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none."""
+        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none.
+
+        Options of several values accept a single one.
+        """
         for found in options_of(type(self)):
             name, kind = found.name, found.metadata["kind"]
             value: Any = getattr(self, name)
             if value is None and found.default is None:
                 continue
-            several = isinstance(value, list | tuple) and takes_several(found)
+            takes_several = "nargs" in found.metadata["declared"]
+            several = takes_several and isinstance(value, list | tuple)
             values: Sequence[Any] = cast(Sequence[Any], value) if several else [value]
             if kind in (str, Path):
-                made = tuple(kind(text_of_path(name, one)) for one in values)
-                object.__setattr__(self, name, made if several else made[0])
+                values = [kind(text_of_path(name, one)) for one in values]
             elif isinstance(kind, Number):
                 try:
-                    all(map(kind, values))
+                    values = list(map(kind, values))
                 except argparse.ArgumentTypeError as error:
                     raise CommandError(f"{name}={value!r} must be {kind}") from error
             elif value not in kind:
                 raise CommandError(f"{name}={value!r} must be one of {', '.join(kind)}")
-
-
-def takes_several(found: Field[Any]) -> bool:
-    return isinstance(found.default, tuple) or "nargs" in found.metadata["declared"]
+            object.__setattr__(self, name, tuple(values) if takes_several else values[0])
 
 
 def options_of(kind: type) -> list[Field[Any]]:
@@ -210,7 +205,7 @@ class MakeReference(Options):
 
     spp: int = option(64, WHOLE, "samples per pixel of the renders to judge; default: %(default)s")
     seconds: float = option(REFERENCE_SECONDS, SECONDS, "limit per scene; default: %(default)g")
-    resolution: int = _width()
+    resolution: int = _width(RESOLUTION)
     max_depth: int | None = option(
         None,
         Number(int, 1, apart=-1),
@@ -230,8 +225,8 @@ class Compare(Options):
 
     spp: tuple[int, ...] = option((64,), WHOLE, "samples per pixel; default: 64", nargs="+")
     pairs: int = option(12, WHOLE, "pairs of renders; default: %(default)s")
-    resolution: int = _width()
-    reference_seconds: float = _reference_seconds()
+    resolution: int = _width(RESOLUTION)
+    reference_seconds: float = _reference_seconds(REFERENCE_SECONDS)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ import json
 import math
 import time
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
@@ -29,20 +30,20 @@ from ..files.images import check_output
 from ..files.texts import read_json, write_json
 from ..run.rendering import raise_interrupt
 from .estimates import seed_errors
-from .limited import Pending
 from .making import check, obtained
 from .options import REFERENCE_SECONDS, VARIANT
 from .options import Sweep as SweepOptions
-from .preset import Cell, Cells, Preset, machine, read_preset
+from .preset import FIRST_SEED, Cell, Cells, Preset, machine, read_preset
 from .project import Project
 from .reference import make_command
-from .results import beside, decided, keep_missing, rows, store, write_tables
+from .results import beside, cell_file, decided, keep_missing, read_cell, rows, store, write_tables
 from .scenes import check_plugins, integrator_of, samples_taken
 from .showing import Renders
 from .timing import Timed, alternating, timed
 
 CALIBRATIONS = 3  # alternating renders that calibrate the samples for equal time
 CALIBRATED = 0.25  # share of a limit of time for these renders, and for those that find how many samples fit
+LEAST_SLOPE = 0.5  # of a larger budget's seconds over samples, in those of the budgets before
 ROOM = 1.25  # times the predicted seconds of what was cut, in the advice of how many to allow
 
 
@@ -157,6 +158,82 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
         "decisions": json.dumps(statistics.get("decisions")),
     }
     return row | {f"rays_{kind}": n for kind, n in statistics.get("rays", {}).items()}, image
+
+
+class Pending:
+    """The renders of a scene that are not in ``output``, in the order of seeds, all budgets of each.
+
+    Integrators of one budget and seed are rendered together or not at all.
+    """
+
+    def __init__(self, cells: Cells, output: Path):
+        self.cells, self._output = cells, output
+        missing = [[c for c in group if not cell_file(output, c).exists()] for group in cells.groups]
+        self._groups = [group for group in missing if group]
+        self._seconds: dict[str, dict[int, float]] = defaultdict(dict)
+        self._compiled = set[tuple[str, int]]()
+
+    @property
+    def late(self) -> list[Cell]:
+        return [cell for group in self._groups for cell in group]
+
+    @property
+    def needed(self) -> float:
+        return sum(map(self._predicted, self._groups))
+
+    @property
+    def text(self) -> str:
+        """How many renders are missing, and at which budgets."""
+        counts = Counter(cell.budget for cell in self.late)
+        at = ", ".join(f"{count} at {budget} spp" for budget, count in sorted(counts.items()))
+        return f"{counts.total()} of {len(self.cells.planned)} renders: {at}"
+
+    def render(self, rendered: Callable[[Cell], float | None], seconds: float) -> int:
+        """Render what fits into the ``seconds``; returns the number of renders.
+
+        ``rendered`` renders a cell and returns its seconds, None if it failed. Two seeds of the smallest
+        budget are rendered in any case: with fewer there is no figure.
+        """
+        end = time.monotonic() + seconds
+        if seconds < math.inf and not self._seconds:
+            finished = {cell: cell_file(self._output, cell) for cell in self.cells.planned}
+            for cell, file in finished.items():
+                if file.exists():
+                    self._seconds[cell.method][cell.budget] = read_cell(file)["seconds"]
+
+        def fits(group: list[Cell]) -> bool:
+            is_least = group[0].budget == min(self.cells.spp) and group[0].seed < FIRST_SEED + 2
+            left = end - time.monotonic()
+            return is_least or (left > 0 and self._predicted(group) <= left)
+
+        done = 0
+        while group := next(filter(fits, self._groups), None):
+            self._groups.remove(group)
+            for cell in group:
+                taken = rendered(cell)
+                if taken is not None:
+                    self._seconds[cell.method][cell.budget] = taken
+                self._compiled.add((cell.method, cell.budget))
+                done += 1
+        return done
+
+    def _predicted(self, group: list[Cell]) -> float:
+        """Return the predicted seconds of the renders of a ``group``."""
+        # The first render of a budget compiles, in a render that is not measured.
+        renders = [(c.method, c.budget, 1 + ((c.method, c.budget) not in self._compiled)) for c in group]
+        return sum(count * self._seconds_of(method, budget) for method, budget, count in renders)
+
+    def _seconds_of(self, method: str, budget: int) -> float:
+        """Return the seconds of a render: the last of its budget, else extrapolated; 0 before the first."""
+        known = self._seconds[method]
+        if not known or budget in known:
+            return known.get(budget, 0.0)
+        *_, before, last = [0, *sorted(known)]
+        proportional = known[last] / last
+        if budget < last:
+            return proportional * budget
+        slope = (known[last] - known.get(before, 0.0)) / (last - before)
+        return known[last] + max(slope, LEAST_SLOPE * proportional) * (budget - last)
 
 
 class Sweep:
@@ -315,6 +392,12 @@ def _tell(sweep: Sweep, table: pd.DataFrame) -> None:
     if sweep.cut:
         cut = "; ".join(f"{scene}, {text}" for scene, text in sweep.cut.items())
         print(f"cut for lack of time: {cut}; run it again with --seconds {sweep.wanted}, about")
+    for row in table.to_dict("records"):
+        target = json.loads(row["parameters"]).get("target_error")
+        error = json.loads(row["statistics"]).get("error")
+        if target and (error is None or error > target):
+            text = f"{row['scene']}, {row['budget']} spp, seed {row['seed']}, {row['method']}"
+            print(f"warning: {text}: ended before target_error={target:g}; give it more spp")
     for cells in sweep.scenes if len(table) else ():
         if text := poor_reference(cells, table):
             print(f"warning: {text}")
