@@ -16,11 +16,7 @@ import time
 from dataclasses import dataclass, field
 from datetime import timedelta
 from io import StringIO
-from typing import TYPE_CHECKING, Any, TextIO
-
-# Not at run time: the command declares its options, and `doctor` runs, without rich.
-if TYPE_CHECKING:
-    from rich.console import Console
+from typing import Any, TextIO
 
 # Minimum interval between two lines of a log: seconds, and share of the elapsed time.
 EVERY, SHARE = 10.0, 0.02
@@ -89,7 +85,8 @@ class Bar(Display):
     ``console``: another output. The bar disappears after the last pass, and by `close`.
     """
 
-    console: Console | None = field(default=None, kw_only=True)
+    # Of the class `Console` of rich, which is not imported for types: `doctor` runs without it.
+    console: Any = field(default=None, kw_only=True)
 
     def __post_init__(self):
         from rich.console import Console

@@ -22,9 +22,9 @@ MOST = {
     "scene sampling": 775,
     "host": 713,
     "sensors": 883,
-    "": 1317,  # top files
+    "": 1314,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28041}
+OUTSIDE = {"scripts": 2961, "tests": 28043}
 MOST_WORDS = 29009
 
 
