@@ -26,7 +26,7 @@ from mitsuba_bdpt.measure.analysis import (
     summary,
 )
 from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL, KINDS, Error
-from mitsuba_bdpt.measure.tables import met_text, ratio, table
+from mitsuba_bdpt.measure.tables import ratio, table
 from scipy import stats
 
 
@@ -211,7 +211,8 @@ class Goal:
         met = "–"
         if len(found.values) and not np.isnan(found.values).any():
             bounds = np.broadcast_to(self.bounds, len(found.values))
-            met = met_text(bool(np.all(found.values <= bounds if self.at_most else found.values >= bounds)))
+            is_met = np.all(found.values <= bounds if self.at_most else found.values >= bounds)
+            met = "yes" if is_met else "**no**"
         return [self.what, bound, self.aim, found.text, met]
 
 

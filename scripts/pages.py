@@ -26,7 +26,7 @@ import scale
 import stress
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.report import Report, efficiency_table, said
-from mitsuba_bdpt.measure.tables import markdown, replace_part
+from mitsuba_bdpt.measure.tables import markdown
 
 REPORTS = repository.ROOT / "docs" / "reports"
 
@@ -58,6 +58,14 @@ def gallery(results: Results) -> str:
     cells += [""] * (-len(cells) % GALLERY_COLUMNS)
     first, *rows = np.reshape(cells, (-1, GALLERY_COLUMNS)).tolist()
     return markdown(pd.DataFrame(rows, columns=first))
+
+
+def replace_part(text: str, name: str, part: str) -> str:
+    """Replace the text between the markers of ``name``; ``ValueError`` without them."""
+    pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+    if len(pattern.findall(text)) != 1:
+        raise ValueError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
+    return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)
 
 
 TABLES: dict[str, Callable[[], str]] = {

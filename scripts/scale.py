@@ -41,7 +41,7 @@ from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.options import WHOLE
-from mitsuba_bdpt.measure.tables import met_text, ratio, table
+from mitsuba_bdpt.measure.tables import ratio, table
 
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
@@ -500,9 +500,9 @@ def goals(record: dict) -> str:
         size = f"{goal.size:,}" if isinstance(goal.size, int) else goal.size
         what = f"{goal.kind}, {size}, {words}" + (", path tracing alone" if goal.method == "alone" else "")
         value = figure(rows, found, goal.method) if found else None
-        measured, met = (
-            ("not measured", "–") if value is None else (f"{value:.3g}", met_text(value <= goal.most))
-        )
+        measured, met = "not measured", "–"
+        if value is not None:
+            measured, met = f"{value:.3g}", "yes" if value <= goal.most else "**no**"
         lines.append([what, f"{goal.most:g}", measured, met])
     return table(["over `path`", "at most", "measured", "met"], lines)
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 
 import pandas as pd
-
-from ..errors import CommandError
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -32,11 +29,6 @@ def described(parameters: Mapping[str, object]) -> str:
     return " ".join([str(found.pop("type", "")), *(f"{key}={value}" for key, value in found.items())])
 
 
-def met_text(met: bool) -> str:
-    """Return whether a goal is met, as text of a table."""
-    return "yes" if met else "**no**"
-
-
 def ratio(x: float) -> str:
     """Format a ratio with three digits."""
     return f"{x:.3g}x" if x < 999.5 else f"{round(x, -1):.0f}x"
@@ -46,11 +38,3 @@ def spanned(values: Sequence[float] | pd.Series) -> str:
     """Format the median of positive values (smallest–largest)."""
     middle, low, high = (f"{x:.3g}" for x in pd.Series(values).quantile([0.5, 0, 1]))
     return middle if len(values) == 1 else f"{middle} ({low}–{high})"
-
-
-def replace_part(text: str, name: str, part: str) -> str:
-    """Replace the text between the markers of ``name``; ``CommandError`` without them."""
-    pattern = re.compile(rf"(<!-- report: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-    if len(pattern.findall(text)) != 1:
-        raise CommandError(f"there must be one `<!-- report: {name} -->` with an `<!-- end -->`")
-    return pattern.sub(lambda m: m[1] + "\n" + part + "\n" + m[2], text)
