@@ -73,30 +73,6 @@ def test_the_references_own_error_is_subtracted():
     assert found.efficiency("box", "path").median == pytest.approx(1)
 
 
-def test_the_gap_is_what_the_worst_values_carry():
-    """Raw over trimmed errors of 2, 4 and 9: median 4. What the reference carries is no part of it."""
-    rows = [row(seed=seed, rel_mse=0.02 * times) for seed, times in enumerate((2, 9, 4))]
-    found = results_of(rows).gap("box", "bdpt")
-    assert (found.median, found.smallest, found.largest, found.count) == pytest.approx((4, 2, 9, 3))
-    noisy = [r | {"reference_rel_mse": 0.005, "rel_mse": r["rel_mse"] + 0.005} for r in rows]
-    assert results_of(noisy).gap("box", "bdpt").median == pytest.approx(4)
-    exact = [r | {"rel_mse": 0.0, "rel_mse_trimmed": 0.0} for r in rows]
-    for few, why in ((exact, "bdpt is exact here"), (rows[:1], "fewer than two renders")):
-        with pytest.raises(Unavailable, match=why):
-            results_of(few).gap("box", "bdpt")
-
-
-def test_scenes_with_the_largest_gap_come_first():
-    """`even` has no gap, `spots` one of 8 with `bdpt` and 2 with `path`; `alone` has a single render."""
-    rows = [r | {"scene": "even"} for r in runs("bdpt", 2) + runs("path", 2)]
-    rows += [r | {"scene": "alone"} for r in runs("bdpt", 1)]
-    spots = runs("bdpt", 2, rel_mse=0.16) + runs("path", 2, rel_mse=0.04)
-    rows += [r | {"scene": "spots"} for r in spots]
-    found = results_of(rows, {})
-    assert found.by_gap("bdpt") == ["spots", "even", "alone"]
-    assert cells(report.gaps_table(found), "`spots`") == ["8x (8–8; n = 2)", "2x (2–2; n = 2)"]
-
-
 def test_cost_is_per_sample():
     """1 s for 64 samples against 2 s for 256: 2x."""
     sides = runs("bdpt", 2), runs("path", 2, seconds=2.0, spp=256)
@@ -193,7 +169,6 @@ def test_scenes_with_media_have_a_table_of_their_own(results):
     assert cells(text, "`fog`")[:3:2] == ["5x (5–5; n = 3)", "3x (3–3; n = 3)"]
     assert both.against_path("fog").median == pytest.approx(3)
     assert both.against_path("box").median == pytest.approx(0.8)
-    assert cells(report.gaps_table(both), "`fog`") == ["1x (1–1; n = 3)", "0.2x (0.2–0.2; n = 3)"]
 
 
 def test_tables_say_what_the_rows_say(results):

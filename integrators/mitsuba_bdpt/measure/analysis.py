@@ -306,22 +306,6 @@ class Results:
         is_few = min(map(len, runs.values())) < FEWEST_WITH_INTERVAL
         return Estimate(found.value, -math.inf, math.inf) if is_few else found
 
-    def gap(self, scene: str, method: str) -> Summary:
-        """Return raw over trimmed relMSE at the deciding budget: large where few values carry the error."""
-        rows, differs = self.of(scene, method, self.deciding), self.differs(scene, method)
-        (raw, _), (trimmed, _) = (_errors(rows, error, differs) for error in ("rel_mse", "rel_mse_trimmed"))
-        return summary(raw / trimmed)
-
-    def by_gap(self, method: str) -> list[str]:
-        """Return the scenes by decreasing `gap`; those without one are last."""
-
-        def size(scene: str) -> float:
-            with suppress(Unavailable):
-                return self.gap(scene, method).median
-            return 0.0
-
-        return sorted(self.scenes, key=size, reverse=True)
-
     @cache  # noqa: B019
     def efficiency(
         self,

@@ -124,8 +124,8 @@ def _around(places: Sequence[tuple[float, float]], height: int, width: int) -> l
 
 def draw(
     blocks: Sequence[Block], file: Path, columns: int, places: Sequence[tuple[float, float]] | None = None
-) -> float:
-    """Draw the ``blocks`` under each other, ``columns`` (1 or 2) wide; return the height in inches.
+) -> None:
+    """Draw the ``blocks`` under each other, ``columns`` (1 or 2) wide.
 
     A column per image, the reference last. ``places``: centres of windows; None: where errors differ most.
     """
@@ -141,7 +141,6 @@ def draw(
                 chosen = _around(places, *block.target.shape[:2])
             _block(part, block, row, chosen)
         save(figure, file)
-    return sum(heights)
 
 
 def _captions(block: Block, wide: float) -> list[str]:

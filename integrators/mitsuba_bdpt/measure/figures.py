@@ -1,7 +1,7 @@
 """Figures of a sweep, for print: PDF, SVG or PNG by the file's ending, one or two columns wide.
 
 Text has 7 points at the width of a column of a journal, 8.5 cm, or of its page, 17.8 cm. An integrator has
-its colour and marker everywhere; raw errors are solid, trimmed ones dashed; a hollow marker is a bound.
+its colour and marker in all panels; raw errors are solid, trimmed ones dashed; a hollow marker is a bound.
 """
 
 from __future__ import annotations
@@ -22,41 +22,19 @@ from matplotlib.ticker import FuncFormatter
 from ..errors import CommandError
 from ..files.images import read_layers
 from . import crops
-from .analysis import (
-    ALONE,
-    INDEPENDENT,
-    LIGHT_TRACER,
-    MEDIA_RIVALS,
-    MERGING,
-    NONE,
-    RIVALS,
-    UNAIMED,
-    Results,
-    Unavailable,
-)
+from .analysis import Results, Unavailable
 from .estimates import FEWEST_WITH_INTERVAL, KINDS, Error, has_interval
 from .paper import PAPER, WIDTHS, check_figure, save
 from .project import Project
 from .reference import Reference
 from .results import image_file, load
 
-# Colours: M. Okabe, K. Ito, Color Universal Design, 2008.
-STYLES = {
-    "bdpt": ("#0072B2", "o"),
-    NONE: ("#56B4E9", "v"),
-    INDEPENDENT: ("#009E73", "^"),
-    ALONE: ("#F0E442", "P"),
-    UNAIMED: ("#999999", "X"),
-    MERGING: ("#009E73", "D"),
-    RIVALS[0]: ("#D55E00", "s"),
-    RIVALS[1]: ("#E69F00", "D"),
-    # Only in scenes with media.
-    MEDIA_RIVALS[0]: ("#D55E00", "s"),
-    MEDIA_RIVALS[1]: ("#E69F00", "D"),
-    LIGHT_TRACER: ("#CC79A7", "h"),
-}
-PLAIN = (("#000000", "p"), ("#882255", "*"), ("#117733", "<"), ("#332288", ">"))
-"""Of other integrators, in turn."""
+STYLES = (
+    *(("#0072B2", "o"), ("#D55E00", "s"), ("#E69F00", "D"), ("#56B4E9", "v"), ("#009E73", "^")),
+    *(("#CC79A7", "h"), ("#F0E442", "P"), ("#999999", "X"), ("#000000", "p"), ("#882255", "*")),
+    *(("#117733", "<"), ("#332288", ">")),
+)
+"""Of integrators, in turn. Colours: M. Okabe, K. Ito, Color Universal Design, 2008; P. Tol, 2021."""
 
 RAYS = {
     "camera": ("camera", "#0072B2", ""),
@@ -72,13 +50,11 @@ PANELS = {1: 2, 2: 4}
 DASHES: dict[Error, object] = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 SLOPE = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 0.8}
 AXES = {"seconds": "seconds", "spp": "samples per pixel"}
-PAGE = 24.0  # cm, the height of the text on a journal's page
 
 
 def style(methods: Sequence[str], method: str) -> dict:
     """Return colour and marker of one of the ``methods``."""
-    others = [name for name in methods if name not in STYLES]
-    colour, marker = STYLES[method] if method in STYLES else PLAIN[others.index(method) % len(PLAIN)]
+    colour, marker = STYLES[methods.index(method) % len(STYLES)]
     return {"color": colour, "marker": marker}
 
 
@@ -113,13 +89,8 @@ def convergence(
 
 
 def _entries(methods: Sequence[str], shown: Sequence[str], before: str = "", **more) -> list[Line2D]:
-    """Return the entries of integrators in a legend: one of those that look alike, as in different scenes."""
-    alike: dict[tuple, list[str]] = {}
-    for name in shown:
-        alike.setdefault(tuple(style(methods, name).items()), []).append(name)
-    return [
-        Line2D([], [], label=before + " / ".join(names), **dict(look) | more) for look, names in alike.items()
-    ]
+    """Return the entries of integrators in a legend."""
+    return [Line2D([], [], label=before + name, **style(methods, name) | more) for name in shown]
 
 
 def _legend(figure, handles: Sequence) -> None:
@@ -337,12 +308,7 @@ def run(options: Namespace) -> int:
         )
     if options.plot == "crops":
         blocks = [cropped(folder, results, made[scene], scene) for scene in scenes]
-        tall = 2.54 * crops.draw(blocks, output, options.columns, crops.centres(options.windows))
-        if tall > PAGE:
-            print(
-                f"warning: {output} is {tall:.0f} cm tall, more than the text on a journal's page (about "
-                f"{PAGE:g} cm): draw fewer scenes by --scenes, such as --scenes {scenes[0]!r}"
-            )
+        crops.draw(blocks, output, options.columns, crops.centres(options.windows))
     else:
         PLOTS[options.plot](results, output, options.columns, scenes)
     print(output)

@@ -440,12 +440,8 @@ def run(options: Namespace) -> int:
 
     Returns 1 if one failed or is not good enough.
     """
-    if not (options.all or options.scenes):
-        raise CommandError("reference: name a scene, or give --all")
-    if options.all and options.scenes:
-        raise CommandError(
-            f"reference: {options.scenes[0]!r} together with --all: leave out one or the other"
-        )
+    if options.all == bool(options.scenes):
+        raise CommandError("reference: name a scene, or give --all, not both")
     project, status = Project(options.project), 0
     names = project.scene_names() if options.all else options.scenes
     if not names:

@@ -27,7 +27,6 @@ from . import figures
 from .analysis import (
     INDEPENDENT,
     LIGHT_TRACER,
-    MEDIA_RIVALS,
     NONE,
     RIVALS,
     Results,
@@ -135,30 +134,15 @@ def budgets_table(results: Results) -> str:
     return by_scene(results.scenes, columns)
 
 
-def gaps_table(results: Results) -> str:
-    """Table of raw over trimmed relMSE, by decreasing ratio: how much of the error few values carry."""
-    ours, rivals = results.methods[0], _first_rivals(results)
-    columns: dict[str, Figure] = {ours: partial(results.gap, method=ours)}
-    if rivals:
-        columns[" or ".join(rivals)] = lambda scene: results.gap(scene, _first_rival(results, scene))
-    return by_scene(results.by_gap(ours), columns)
-
-
 def _first_rival(results: Results, scene: str) -> str:
     """Return the first of `Results.standard` in a scene."""
     return (results.standard_in(scene) or results.standard or RIVALS)[0]
 
 
-def _first_rivals(results: Results) -> list[str]:
-    """Return the first of `Results.standard` in any scene, without repetitions."""
-    firsts = [name for scene in results.scenes for name in results.standard_in(scene)[:1]]
-    return list(dict.fromkeys(firsts)) or results.standard[:1]
-
-
 def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, str]) -> str:
     """Cost per sample, slopes and bias checks per scene; marks unexpected ones."""
     ours = results.methods[0]
-    rival = " or ".join(_first_rivals(results) or RIVALS[:1])
+    rival = " or ".join(dict.fromkeys(_first_rival(results, scene) for scene in results.scenes))
 
     def costs(method: str, scene: str) -> object:
         names = method, _first_rival(results, scene)
@@ -229,15 +213,6 @@ def _maker(kept: Reference) -> str:
     """Name the integrator that made a reference."""
     by = kept.provenance["integrator"]
     return by if isinstance(by, str) else f"`{by['type']}`" + (", `merging`" if kept.merged else "")
-
-
-def stronger(results: Results) -> str:
-    """Name the baselines of efficiencies by budget."""
-    names = results.standard or [RIVALS[0]]
-    if set(names) <= {*RIVALS, *MEDIA_RIVALS}:
-        media = ", with media the stronger of `volpath` and `volpathmis`,"
-        return "the stronger `path`" + (media if set(names) & {*MEDIA_RIVALS} else "")
-    return f"the strongest of {', '.join(names)}" if len(names) > 1 else names[0]
 
 
 # -- the page ---------------------------------------------------------------------------------
@@ -319,8 +294,8 @@ MARK = "Made by `mitsuba-bdpt report`"
 
 TEMPLATE = Path(__file__).with_suffix(".md.jinja")
 TABLES = (
-    *(machine, stronger, conditions_table, efficiency_table, budgets_table),
-    *(gaps_table, errors_table, checks_table, references_table),
+    *(machine, conditions_table, efficiency_table, budgets_table),
+    *(errors_table, checks_table, references_table),
 )
 """What the template calls."""
 
@@ -379,13 +354,7 @@ def run(options: Namespace) -> int:
     folder = project.results(options.folder)
     check_own(folder / "README.md", MARK, "move it away, or sweep into another folder")
     found = Report.of(project, folder, options.spp)
-    try:
-        check_writable(folder / "README.md")
-    except OSError as error:
-        raise CommandError(
-            f"folder={str(folder)!r} cannot be written ({error.strerror}), which has the report; copy it to "
-            "where it can, or change its rights"
-        ) from error
+    check_writable(folder / "README.md")
     write_text(folder / "README.md", found.text())
     found.draw(folder)
     print(folder / "README.md")
