@@ -421,10 +421,10 @@ def test_widths_fit_the_film(tmp_path, others):
 def test_time_left_follows_from_work(monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("rich.console.monotonic", lambda: clock[0])
-    with showing.Renders() as made, showing.Renders(limit=25) as limited:
+    works = [4, 4, 8]
+    with showing.Renders(works) as made, showing.Renders(works, 25) as limited:
         assert made.seconds_left() == math.inf and limited.seconds_left() == 25
         for shown in (made, limited):
-            shown.plan([4, 4, 8])
             shown.begin("box")
         clock[0] = 10
         for shown in (made, limited):
@@ -441,7 +441,7 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
         sweep.Sweep(preset, tmp_path).prepare(*given)
         assert asked[-2:] == [found, found]
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(sweep.Sweep, "run", lambda self, progress, seconds: limits.append(seconds))
+    monkeypatch.setattr(sweep.Sweep, "run", lambda self, seconds: limits.append(seconds))
     monkeypatch.setattr(sweep.Sweep, "rows", lambda self: pd.DataFrame())
     for spent, left in ((10.0, 90.0), (170.0, 0.0)):
 
@@ -521,7 +521,7 @@ def test_what_time_does_not_allow_is_cut(folder, monkeypatch):
     def swept(seconds):
         found.clear()
         made = sweep.Sweep(preset, folder)
-        made.run(showing.Renders(), seconds)
+        made.run(seconds)
         keys = [(cell.seed, cell.budget) for cell in found]
         assert keys[::2] == keys[1::2]  # both integrators
         return keys[::2], made
@@ -563,7 +563,7 @@ def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
             return count
 
     monkeypatch.setattr(sweep, "Pending", Scene)
-    made.run(showing.Renders(), 74)
+    made.run(74)
     assert shares[:4] == [37, 54, 17, 24] and made.wanted == 9  # of one scene, 7 s and a quarter more
     assert made.cut == {"furnace_emission": "text"} or made.cut == {"cornell_box": "text"}
 
@@ -576,7 +576,7 @@ def test_a_second_run_uses_the_seconds_of_the_first(folder, monkeypatch, known):
     for cell in cells.planned:
         if cell.budget < 6400:
             write_json(cell_file(output, cell), {"seconds": 0.001 * cell.budget})
-    made.run(showing.Renders(), 0.1)
+    made.run(0.1)
     assert made.cut == {"cornell_box": "4 of 12 renders: 4 at 6400 spp"}
     assert made.wanted == math.ceil(1.25 * 2 * 4 * 6.4)
 

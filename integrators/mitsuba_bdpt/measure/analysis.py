@@ -154,15 +154,8 @@ class Results:
 
     @cached_property
     def methods(self) -> list[str]:
-        """Integrators, in the order of the preset as far as scenes show it; the first is compared."""
-        order: list[str] = [self.rows["first"].iloc[0]]
-        for _, found in self.rows.groupby("scene", sort=False)["method"]:
-            names = list(found.unique())
-            for i, name in enumerate(names):
-                if name not in order:
-                    following = [order.index(later) for later in names[i + 1 :] if later in order[1:]]
-                    order.insert(min(following, default=len(order)), name)
-        return order
+        """Integrators, the compared one first, others as scenes have them."""
+        return list(dict.fromkeys([self.rows["first"].iloc[0], *self.rows["method"]]))
 
     @cached_property
     def rivals(self) -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import partial
@@ -47,16 +47,16 @@ EVERY, SHARE = 30.0, 0.02
 
 
 class Renders:
-    """Progress of many renders of different lengths, whose time left follows from their work.
+    """Progress of renders that differ in length, whose ``works`` are in proportion to their seconds.
 
-    The work of a render is any number in proportion to its seconds. ``limit``: of the seconds.
+    ``limit``: of the seconds.
     """
 
-    def __init__(self, limit: float = math.inf):
+    def __init__(self, works: Sequence[float], limit: float = math.inf):
         self._bar = bar()
-        task = self._bar.add_task("", total=0.0)
+        task = self._bar.add_task("", total=sum(works))
         self._task, self._update = self._bar.tasks[0], partial(self._bar.update, task)
-        self._done, self._total, self._limit, self._printed = 0, 0, limit, 0.0
+        self._done, self._total, self._limit, self._printed = 0, len(works), limit, 0.0
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -64,12 +64,6 @@ class Renders:
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
-
-    def plan(self, works: Iterable[float]) -> None:
-        """Add renders of so much work each."""
-        found = list(works)
-        self._total += len(found)
-        self._update(total=(self._task.total or 0.0) + sum(found))
 
     def begin(self, text: str) -> None:
         """Show what is rendered next."""

@@ -285,18 +285,18 @@ class Sweep:
                 self._note(f"{cells.scene.name}: no rows", error)
         return pd.concat(found, ignore_index=True)
 
-    def run(self, progress: Renders, seconds: float = math.inf) -> None:
-        """Render the missing cells, showing ``progress``.
+    def run(self, seconds: float = math.inf) -> None:
+        """Render the missing cells.
 
         ``seconds``: limit, shared equally by the scenes, see `Pending`; what does not fit is recorded in
         ``cut``.
         """
         end = time.monotonic() + seconds
         pending = [one for one in (Pending(cells, self.output) for cells in self.scenes) if one.late]
-        progress.plan(_work(cell) for one in pending for cell in one.late)
+        works = [_work(cell) for one in pending for cell in one.late]
         benches: dict[int, Bench] = {}
 
-        def rendered(i: int) -> int:
+        def rendered(progress: Renders, i: int) -> int:
             """Render what fits of a scene into its share of the time left."""
             if i not in benches:
                 benches[i] = Bench(pending[i].cells, self.output, seconds / len(pending))
@@ -308,8 +308,9 @@ class Sweep:
             return done
 
         # What a scene leaves goes to the others, until nothing more fits.
-        while sum([rendered(i) for i, one in enumerate(pending) if one.late]):
-            pass
+        with Renders(works, seconds) as progress:
+            while sum([rendered(progress, i) for i, one in enumerate(pending) if one.late]):
+                pass
         late = [one for one in pending if one.late]
         self.cut = {one.cells.scene.name: one.text for one in late}
         self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
@@ -371,9 +372,7 @@ def swept(
     check_output(output / "rows.csv", ".csv")  # fail before rendering
     limit = math.inf if options.seconds is None else options.seconds
     sweep.prepare(options.reference_seconds, limit)
-    left = max(limit - (time.monotonic() - began), 0.0)
-    with Renders(left) as progress:
-        sweep.run(progress, left)
+    sweep.run(max(limit - (time.monotonic() - began), 0.0))
     table = sweep.rows()
     if options.scenes or whole.scenes is None:
         table = beside(table, whole.scenes, output)
