@@ -12,13 +12,9 @@ from operator import attrgetter
 import numpy as np
 import repository
 from mitsuba_bdpt.measure.analysis import (
-    ALONE,
-    IMPOSSIBLE,
     MEDIA_RIVALS,
-    MERGING,
     NONE,
     RIVALS,
-    UNAIMED,
     Results,
     Summary,
     Unavailable,
@@ -28,6 +24,12 @@ from mitsuba_bdpt.measure.analysis import (
 from mitsuba_bdpt.measure.estimates import FEWEST_WITH_INTERVAL, KINDS, Error
 from mitsuba_bdpt.measure.tables import ratio, table
 from scipy import stats
+
+# Names in presets/benchmark.toml, like those of `analysis`.
+IMPOSSIBLE = "bdpt skip=impossible"
+ALONE = "bdpt light_paths=0"
+UNAIMED = "bdpt guiding=photons"
+MERGING = "bdpt merging"
 
 
 @dataclass(frozen=True)

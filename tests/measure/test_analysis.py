@@ -243,7 +243,7 @@ def test_what_a_biased_integrator_lacks_is_said():
 def test_names_are_those_of_the_preset():
     file = PresetFile.model_validate(read_toml(ROOT / "presets" / "benchmark.toml"))
     names = {m.name for m in file.methods}
-    others = analysis.NONE, analysis.IMPOSSIBLE, analysis.INDEPENDENT, analysis.ALONE, analysis.LIGHT_TRACER
+    others = analysis.NONE, goals.IMPOSSIBLE, analysis.INDEPENDENT, goals.ALONE, analysis.LIGHT_TRACER
     assert names >= {*analysis.RIVALS, *analysis.MEDIA_RIVALS, *others}
 
 

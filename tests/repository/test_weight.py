@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5111,
+    "measure": 5107,
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1314,  # top files
 }
-OUTSIDE = {"scripts": 2970, "tests": 28010}
+OUTSIDE = {"scripts": 2972, "tests": 28010}
 MOST_WORDS = 29009
 
 

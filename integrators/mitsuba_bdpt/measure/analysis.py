@@ -42,11 +42,7 @@ from .tables import ratio
 RIVALS = ("path", "path multijitter")
 MEDIA_RIVALS = ("volpath", "volpathmis")  # in scenes with participating media
 NONE = "bdpt skip=none"
-IMPOSSIBLE = "bdpt skip=impossible"
 INDEPENDENT = "bdpt points=independent"
-ALONE = "bdpt light_paths=0"
-UNAIMED = "bdpt guiding=photons"
-MERGING = "bdpt merging"
 LIGHT_TRACER = "ptracer"
 
 ALONE_HERE = "fewer than two renders: seeds = 2 or more"
