@@ -13,19 +13,19 @@ MOST = {
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1450,
+    "cli": 1452,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,
     "files": 859,
-    "run": 1101,
+    "run": 1102,
     "scene sampling": 775,
     "host": 713,
     "sensors": 883,
     "": 1314,  # top files
 }
 OUTSIDE = {"scripts": 2972, "tests": 28010}
-MOST_WORDS = 29009
+MOST_WORDS = 29083
 
 
 def _lines(files):

@@ -192,14 +192,15 @@ class Render:
     def _why_to_merge(self) -> str:
         """Why this render has to merge; empty, and noted as left out, if it does not."""
         missing = self.missing()
-        if missing is None:
-            return ""
-        level, why = "impossible", components.merging.why_not(self.sensor, self.prepared.space is not None)
-        if not why and self.settings.strategy_images:
-            why = "layers=strategies shows merges with merging=true only"
-        if missing.share < WARN_SHARE:
-            level, why = NOT_WORTH, f"the other strategies lack {missing.share:.2%} of the image's light"
-        if why:
+        if missing is None or missing.share < WARN_SHARE:
+            lacks = f"{missing.share:.2%} of the image's light" if missing else "no light"
+            level, why = NOT_WORTH, f"the other strategies lack {lacks}"
+        else:
+            in_media = self.prepared.space is not None
+            level, why = "impossible", components.merging.why_not(self.sensor, in_media)
+            if not why and self.settings.strategy_images:
+                why = "layers=strategies shows merges with merging=true only"
+        if missing is None or why:
             decided = self.planner.decided
             left_out = (*decided.left_out, {"class": "merging", "level": level, "why": why})
             self.planner.decided = replace(decided, left_out=left_out)
