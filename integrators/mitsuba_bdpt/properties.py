@@ -187,7 +187,7 @@ def _check_together(settings: Settings):
     if settings.stokes and not mi.is_polarized:
         raise UsageError(
             f"layers=stokes needs a polarized variant, {mi.variant()} has no Stokes vectors; use one, for "
-            "example mi.set_variant('llvm_ad_spectral_polarized')"
+            "example llvm_ad_spectral_polarized"
         )
 
 
@@ -196,8 +196,7 @@ def check_variant(variant: str | None = None):
     variant = variant or mi.variant() or "none"
     if not variant.startswith(("llvm", "cuda")):
         raise UnsupportedError(
-            f"the variant {variant} is not supported; use one of LLVM or CUDA, for example "
-            "mi.set_variant('llvm_ad_rgb')"
+            f"the variant {variant} is not supported; use one of LLVM or CUDA, for example llvm_ad_rgb"
         )
 
 

@@ -1,4 +1,4 @@
-"""The integrator's parameters: the one place that knows their names, defaults, bounds and meanings.
+"""The integrator's parameters: the only table of their names, defaults, bounds and meanings.
 
 `properties.read_settings` reads them, the plugin's manual is `manual` and docs/user/parameters.md is `table`.
 """
@@ -145,7 +145,8 @@ class Settings:
         "auto",
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
         as the floor of a pool), also of nearly specular surfaces, by vertex merging with photons: consistent,
-        not unbiased. With ``auto`` where the other strategies lack 1 % of the image's light or more.""",
+        not unbiased. With ``auto`` it merges where the other strategies miss 1 % of the image's light or
+        more.""",
         choices=("auto", "true", "false"),
     )
     guiding: str = _parameter(

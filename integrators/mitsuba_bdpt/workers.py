@@ -17,7 +17,10 @@ one_at_a_time = threading.Lock()
 
 
 def _check_answers(address: str) -> None:
-    """Raise ``OSError`` if no scheduler sends at ``address``, where ``Client`` would wait forever."""
+    """Raise ``OSError`` if no scheduler sends at ``address``, where ``Client`` would wait forever.
+
+    ``CommandError`` for an ``address`` without a valid port.
+    """
     from distributed.comm.addressing import parse_address, parse_host_port
 
     protocol, place = parse_address(address)
@@ -28,6 +31,8 @@ def _check_answers(address: str) -> None:
             if connection.recv(1):
                 return
             why = "it ends the connection"
+    except (ValueError, OverflowError) as error:
+        raise CommandError(f"scheduler={address!r}: {error}; give HOST:PORT.") from error
     except OSError as error:
         why = str(error)
     raise OSError(f"no dask scheduler answers at {address} within {ANSWERS_WITHIN:g} s: {why}")
@@ -68,8 +73,8 @@ def worker_count(client) -> int:
 def connected(address: str):
     """Yield a ``distributed.Client`` of the scheduler at ``address``.
 
-    Raises ``CommandError`` if distributed is not installed or the scheduler has no worker, ``OSError`` if
-    there is no scheduler within `ANSWERS_WITHIN`.
+    Raises ``CommandError`` if distributed is not installed, the ``address`` has no port or the scheduler no
+    worker, ``OSError`` if there is no scheduler within `ANSWERS_WITHIN`.
     """
     try:
         from distributed import Client

@@ -79,7 +79,8 @@ def test_what_fails_is_said(monkeypatch):
     def hang(command, **kwargs):
         raise subprocess.TimeoutExpired(command, kwargs["timeout"])
 
-    monkeypatch.setattr(doctor, "PACKAGES", ("surely-not-installed",))
+    monkeypatch.setattr(doctor, "PACKAGES", ("no-wheel", "surely-not-installed"))
+    monkeypatch.setattr(doctor.llvm, "WHEEL", "no-wheel")
     wrong = [child(0, f'{{"llvm": "23", "mean": {mean}}}') for mean in ("0.0", "NaN", "1e9")]
     found = [found for process in (*wrong, hang) for found in doctor.render_in_child("llvm_ad_rgb", process)]
     for finding, text in zip(
@@ -88,6 +89,7 @@ def test_what_fails_is_said(monkeypatch):
         strict=True,
     ):
         assert finding.state == "FAIL" and text in finding.text
+    assert doctor.Finding("note", "no-wheel", "not installed") in [*doctor.versions()]
 
 
 def test_which_variants_can_render_here():

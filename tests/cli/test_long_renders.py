@@ -111,7 +111,10 @@ def test_an_interrupted_render_leaves_a_checkpoint_of_its_own(monkeypatch, capsy
 
 @pytest.mark.parametrize(
     ("after", "text"),
-    [(0, "checkpoint 'a.checkpoint.npz' is missing: it has none of the image's"), (1, "checkpoint 'a.ch")],
+    [
+        (0, "no checkpoint 'a.checkpoint.npz' yet: interrupted in the first pass; "),
+        (1, "checkpoint 'a.checkp"),
+    ],
 )
 def test_ctrl_c_within_a_pass_tells_what_the_checkpoint_lacks(monkeypatch, capsys, after, text):
     render = [*ARGUMENTS, "--spp", "32", "-P", "layers=variance", "-o"]
@@ -224,6 +227,7 @@ def test_a_damaged_checkpoint_is_refused(monkeypatch, capsys):
         (["--resume"], "resume needs --checkpoint"),
         (["--resume", "never"], "resume needs --checkpoint"),
         (["--parts", "3"], "parts needs --scheduler"),
+        (["--scheduler", "localhost"], "scheduler='localhost': missing port number"),
         (["--scheduler", "x:1", "--time", "1"], "scheduler together with time"),
         (["--scheduler", "x:1", "--checkpoint", "1"], "scheduler together with checkpoint"),
         (["--scheduler", "x:1", "--target-error", "1"], "scheduler together with target_error"),

@@ -156,7 +156,9 @@ def test_images_that_cannot_be_mixed(tmp_path):
         (["none.exr", "key=1"], "none.exr': No such file or directory"),
         (["a.exr", "-m", "none"], "variant='none' is not one of Mitsuba's"),
         (["a.exr", "key=1", "key=2"], "a layer of key has two weights; give it one"),
-        (["a.exr", "key=1", "-o", "b.jpg"], "b.jpg' must end in .png"),
+        (["a.exr", "key=1", "-o", "b.jpg"], "b.jpg' must end in .png or .exr"),
+        (["a.exr", "key=1", "-o", ""], "output='.' must end in .png or .exr"),
+        (["", "key=1"], "'.': "),
         (["a.exr", "key"], "must have the form LAYER=X or LAYER=X,Y,Z"),
     ],
 )

@@ -17,6 +17,7 @@ from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.errors import CommandError, FailureError, UnsupportedError
 from mitsuba_bdpt.files import images
 from mitsuba_bdpt.files.loading import in_proportion, load
+from mitsuba_bdpt.settings import Settings
 
 SCENE = """
 <scene version="3.0.0">
@@ -257,7 +258,11 @@ OWN = "--integrator", "scene", "-D", "integrator=bdpt"
         ([], ["-o", "/proc/none/a.exr"], r"output='/proc/none/a.exr' cannot be written \(No such file"),
         ([], ["-o", "plain.xml/a.exr"], "name another with -o"),
         ([], ["-m", "LLVM_AD_RGB"], r"variant='LLVM_AD_RGB' is not one of .*; did you mean llvm_ad_rgb\?"),
-        ([], ["-m", "scalar_rgb", "--integrator", "bdpt"], "scalar_rgb is not supported; .*'llvm_ad_rgb'"),
+        (
+            [],
+            ["-m", "scalar_rgb", "--integrator", "bdpt"],
+            "scalar_rgb is not supported; .*example llvm_ad_rgb",
+        ),
         ([], ["-s", "3"], "sensor=3 is not in the scene; the last one is 0"),
         ([], ["-Dlight=abc"], r'plain.xml \(line 17, col 31\): could not parse RGB value "abc"'),
         ([], ["--integrator", "diffuse"], 'plugin "diffuse" is of type "bsdf", which does not match'),
@@ -265,7 +270,7 @@ OWN = "--integrator", "scene", "-D", "integrator=bdpt"
         ([], ["--integrator", "aov", "-P", "aovs="], "integrator=aov is for one around another"),
         ([], ["--integrator", "moment"], "integrator=moment is for one around another"),
         ([], ["-Players=strategies", "-Pmax_depth=17"], "smaller max_depth"),
-        ([], ["-P", "layers=stokes"], "layers=stokes needs a .*'llvm_ad_spectral_polarized'"),
+        ([], ["-P", "layers=stokes"], "layers=stokes needs a .*example llvm_ad_spectral_polarized"),
         ([], ["-P", "max_depth=0.5"], "max_depth=0.5 must be an integer: the longest path"),
         ([], ["-P", "max_dept=4"], r"max_dept=4 is not a parameter; did you mean max_depth\? Parameters:"),
         ([], ["-P", "decisions=[]"], r"decisions='\[\]' is not a parameter; set light_paths and"),
@@ -375,6 +380,8 @@ def test_what_a_render_ends_with_is_its_exit_status(scene, capsys, monkeypatch, 
         RuntimeError("bug"),
         wrapped(RuntimeError("bug")),
         RuntimeError("[Lamp] eval(): Traceback (most recent call last):\nKeyError: bug"),
+        RuntimeError("[ImageBlock] put_block(): mismatched channel counts!"),
+        wrapped(RuntimeError("[HDRFilm] prepare(): wrong")),
     ],
 )
 def test_a_bug_shows_its_traceback(scene, monkeypatch, error):
@@ -403,6 +410,13 @@ def test_an_error_of_a_plugin_is_one_line(tmp_path, capsys, kind):
     assert main(["render", str(tmp_path / "a.xml"), *arguments]) == 2
     *_, last = capsys.readouterr().err.splitlines()
     assert last.startswith("error: [BitmapTexture") and last.endswith("explicitly disabled! (raw=true)")
+
+
+def test_a_render_without_noise_is_stopped_by_its_time():
+    options = build_parser().parse_args(["render", "a.xml", "--time", "1"])
+    outcome = render.Outcome(1.0, 16, False, statistics={"error": 0.0})
+    words = render.stopped_by(options, Settings(timeout=1.0), outcome, 32)
+    assert words == "stopped by the time limit of 1 s after 16 spp"
 
 
 @pytest.mark.parametrize("kind", ["path", "ptracer"])
@@ -460,6 +474,7 @@ def test_what_is_no_integrator_is_refused_in_a_scene_without_one_too(scene, caps
         ),
         (["render", "plain.xml", "--check", "4"], "did you mean --checkpoint?"),
         (["sweep", "preset", "--sched=x"], "did you mean --scheduler?"),
+        (["mix", "a.exr", "--spp", "4"], "see mitsuba-bdpt --help"),
     ],
 )
 def test_mistyped_commands_and_options_are_answered_with_those_that_exist(capsys, arguments, question):

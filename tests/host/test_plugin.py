@@ -1,49 +1,10 @@
-"""How Mitsuba finds the plugin: its registry, scene files, and the module `mitsuba_bdpt_plugin` for 3.10."""
-
-import os
-import subprocess
-import sys
+"""How Mitsuba finds the plugin: its registry and scene files."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 import variants
 from mitsuba_bdpt.settings import PARAMETERS
-
-# What Mitsuba does for everybody who has the package, and then a scene without `bdpt` and one with it.
-STEPS = """
-import mitsuba as mi
-import mitsuba_bdpt_plugin
-mi.set_variant({variant!r})
-mi.render(mi.load_dict(mi.cornell_box()), spp=1)
-print("rendered")
-try:
-    print(type(mi.load_dict({{"type": "bdpt"}})).__name__)
-except Exception as error:
-    print(error)
-"""
-
-
-def answers(variant, **environment):
-    """Lines that the steps print with these variables of the environment."""
-    command = [sys.executable, "-c", STEPS.format(variant=variant)]
-    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()
-
-
-def test_mitsuba_is_not_hurt_where_there_is_no_llvm():
-    """Mitsuba 3.10 imports the module in every process, whatever variant it runs."""
-    rendered, *words = answers("scalar_rgb", DRJIT_LIBLLVM_PATH="/no/such.so")
-    assert rendered == "rendered"
-    words = " ".join(words)
-    assert "bdpt: drjit was imported first and found no usable LLVM" in words
-    assert "python -m mitsuba_bdpt doctor" in words
-
-
-def test_the_plugin_is_there():
-    path = os.environ["DRJIT_LIBLLVM_PATH"]  # which the package has chosen in this process
-    assert answers("llvm_ad_rgb", DRJIT_LIBLLVM_PATH=path) == ["rendered", "BDPTIntegrator"]
 
 
 def written(scene, transformed):

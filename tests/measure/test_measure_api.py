@@ -63,8 +63,8 @@ def test_a_dictionary_that_changes_is_another_scene(here, change):
     sha256 = before.sha256
     assert before.name == same.name and len([*Path("dictionaries").iterdir()]) == 1
     change(dictionary)
-    after = found(dictionary)
-    assert after.sha256 != sha256
+    after = found(measure.SceneDict("scene_v2", dictionary))
+    assert after.sha256 != sha256 and after.name == "scene_v2"
 
 
 def found(dictionary):

@@ -24,13 +24,15 @@ def anchors(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files(page):
-    """As GitHub names anchors; `make docs` checks the links of the site."""
+    """As GitHub names anchors, and tests by their names; `make docs` checks the links of the site."""
     missing = []
-    for link in re.findall(r"\]\(([^)\s]+)[^)]*\)", page.read_text()):
+    for link, title in re.findall(r'\]\(([^)\s]+)(?: "([^"]*)")?\)', page.read_text()):
         path, _, anchor = link.partition("#")
         target = page.parent / path if path else page
         if "://" not in link and not (target.is_file() and (not anchor or anchor in anchors(target))):
             missing.append(link)
+        elif path.endswith(".py") and title not in target.read_text():
+            missing.append(f"{link} {title}")
     assert not missing
 
 

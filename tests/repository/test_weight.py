@@ -13,7 +13,7 @@ MOST = {
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1452,
+    "cli": 1462,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,
@@ -22,10 +22,10 @@ MOST = {
     "scene sampling": 775,
     "host": 713,
     "sensors": 883,
-    "": 1314,  # top files
+    "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2972, "tests": 28010}
-MOST_WORDS = 29083
+OUTSIDE = {"scripts": 2968, "tests": 27998}
+MOST_WORDS = 29082
 
 
 def _lines(files):

@@ -81,7 +81,8 @@ class Parser(argparse.ArgumentParser):
         elif parameter in PARAMETERS:
             question = f"that is a parameter of the integrator: -P {parameter}=VALUE"
         else:
-            question = REPLACED.get(name) or (did_you_mean(name, self.known) if wrong else "")
+            is_unknown = wrong and name not in self.known  # else of another command
+            question = REPLACED.get(name) or (did_you_mean(name, self.known) if is_unknown else "")
         question = question.rstrip() or f"see {self.prog} --help"
         self.exit(mistakes.USAGE, f"{self.prog}: error: {message}; {question}\n")
 

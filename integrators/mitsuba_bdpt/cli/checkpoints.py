@@ -103,13 +103,13 @@ class Checkpoints:
         Prints where the checkpoint lacks samples of the image.
         """
         self.write()
-        if self._kept < done:
-            holds = f"has {self._kept}" if self._kept else "is missing: it has none"
-            print(
-                f"checkpoint {str(self.path)!r} {holds} of the image's {done} samples per pixel: no later "
-                "pass was over; the same command renders the others again",
-                file=sys.stderr,
-            )
+        if self._kept >= done:
+            return
+        path, again = repr(str(self.path)), "the same command renders the others again"
+        text = f"checkpoint {path} has {self._kept} of the image's {done} samples per pixel; {again}"
+        if not self._kept and self._report is None:
+            text = f"no checkpoint {path} yet: interrupted in the first pass; the same command starts anew"
+        print(text, file=sys.stderr)
 
     def remove(self) -> None:
         self.path.unlink(missing_ok=True)

@@ -82,9 +82,11 @@ def versions() -> Iterator[Finding]:
         try:
             yield Finding("ok", package, importlib.metadata.version(package))
         except importlib.metadata.PackageNotFoundError:
-            # The LLVM wheel exists for one platform only; `llvm_library` reports whether it is needed.
-            state = "note" if package == llvm.WHEEL else "FAIL"
-            yield Finding(state, package, f"not installed; mend it with: python -m pip install {package}")
+            if package == llvm.WHEEL:  # for one platform only; `llvm_library` reports whether it is needed
+                yield Finding("note", package, "not installed")
+            else:
+                remedy = f"mend it with: python -m pip install {package}"
+                yield Finding("FAIL", package, f"not installed; {remedy}")
 
 
 def llvm_library() -> Finding:

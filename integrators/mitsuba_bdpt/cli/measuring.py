@@ -61,9 +61,9 @@ def integrator(text: str) -> tuple[str, dict]:
 
 def declare(parser: argparse.ArgumentParser, kind: type) -> None:
     for field in options.options_of(kind):
-        given, kind = dict(field.metadata["declared"]), field.metadata["kind"]
+        given, values = dict(field.metadata["declared"]), field.metadata["kind"]
         names = [given.pop("short")] if "short" in given else []
-        given["choices" if isinstance(kind, tuple) else "type"] = kind
+        given["choices" if isinstance(values, tuple) else "type"] = values
         names.append(f"--{field.name.replace('_', '-')}")
         parser.add_argument(*names, default=field.default, help=field.metadata["text"], **given)
 

@@ -7,7 +7,7 @@ Usage errors, `USAGE`, concern the user's input; the same command would fail aga
 * ``argparse.ArgumentTypeError``: words of the command line that are parsed later.
 * ``OSError`` about a path that is missing or cannot be written (`PATHS`).
 * ``RuntimeError`` of Mitsuba's (`_is_mitsubas`): about a scene file, an unknown plugin or its parameters, or
-  of a plugin while rendering, such as a texture without spectra.
+  of a plugin while rendering, such as a texture without spectra; not of `INNER` classes.
 
 Failures, `FAILURE`, may be transient: `errors.FailureError`, other ``OSError``, ``MemoryError`` and Dr.Jit's
 ``RuntimeError`` about memory.
@@ -74,6 +74,9 @@ PATHS = frozenset(
 OUT_OF_MEMORY = re.compile(r"out[ _]of[ _]memory|failed to allocate", re.IGNORECASE)
 """What a ``RuntimeError`` of Dr.Jit says of memory that it cannot allocate."""
 
+INNER = re.compile(r"\[\w*(Film|Block|Bitmap|Scene|Integrator|Sampler|Struct|Stream|Pool|Thread|Parser)\]")
+"""What errors of classes that `bdpt` calls with data of its own begin with: they may be bugs."""
+
 
 def in_words(error: BaseException) -> str:
     """Describe the error; for system errors, with the file."""
@@ -96,11 +99,12 @@ def _is_drjits_memory(error: BaseException) -> bool:
 def _is_mitsubas(error: BaseException) -> bool:
     """Return whether an error is one of Mitsuba's, ``[parser.cpp:9] …`` or ``[BitmapTexture] …``.
 
-    With the traceback of a Python plugin, only if that ends in a usage error.
+    Without `INNER` classes; with the traceback of a Python plugin, only if that ends in a usage error.
     """
     before, traceback, rest = str(error).partition("Traceback (most recent call last):")
     of_user = not traceback or IN_WORDS.match(rest.strip().splitlines()[-1])
-    return isinstance(error, RuntimeError) and before.startswith("[") and bool(of_user)
+    of_scene = before.startswith("[") and not INNER.match(before)
+    return isinstance(error, RuntimeError) and of_scene and bool(of_user)
 
 
 def status_of(error: BaseException) -> int | None:

@@ -119,7 +119,7 @@ def finish(film: mi.Film, integrator: mi.Integrator, options: Namespace, outcome
     if options.statistics is not None:
         write_json(options.statistics, {"settings": settings} | found)
     outcome.written()
-    say(summary(options, outcome, film, integrator.settings if is_ours(integrator) else None, spp))
+    print_line(summary(options, outcome, film, integrator.settings if is_ours(integrator) else None, spp))
     if outcome.error is not None:
         raise outcome.error
     return not outcome.interrupted
@@ -154,7 +154,7 @@ def write(film: mi.Film, options: Namespace, attributes: Mapping[str, str]) -> N
         raise FailureError(f"{in_words(error)}; the image is {str(rescued)!r} instead") from error
 
 
-def say(line: str) -> None:
+def print_line(line: str) -> None:
     """Print a ``line``; a closed stream must not end the render."""
     try:
         print(line, flush=True)
@@ -169,7 +169,7 @@ def explain(options: Namespace) -> int | None:
     def explained(ending: Ending) -> int:
         scene, integrator, _ = loaded(options, ending)
         sensor = choose_sensor(scene, options.sensor)
-        say(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
+        print_line(integrator.explain(scene, sensor, options.spp or sensor.sampler().sample_count()))
         return 0
 
     return _ended(explained)
@@ -221,7 +221,7 @@ def render(scene: mi.Scene, integrator: mi.Integrator, options: Namespace, spp: 
 def preview(options: Namespace, film: mi.Film) -> Callable[[PassReport], None]:
     """Return a watcher that rewrites the PNG with the image so far, first after the first pass.
 
-    A full disk does not end the render.
+    A PNG that cannot be written does not end the render.
     """
     path, last = options.output.with_suffix(".png"), -math.inf
 
@@ -232,7 +232,7 @@ def preview(options: Namespace, film: mi.Film) -> Callable[[PassReport], None]:
         report.image()
         try:
             write_png(film, film.bitmap(), path, options.exposure)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # Mitsuba's for an image that is too large for a PNG
             print(f"warning: no preview {str(path)!r}: {error}", file=sys.stderr)
         last = time.monotonic()
 
@@ -344,7 +344,7 @@ def stopped_by(options: Namespace, parameters, outcome: Outcome, spp: int) -> st
         return ""
     done = f"{outcome.spp} spp" if is_open_ended(options) else f"{outcome.spp} of {spp} spp"
     target, limit = (parameters.target_error, parameters.timeout) if parameters else (0, options.time)
-    if outcome.statistics.get("error", math.inf) <= target:
+    if 0 < target and outcome.statistics.get("error", math.inf) <= target:
         return f"stopped by target_error={target:g} after {done}"
     if limit is None or limit < 0:
         return ""

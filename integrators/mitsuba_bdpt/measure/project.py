@@ -58,8 +58,8 @@ class Project:
         named = (folder / f"{name}.xml" for folder in (self.scenes, self.dictionaries))
         for file in (Path(name), *named, self.root / name):
             if file.is_file():
-                stem = file.resolve().parent.name if PLAIN.fullmatch(file.stem) else file.stem
-                return SceneFile(stem, file)
+                is_plain = PLAIN.fullmatch(file.stem) and file.parent != self.dictionaries
+                return SceneFile(file.resolve().parent.name if is_plain else file.stem, file)
         known = self.scene_names()
         text = f"or put it into {str(self.scenes)!r} and give its name"
         if known:
