@@ -62,7 +62,7 @@ def _measured(
 def over_path(results: Results, scene: str, error: Error = "rel_mse_trimmed") -> Measured:
     """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
     lacks, found = results.path_lacks(scene), results.against_path(scene, error)
-    return Measured(f"{found}" + (f"; `{results.tracer(scene)}`: {lacks}" if lacks else ""), [found.median])
+    return Measured(f"{found}" + f"; {lacks}" * bool(lacks), [found.median])
 
 
 def _near(found: Summary) -> str:

@@ -50,7 +50,7 @@ def gallery(results: Results) -> str:
 
     def figure(scene: str) -> str:
         lacks = results.path_lacks(scene)
-        return f"{results.against_path(scene)}" + (f"<br>`{results.tracer(scene)}`: {lacks}" if lacks else "")
+        return f"{results.against_path(scene)}" + f"<br>{lacks}" * bool(lacks)
 
     cells = [
         f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes

@@ -141,6 +141,23 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
     assert frames == [(24.5, 9.5), (49.5, -0.5)]
 
 
+@pytest.mark.parametrize(("least", "labels"), [(4, ["10", "100"]), (64, ["100", "200"])])
+def test_samples_are_written_out_under_the_axis(monkeypatch, least, labels):
+    found, kept = saved(monkeypatch, figures), results(("b",))
+    figures.convergence(replace(kept, rows=kept.rows.query(f"budget >= {least}")), None, 1)
+    (axis,) = found[0].axes
+    low, high = axis.get_xlim()
+    ticks = [label for which in (False, True) for label in axis.xaxis.get_ticklabels(minor=which)]
+    inside = [one.get_text() for one in ticks if low < one.get_position()[0] < high]
+    assert [text for text in inside if text] == labels
+
+
+def test_points_are_joined_in_the_order_of_budgets():
+    kept = results(("b",))
+    slow = replace(kept, rows=kept.rows.assign(seconds=1 / kept.rows["budget"]))
+    assert figures._points(slow, "b", "bdpt", "seconds", "rel_mse")["x"].is_monotonic_decreasing
+
+
 def test_single_renders_among_several_have_no_point():
     kept = results(("b",))
     few = replace(kept, rows=kept.rows.query("budget < 256 or seed == 0"))

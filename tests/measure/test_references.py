@@ -159,9 +159,17 @@ def test_an_interrupted_reference_is_gone_on_with(project, job, monkeypatch):
         patched.setattr(making.mi, "render", interrupted)
         with pytest.raises(KeyboardInterrupt):
             making.obtained(job(2, seconds=0, by="bdpt"))
-    assert stored(project, 2).provenance["spp"] == 16 and job(2).is_missing
+
+    def lack(spp):
+        return job(2, spp=spp, share=making.SHARE_ON_THE_WAY).lack
+
+    assert stored(project, 2).provenance["spp"] == 16
+    assert lack(1) and "has 16 of 40 samples per pixel; going on" in lack(4)  # too few renders; samples
     assert making.obtained(job(2, seconds=0, by="bdpt")).provenance["spp"] == 48
-    assert not job(2).is_missing
+    assert not lack(4) and lack(64)
+    made = making.obtained(job(2, seconds=0, spp=64))  # with the integrator asked for before
+    assert 48 < made.provenance["spp"] < 640 and made.provenance["integrator"]["type"] == "bdpt"
+    assert not lack(64) and lack(65)  # ended by the limit
 
 
 def test_a_reference_has_the_samples_that_fit(job, capsys, renders):
@@ -193,8 +201,9 @@ def test_a_better_reference_stays(project, job):
     made, _ = making.make(job(2))
     other = replace(made, provenance=made.provenance | {"sampler": "another"})
     reference.write(job(2).path, other)
-    kept, reached = making.make(job(2, seconds=0))
+    kept, reached = making.make(job(2, seconds=0, spp=8))
     assert not reached and kept.provenance["spp"] == other.provenance["spp"]
+    assert not job(2, spp=8).lack and job(2, spp=9).lack
     assert stored(project, 2).provenance["spp"] == other.provenance["spp"]
     assert making.make(job(2))[1]
 

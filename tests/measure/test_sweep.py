@@ -1,6 +1,7 @@
 """Sweeps: what is stored, what a restart keeps, what is refused."""
 
 import csv
+import itertools
 import json
 import math
 import re
@@ -302,7 +303,7 @@ def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
         (("[2, 4]", "[2, 2]"), r"spp=\[2, 2\] must differ"),
         (("[2, 4]", "[true]"), r"spp.0=True: .* integer"),
         (("seeds = 2", "seeds = [1, 2, 3]"), r"seeds=\[1, 2, 3\] be as many"),
-        (("seeds = 2", "seed = 2"), "seed=2: Extra inputs are not permitted"),
+        (("seeds = 2", "seed = 2"), "seed=2: unknown; did you mean seeds.* known: scenes, res"),
         (('scenes = ["cornell_box"]', ""), "scenes is missing"),
         (("cornell_box", "nowhere"), "scene='nowhere'"),
         (('type = "bdpt"', 'type = "bdpt"\nseeds = 1'), "the first integrator, 'ours', sets the time"),
@@ -315,9 +316,9 @@ def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
         (('match = "seconds"', "[scene.pool]\nspp = [1]\nseeds = 1"), r"\[scene.pool\]: 'pool' is not among"),
         (
             ('match = "seconds"', "[scene.cornell_box]\ndepth = 1"),
-            "cornell_box.depth=1: Extra inputs",
+            "depth=1: unknown; .* known: max_depth, spp",
         ),
-        (('match = "seconds"', "[more]\nspp = 4"), "more={'spp': 4}: Extra inputs are not permitted"),
+        (('match = "seconds"', "[more]\nspp = 4"), "more={'spp': 4}: unknown; known: scenes"),
     ],
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
@@ -620,7 +621,20 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
     text = report.Report.of(Project(folder), output).text()
     assert "`cornell_box`, 4 of 8 renders: 4 at 4 spp." in text
     assert f"mitsuba-bdpt sweep {path} -o {output} --project {folder} --seconds " in text
+    measure, count = sweep.measure, itertools.count()
+
+    def interrupted(bench, cell):
+        if next(count):
+            raise KeyboardInterrupt
+        return measure(bench, cell)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sweep, "measure", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            swept(*words)
+    assert len(rows_of(output)) == 5
     missing = missing_of(output)
+    assert missing["cornell_box"]["text"] == "3 of 8 renders: 3 at 4 spp"
     keep_missing(output, ["another"], {}, "")
     assert missing_of(output) == missing != {}
     assert swept(*words) == 0 and missing_of(output) == {}

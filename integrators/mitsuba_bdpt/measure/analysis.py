@@ -177,10 +177,6 @@ class Results:
         has_parameters = "parameters" in rows and len(rows)
         return json.loads(rows["parameters"].iloc[0])["type"] if has_parameters else method.split()[0]
 
-    def tracer(self, scene: str) -> str:
-        """Return the type of the last of `standard` in a scene."""
-        return self.kind((self.standard_in(scene) or RIVALS)[-1])
-
     def has_efficiency(self, scenes: Sequence[str]) -> bool:
         """Return whether the first integrator has an efficiency over a rival in one of the ``scenes``."""
         for scene, rival in product(scenes, self.rivals):
@@ -333,9 +329,10 @@ class Results:
         return min(found, key=lambda ratio: ratio.median)
 
     def path_lacks(self, scene: str) -> str:
-        """Describe the energy that the last of `standard` lacks in a scene, if all of them do."""
-        found = [self.lacks(scene, rival) for rival in self.standard_in(scene)]
-        return found[-1] if found and all(found) else ""
+        """Return the last type of `standard` and the energy it lacks in a scene; empty unless all do."""
+        rivals = self.standard_in(scene)
+        found = [self.lacks(scene, rival) for rival in rivals]
+        return f"{self.kind(rivals[-1])}: {found[-1]}" if found and all(found) else ""
 
 
 NOTHING = "all energy is missing"

@@ -3,7 +3,7 @@
 The estimators, and when an error is a bound: docs/development/measuring.md, *How errors are estimated*. The
 raw relMSE is the variance (`metrics.spread`) where the mean of the renders agrees with the reference, else
 variance + squared bias, the measured error less the reference's own. Weights come from the reference alone.
-Intervals are Student's over seeds; the noise of the reference's image in the weights is not in them.
+Intervals are Student's over seeds; the noise of the reference's image is not in them.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ Bound = Literal["", "≥", "≤", "~"]
 """Exact, at least, at most, or neither bound."""
 
 SUBTRACTED = 0.9  # largest share of the reference's own error in a measured one that is subtracted
+SHIFTED = 0.1  # largest share of an error by which the reference's noise in its weights may shift it
+SHARE_OF_BIAS = 0.2  # largest share of the reference's own error for which the squared bias has an interval
 RESAMPLES = 10_000  # of the bootstrap: ends of a 95 % interval vary by 1 % of its width between seeds
 FEWEST_WITH_INTERVAL = 5  # renders for which a 95 % interval is given
 WIDE = 1e3  # ratio of the ends of an interval from which on it is not given
@@ -47,8 +49,12 @@ def has_interval(found: Estimate, count: int) -> bool:
 def with_interval(found: Estimate, count: int, is_positive: bool = True) -> str:
     """Format an error of ``count`` renders (its interval), or why there is none."""
     low, high = (f"{end:.2e}" if end > 0 or is_positive else "0" for end in (found.low, found.high))
-    if count < FEWEST_WITH_INTERVAL or (is_positive and not has_interval(found, count)):
+    if count < FEWEST_WITH_INTERVAL:
         interval = "one render" if count == 1 else "too few renders for an interval"
+    elif is_positive and not has_interval(found, count):
+        interval = "no interval: one render decides"
+    elif math.isinf(found.high):
+        interval = "no interval: the reference is too noisy"
     elif is_positive:
         interval = f"{low}–{high}"
     else:
@@ -121,7 +127,9 @@ def _is_variance(rows: pd.DataFrame, differs: bool) -> bool:
 def _is_noisy(rows: pd.DataFrame, error: Error) -> bool:
     """Return whether the reference is too noisy to subtract its own error."""
     measured, own = rows[error], rows[f"reference_{error}"]
-    return bool(own.any()) and bool(own.sum() > SUBTRACTED * measured.sum() or (measured - own).min() <= 0)
+    found, shift = measured - own, 6 * rows["reference_rel_mse"].mean() ** 2  # to lowest order
+    is_noisy = own.sum() > SUBTRACTED * measured.sum() or found.min() <= 0 or shift > SHIFTED * found.mean()
+    return bool(own.any() and is_noisy)
 
 
 def relative_error(rows: pd.DataFrame, error: Error, differs: bool) -> RelativeError:
@@ -189,14 +197,15 @@ def _variance_without(rows: pd.DataFrame) -> pd.Series | None:
 def squared_bias(rows: pd.DataFrame) -> Estimate | None:
     """Return the squared bias relative to the reference, raw, with a 95 % interval; both may be negative.
 
-    None for a single render; infinite interval for two.
+    None for a single render; infinite interval for two, and where the reference's noise, which all seeds
+    share, is more than `SHARE_OF_BIAS` of the measured error.
     """
     n = len(rows)
     if n < 2 or not _has_variance(rows):
         return None
     total = rows["rel_mse"] - rows["reference_rel_mse"]
     value, variances = float(total.mean() - rows["variance"].mean()), _variance_without(rows)
-    if variances is None:
+    if variances is None or rows["reference_rel_mse"].sum() > SHARE_OF_BIAS * rows["rel_mse"].sum():
         return Estimate(value, -math.inf, math.inf)
     without = (total.sum() - total) / (n - 1) - variances
     half = _half_width(without)

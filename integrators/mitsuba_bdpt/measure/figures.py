@@ -17,7 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ..errors import CommandError
 from ..files.images import read_layers
@@ -123,13 +123,17 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
             else:  # a single point has no line
                 axis.plot(points["x"], points["y"], **look | {"marker": "" if len(points) > 1 else "_"})
     axis.set(xscale="log", yscale="log", title=scene)
+    low, high = axis.get_xlim()
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     if axis.lines:
         x, y = axis.lines[0].get_data()
         axis.plot([x[0], x[-1]], [y[0], y[0] * x[0] / x[-1]], zorder=1, **SLOPE)
 
 
 def _points(results: Results, scene: str, method: str, against: str, error: Error) -> pd.DataFrame:
-    """Return an integrator's positive errors ``y`` over ``x``, with their interval, if any, and bound."""
+    """Return an integrator's positive errors ``y`` over ``x`` by budget, with interval, if any, and bound."""
     points: list[dict[str, object]] = []
     groups = results.of(scene, method).groupby("budget")
     # Where time was too short for a second render, a single one would look as certain as the others.
@@ -142,7 +146,7 @@ def _points(results: Results, scene: str, method: str, against: str, error: Erro
             point = {"x": rows[against].median(), "y": total.value, "low": ends[0], "high": ends[1]}
             points.append(point | {"bound": found.bound})
     numbers = dict.fromkeys(["x", "y", "low", "high"], float)
-    return pd.DataFrame(points, columns=[*numbers, "bound"]).astype(numbers).sort_values("x")
+    return pd.DataFrame(points, columns=[*numbers, "bound"]).astype(numbers)
 
 
 def efficiencies(results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None) -> None:

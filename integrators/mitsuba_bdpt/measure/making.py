@@ -1,9 +1,9 @@
 """Makes reference images that include an estimate of their own error.
 
-A reference for renders of n samples per pixel has n / `SHARE` samples: beside equally good ones its own error
-adds 1 % to theirs; one that another command makes on the way, which subtracts its error, 10 %. It is the mean
-of two halves with different seeds, which differ by twice the standard error of their mean. `Recipe` names the
-integrator; windows in which few samples find the light have more samples.
+A reference for renders of n samples per pixel has 100 n; one that another command makes on the way, which
+subtracts the reference's own error, 10 n. It is the mean of two halves with different seeds, which differ by
+twice the standard error of their mean. `Recipe` names the integrator; windows in which few samples find the
+light have more samples.
 
 `reference` describes the files. Each round is stored; a further run continues from the stored image, whose
 rounding to half precision is far below its error.
@@ -61,7 +61,7 @@ LEAST_SPP, PASS_SPP, TRIAL_SPP = 4, 256, 16
 
 FITTED = 0.8  # share of the time left for which renders are planned
 FIRST_SEED = 1_000_000  # far from the seeds of measurements
-SHARE, SHARE_ON_THE_WAY = 0.01, 0.1  # of the reference's own error in a measured error
+SHARE, SHARE_ON_THE_WAY = 0.01, 0.1  # samples of the judged renders over the reference's
 
 
 def recipe_of(project: Project, name: str) -> Recipe:
@@ -74,7 +74,7 @@ def recipe_of(project: Project, name: str) -> Recipe:
 class Job:
     """A reference to be made.
 
-    ``spp``: of the renders to judge; ``share``: of its own error in theirs; ``seconds``: time limit, after
+    ``spp``: of the renders to judge; ``share``: of these in its own samples; ``seconds``: time limit, after
     the first `FEWEST_RUNS` renders; ``max_depth``: None for the project's; ``by``: replaces the recipe's.
     """
 
@@ -98,7 +98,7 @@ class Job:
 
     @property
     def samples(self) -> int:
-        """Samples per pixel of a reference that is good enough."""
+        """Samples per pixel that are enough."""
         return round(self.spp / self.share)
 
     @property
@@ -115,16 +115,20 @@ class Job:
 
     @property
     def lack(self) -> str:
-        """Why the reference has to be made; empty if there is one of this version of the scene."""
+        """Why the reference has to be made or refined; empty if it need not.
+
+        Of this version of the scene it is enough with its samples, or if a time limit ended it when as many
+        were wanted.
+        """
         header, where = header_of(self.path), f"{self.resolution} and depth {self.depth}"
         if header.get("scene_sha256", self.scene_sha256) != self.scene_sha256:
             return f"the scene has changed since its reference at {where} was made; making one anew"
-        is_begun = header.get("means", True) is None
-        return f"no reference at {where} yet; making one" if is_begun or not self.path.is_file() else ""
-
-    @property
-    def is_missing(self) -> bool:
-        return bool(self.lack)
+        if not self.path.is_file():
+            return f"no reference at {where} yet; making one"
+        spp = header.get("spp", self.samples)  # a known answer has none
+        if header.get("means", True) and max(spp, header.get("ended_for", 0)) >= self.samples:
+            return ""
+        return f"the reference at {where} has {spp} of {self.samples} samples per pixel; going on"
 
     @property
     def stored(self) -> Reference | None:
@@ -143,15 +147,14 @@ def requested(project: Project, name: str, options: MakeReference | Namespace) -
 
 
 def obtained(job: Job) -> Reference:
-    """Return the stored reference, or make it if it is missing or of another version of the scene.
+    """Return the stored reference; makes or refines it first if it lacks samples (see `Job.lack`).
 
-    A new one is reported on standard output. It ends when its own error is a tenth of the renders', or at the
-    time limit.
+    That is reported on standard output. It ends at 10 times the samples of the renders, or at the time limit.
     """
+    job = replace(job, share=SHARE_ON_THE_WAY, by=job.by or header_of(job.path).get("by"))
     check(job)
-    if job.is_missing:
-        made = replace(job, max_depth=job.depth, share=SHARE_ON_THE_WAY)
-        print(said(made, *make(made)), flush=True)
+    if job.lack:
+        print(said(job, *make(job)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
@@ -161,7 +164,7 @@ def check(job: Job) -> Recipe:
     if (width := fitted(job.scene, job.resolution)) != job.resolution:
         raise CommandError(f"resolution={job.resolution} of {job.scene.name!r} must be {width}")
     try:
-        if job.is_missing:
+        if job.lack:
             job.path.parent.mkdir(parents=True, exist_ok=True)
             check_writable(job.path)
     except OSError as error:
@@ -173,9 +176,9 @@ def check(job: Job) -> Recipe:
 
 
 def make(job: Job) -> tuple[Reference, bool]:
-    """Render until the reference is good enough or the time is over, and store it.
+    """Render until the reference has enough samples or the time is over, and store it.
 
-    Returns it, and whether it is good enough. A reference cut short by time does not replace a better one of
+    Returns it, and whether it has enough. A reference cut short by time does not replace a better one of
     the same light and version of the scene.
     """
     recipe = check(job)
@@ -328,10 +331,9 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
             return stored, True
         stored = None
     spp = _fitting(job, scene, integrator, started)
-    spent = last = 0.0
     with amount(f"{job.scene.name}: seconds of the reference", job.seconds) as show:
-        # A round that would end too late does not begin.
-        while halves.means() is None or not (halves.is_enough(job) or spent + last > job.seconds):
+        is_over = False
+        while not is_over:
             began = time.perf_counter()
             behind = [window for window in windows if window.is_behind(halves)]
             for window in behind:
@@ -343,25 +345,29 @@ def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
                     f"scene={job.scene.name!r} is black: the samples of its reference found no light; check "
                     f"its lamps, its sensor and max_depth={job.depth}, or leave it out"
                 )
-            if stored is None:
-                write(job.path, _made(job, halves, spp, made_by))
             spent, last = time.perf_counter() - started, time.perf_counter() - began
+            # A round that would end too late does not begin.
+            is_over = halves.means() is not None and (halves.is_enough(job) or spent + last > job.seconds)
+            if stored is None:
+                write(job.path, _made(job, halves, spp, made_by, is_over))
             show(spent)
-    found, reached = _made(job, halves, spp, made_by), halves.is_enough(job)
+    found, reached = _made(job, halves, spp, made_by, True), halves.is_enough(job)
     if stored is None:
         return found, reached
     if not reached and stored.merged == found.merged and stored.error < found.error:
         print(f"{job.scene.name}: the stored reference is better than what the time allowed, and stays")
-        return stored, False
+        found = replace(stored, provenance=stored.provenance | {"ended_for": job.samples})
     write(job.path, found)
     return found, reached
 
 
-def _made(job: Job, halves: Halves, spp: int, made_by: dict[str, Any]) -> Reference:
+def _made(job: Job, halves: Halves, spp: int, made_by: dict[str, Any], is_over: bool) -> Reference:
     return halves.reference(
         provenance_of(
             job,
             **made_by,
+            by=job.by,
+            ended_for=job.samples if is_over else 0,
             spp=round(2 * float(halves.spp.min())),
             spp_in_windows=round(2 * float(halves.spp.max())),
             spp_per_render=spp,
@@ -438,7 +444,7 @@ def said(job: Job, made: Reference, reached: bool) -> str:
 def run(options: Namespace) -> int:
     """Make the references that the command-line ``options`` name.
 
-    Returns 1 if one failed or is not good enough.
+    Returns 1 if one failed or has too few samples.
     """
     if options.all == bool(options.scenes):
         raise CommandError("reference: name a scene, or give --all, not both")

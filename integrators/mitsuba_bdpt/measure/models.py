@@ -16,7 +16,7 @@ from pydantic import (
 )
 from pydantic import model_validator as validator
 
-from ..errors import CommandError
+from ..errors import CommandError, did_you_mean
 from .agreement import FEWEST_RUNS, TILES
 from .options import RESOLUTION
 
@@ -47,6 +47,9 @@ def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> Model
         texts = []
         for one in error.errors(include_url=False):
             key, text = ".".join(map(str, one["loc"])), one["msg"].removeprefix("Value error, ")
+            if one["type"] == "extra_forbidden":
+                known = kind.model_fields if len(one["loc"]) == 1 else SceneKeys.model_fields
+                text = f"unknown; {did_you_mean(str(one['loc'][-1]), known)}known: {', '.join(known)}"
             texts.append(f"{key}={one['input']!r}: {text}" if key else text)
         raise CommandError(f"{where}: {'; '.join(texts)}") from error
 

@@ -54,13 +54,13 @@ def answers(results: Results) -> dict[str, str]:
     found: dict[str, tuple[float, str]] = {}
     for scene in results.scenes:
         lacks = results.path_lacks(scene)
-        added = f"; {results.tracer(scene)} fails the bias check: {lacks}" if lacks else ""
+        added = f"; the bias check fails, {lacks}" if lacks else ""
         try:
-            ratio = results.against_path(scene)
+            ratio, over = results.against_path(scene), " and ".join(results.standard_in(scene))
         except Unavailable as why:
             found[scene] = -1.0, f"{why}{added}"
         else:
-            found[scene] = ratio.median, f"efficiency over {results.tracer(scene)}: {ratio}{added}"
+            found[scene] = ratio.median, f"efficiency over {over}: {ratio}{added}"
     return {scene: found[scene][1] for scene in sorted(found, key=found.__getitem__, reverse=True)}
 
 

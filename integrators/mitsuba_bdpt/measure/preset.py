@@ -23,7 +23,7 @@ from ..errors import CommandError, message
 from ..files.texts import read_toml
 from ..host.introspection import versions
 from ..run.rendering import raise_interrupt
-from .making import Job, fitted
+from .making import SHARE_ON_THE_WAY, Job, fitted
 from .models import PresetFile, checked
 from .project import Project
 from .reference import Reference, load_reference, source_digest
@@ -132,7 +132,7 @@ class Cells:
     @property
     def job(self) -> Job:
         """The reference that judges the renders."""
-        return Job(*self.where, spp=max(self.spp))
+        return Job(*self.where, spp=max(self.spp), share=SHARE_ON_THE_WAY)
 
     @cached_property
     def judge(self) -> tuple[Reference, str]:

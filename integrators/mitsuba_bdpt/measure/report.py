@@ -198,12 +198,22 @@ def _chosen(decisions: str) -> str:
     return f"{found[-1]['light_paths']}, {found[-1]['connections']}" if found else ""
 
 
-def references_table(made: dict[str, Reference]) -> str:
+DOUBTFUL = 0.3  # share of a reference's own error in an integrator's from which on it is marked
+
+
+def references_table(results: Results, made: dict[str, Reference]) -> str:
+    """Table of the references, with the largest share of their own error in an integrator's, trimmed."""
+    found = results.rows[results.rows["budget"] == results.deciding].groupby(["scene", "method"])
+    sums = found[["reference_rel_mse_trimmed", "rel_mse_trimmed"]].sum()
+    shares = (sums.iloc[:, 0] / sums.iloc[:, 1]).fillna(0).groupby("scene").max()
     columns: dict[str, Figure] = {
         "max_depth": lambda scene: made[scene].provenance["max_depth"],
         "by": lambda scene: _maker(made[scene]),
         "samples per pixel": lambda scene: made[scene].provenance.get("spp", "–"),
         "own relMSE": lambda scene: f"{made[scene].error:.1e}",
+        "share in errors": lambda scene: (
+            f"{100 * shares[scene]:.2g} %{' ⚠' if shares[scene] > DOUBTFUL else ''}"
+        ),
         "epsilon of relMSE": lambda scene: f"{rel_mse_epsilon(made[scene].image):.3g}",
     }
     return by_scene(list(made), columns)
@@ -219,24 +229,14 @@ def _maker(kept: Reference) -> str:
 
 
 def machine(rows: pd.DataFrame) -> str:
-    """Describe machine and software of the measurements.
-
-    Raises ``CommandError`` for rows of several machines or versions, or of one scene by several sources of
-    the plugin.
-    """
-    found = rows[["scene", "machine", "versions"]].drop_duplicates()
-    versions = [json.loads(text) for text in found["versions"]]
-    found["source"] = [one.pop("source") for one in versions]
-    found["versions"] = [", ".join(f"{name} {version}" for name, version in one.items()) for one in versions]
-    wheres = (found["machine"] + "; " + found["versions"]).unique()
-    sources = found[["scene", "source"]].drop_duplicates()
-    for scene in sources["scene"][sources["scene"].duplicated()]:
-        raise CommandError(f"the rows of {scene} are by several sources of the plugin; render them anew")
-    if len(wheres) > 1:
-        raise CommandError(f"the rows are from several machines or versions: {sorted(wheres)}")
-    main, *others = sources["source"].value_counts().index
-    scenes = sources.groupby("source")["scene"].agg(lambda names: "`, `".join(sorted(names)))
-    return f"{wheres[0]}, source {main}" + "".join(f", {one} for `{scenes[one]}`" for one in others)
+    """Describe machine and software of the measurements: of most rows, then others with their scenes."""
+    versions = {
+        text: [f"{name} {one}" for name, one in json.loads(text).items()] for text in rows["versions"]
+    }
+    found = rows["machine"] + "; " + rows["versions"].map(versions).map(", ".join)
+    main, *others = found.value_counts().index
+    scenes = rows.groupby(found)["scene"].agg(lambda names: "`, `".join(sorted({*names})))
+    return main + "".join(f"; for `{scenes[one]}` {one}" for one in others)
 
 
 # Standard deviations of the logarithm of seconds over seeds. Other programs ran where that of wall seconds is

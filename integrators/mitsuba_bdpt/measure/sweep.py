@@ -208,13 +208,14 @@ class Pending:
 
         done = 0
         while group := next(filter(fits, self._groups), None):
-            self._groups.remove(group)
-            for cell in group:
+            for cell in [*group]:  # after an interruption the rest is still missing
                 taken = rendered(cell)
                 if taken is not None:
                     self._seconds[cell.method][cell.budget] = taken
                 self._compiled.add((cell.method, cell.budget))
+                group.remove(cell)
                 done += 1
+            self._groups.remove(group)
         return done
 
     def _predicted(self, group: list[Cell]) -> float:
@@ -261,7 +262,7 @@ class Sweep:
         half the ``limit``. A scene without one is skipped, and recorded in ``failed``.
         """
         if seconds is None:
-            lacking = sum(cells.job.is_missing for cells in self.scenes)
+            lacking = sum(bool(cells.job.lack) for cells in self.scenes)
             seconds = REFERENCE_SECONDS if limit == math.inf else limit / 2 / max(lacking, 1)
         for cells in [*self.scenes]:
             try:
@@ -308,12 +309,14 @@ class Sweep:
             return done
 
         # What a scene leaves goes to the others, until nothing more fits.
-        with Renders(works, seconds) as progress:
-            while sum([rendered(progress, i) for i, one in enumerate(pending) if one.late]):
-                pass
-        late = [one for one in pending if one.late]
-        self.cut = {one.cells.scene.name: one.text for one in late}
-        self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
+        try:
+            with Renders(works, seconds) as progress:
+                while sum([rendered(progress, i) for i, one in enumerate(pending) if one.late]):
+                    pass
+        finally:
+            late = [one for one in pending if one.late]
+            self.cut = {one.cells.scene.name: one.text for one in late}
+            self.wanted = math.ceil(ROOM * sum(one.needed for one in late))
 
     def _cell(self, progress: Renders, bench: Bench, cell: Cell) -> float | None:
         """Render a cell; returns its wall seconds, None if it failed."""
@@ -345,7 +348,7 @@ def poor_reference(cells: Cells, table: pd.DataFrame) -> str:
     make = make_command(project, project.called(scene), resolution, depth, "--spp", str(max(cells.spp)))
     others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
     method, budget = poor[-1]
-    text = f"{scene.name}: the reference is noisier than the renders of {method} at {budget} spp{others}, "
+    text = f"{scene.name}: the reference is too noisy for the renders of {method} at {budget} spp{others}, "
     return f"{text}whose trimmed errors are upper bounds. To go on: {make}"
 
 
@@ -372,15 +375,17 @@ def swept(
     check_output(output / "rows.csv", ".csv")  # fail before rendering
     limit = math.inf if options.seconds is None else options.seconds
     sweep.prepare(options.reference_seconds, limit)
-    sweep.run(max(limit - (time.monotonic() - began), 0.0))
-    table = sweep.rows()
-    if options.scenes or whole.scenes is None:
-        table = beside(table, whole.scenes, output)
-    if len(table):
-        write_tables(table, output)
-    again = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
-    names = [cells.scene.name for cells in whole.cells]
-    keep_missing(output, names, sweep.cut, again and f"{again} --seconds {sweep.wanted}")
+    try:
+        sweep.run(max(limit - (time.monotonic() - began), 0.0))
+    finally:  # after an interruption there are tables too
+        table = sweep.rows()
+        if options.scenes or whole.scenes is None:
+            table = beside(table, whole.scenes, output)
+        if len(table):
+            write_tables(table, output)
+        again = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
+        names = [cells.scene.name for cells in whole.cells]
+        keep_missing(output, names, sweep.cut, again and f"{again} --seconds {sweep.wanted}")
     _tell(sweep, table)
     return table, sweep.failed
 
