@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5107,
+    "measure": 5123,
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2968, "tests": 27998}
-MOST_WORDS = 29082
+OUTSIDE = {"scripts": 2968, "tests": 28081}
+MOST_WORDS = 29227
 
 
 def _lines(files):

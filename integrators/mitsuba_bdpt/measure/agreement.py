@@ -120,17 +120,15 @@ class BiasCheck:
     """Result of `compare_means`.
 
     ``passed``: no difference at the given significance; ``p``: the smallest p-value; ``family_p``: the same
-    after Sidak's correction for all ``comparisons``; ``tile``: (row, column) of the worst tile, None for the
-    whole image; ``channel``: of it; ``difference``: image - reference there, in radiance, with a simultaneous
-    interval of all comparisons at confidence 1 - significance; ``missing``: `missing_energy`.
+    after Sidak's correction for all comparisons; ``tile``: (row, column) of the worst, None for the whole
+    image; ``difference``: image - reference there, in radiance, with a simultaneous interval of all
+    comparisons at confidence 1 - significance; ``missing``: `missing_energy`.
     """
 
     passed: bool
     p: float
     family_p: float
-    comparisons: int
     tile: tuple[int, int] | None
-    channel: int
     difference: Estimate
     missing: Estimate
 
@@ -197,7 +195,7 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
     """
     found, tiles = welch(ours.columns, theirs.columns), math.isqrt(len(ours.columns.mean) // 3 - 1)
     worst = int(np.lexsort((-np.abs(found.value), found.p))[0])
-    tile, channel = divmod(worst, 3)
+    tile = worst // 3
     family, each = sidak(found.p), (1 - significance) ** (1 / len(found.p))
     value, error, freedom = (float(of[worst]) for of in found[:3])
     half = error * float(stats.t.isf((1 - each) / 2, freedom))
@@ -205,9 +203,7 @@ def compare_means(ours: Means, theirs: Means, significance: float = SIGNIFICANCE
         passed=family >= significance,
         p=float(found.p[worst]),
         family_p=family,
-        comparisons=len(found.p),
         tile=divmod(tile, tiles) if tile < tiles**2 else None,
-        channel=channel,
         difference=Estimate(value, value - half, value + half),
         missing=missing_energy(ours.whole, theirs.whole),
     )

@@ -255,11 +255,8 @@ def conditions_table(results: Results) -> str:
     for scene in results.scenes:
         for condition in _conditions(results, scene):
             found[condition].append(f"`{scene}`")
-    return (
-        table(["condition", "scenes"], [[text, ", ".join(names)] for text, names in found.items()])
-        if found
-        else ""
-    )
+    rows = [[text, ", ".join(names)] for text, names in found.items()]
+    return table(["condition", "scenes"], rows) if rows else ""
 
 
 def _conditions(results: Results, scene: str) -> Iterator[str]:

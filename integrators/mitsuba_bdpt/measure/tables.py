@@ -9,8 +9,7 @@ import pandas as pd
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table; escapes bars and line ends."""
-    frame = pd.DataFrame([*rows], columns=[*head], dtype=str)
-    return markdown(frame)
+    return markdown(pd.DataFrame([*rows], columns=[*head], dtype=str))
 
 
 def markdown(frame: pd.DataFrame) -> str:
