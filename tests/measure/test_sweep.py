@@ -138,7 +138,7 @@ def preset_file(folder, text=PRESET):
 # -- sweeps -----------------------------------------------------------------------------------
 
 
-def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swept):
+def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swept, folder, capsys):
     words, output = finished
     table = rows_of(output)
     assert len(table) == 8 and (output / "rows.csv").read_text().count("\n") == 9
@@ -156,6 +156,11 @@ def test_a_sweep_writes_a_row_per_render_and_goes_on(finished, monkeypatch, swep
     measure = sweep.measure
     monkeypatch.setattr(sweep, "measure", lambda b, c: rendered.append(c.key) or measure(b, c))
     assert swept(*words) == 0 and rendered == [table[3]["key"]] and len(rows_of(output)) == 8
+    assert "stored renders" not in capsys.readouterr().out
+    other = preset_file(folder, PRESET.replace("spp = [2, 4]", "spp = [2]"))
+    assert swept(other, *words[1:]) == 0 and len(rows_of(output)) == 4
+    others = len([*(output / "cells").iterdir()]) - 4
+    assert others >= 4 and f"{others} stored renders of other presets" in capsys.readouterr().out
 
 
 def test_one_scene_of_a_preset_anew(folder, job, swept, known):

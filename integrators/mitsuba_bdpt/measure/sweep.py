@@ -382,6 +382,9 @@ def swept(
         if options.scenes or whole.scenes is None:
             table = beside(table, whole.scenes, output)
         if len(table):
+            others = len([*(output / "cells").glob("*.json")]) - len(table)
+            if others > 0:
+                print(f"{others} stored renders of other presets, or before an edit, stay without rows")
             write_tables(table, output)
         again = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
         names = [cells.scene.name for cells in whole.cells]
