@@ -210,19 +210,19 @@ def _load(options: Namespace, merges: bool) -> Loaded:
     if options.denoise:
         given = overrides if node is None else node.props
         given["layers"] = _added(given.get("layers", ""), "denoised")
-    said = _in_place_of(own, used, kept, asked)
+    choice = _in_place_of(own, used, kept, asked)
     mi.parser.transform_all(config, state)
     # The stub says object; `_check_root` has verified that it is a scene.
     scene: mi.Scene = mi.parser.instantiate(config, state)  # pyright: ignore[reportAssignmentType]
     _check_no_meter(scene, options)
     if node is not None:
-        return Loaded(scene, scene.integrator(), said)
+        return Loaded(scene, scene.integrator(), choice)
     made = mi.load_dict({"type": used, **overrides})
     if not isinstance(made, mi.Integrator):
         raise CommandError(
             f"integrator={used!r} is a plugin of class {made.class_name()}, no integrator; use bdpt"
         )
-    return Loaded(scene, made, said)
+    return Loaded(scene, made, choice)
 
 
 def _in_place_of(own: str | None, used: str, kept: Mapping[str, object], asked: str | None) -> str:

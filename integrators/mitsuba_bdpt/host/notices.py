@@ -71,10 +71,10 @@ def cached(
 
 def warn_once(scene: mi.Scene, sensor: mi.Sensor, text: str, about: Hashable = None):
     """Log a warning unless one with the same ``about`` (default: ``text``) was logged for ``scene``."""
-    said = notes(scene, sensor).setdefault("said", set())
+    logged = notes(scene, sensor).setdefault("warnings", set())
     about = about or text
-    if about not in said:
-        said.add(about)
+    if about not in logged:
+        logged.add(about)
         mi.Log(mi.LogLevel.Warn, text)
 
 
