@@ -141,15 +141,21 @@ def test_integrators_and_windows_can_be_chosen(monkeypatch, tmp_path):
     assert frames == [(24.5, 9.5), (49.5, -0.5)]
 
 
-@pytest.mark.parametrize(("least", "labels"), [(4, ["10", "100"]), (64, ["100", "200"])])
-def test_samples_are_written_out_under_the_axis(monkeypatch, least, labels):
+@pytest.mark.parametrize(
+    ("least", "labels"),
+    [
+        (4, [["5", "10", "20", "50", "100", "200"], ["0.01", "0.1", "1"]]),
+        (64, [["100", "200"], ["0.005", "0.01", "0.02", "0.05", "0.1"]]),
+    ],
+)
+def test_numbers_are_written_out_beside_axes(monkeypatch, least, labels):
     found, kept = saved(monkeypatch, figures), results(("b",))
     figures.convergence(replace(kept, rows=kept.rows.query(f"budget >= {least}")), None, 1)
     (axis,) = found[0].axes
-    low, high = axis.get_xlim()
-    ticks = [label for which in (False, True) for label in axis.xaxis.get_ticklabels(minor=which)]
-    inside = [one.get_text() for one in ticks if low < one.get_position()[0] < high]
-    assert [text for text in inside if text] == labels
+    for i, (one, limits) in enumerate(((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim()))):
+        ticks = [label for which in (False, True) for label in one.get_ticklabels(minor=which)]
+        inside = [tick.get_text() for tick in ticks if limits[0] < tick.get_position()[i] < limits[1]]
+        assert [text for text in inside if text] == labels[i]
 
 
 def test_points_are_joined_in_the_order_of_budgets():

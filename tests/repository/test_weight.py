@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2968, "tests": 28086}
+OUTSIDE = {"scripts": 2968, "tests": 28092}
 MOST_WORDS = 29227
 
 

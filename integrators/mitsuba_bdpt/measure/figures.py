@@ -123,13 +123,13 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
             else:  # a single point has no line
                 axis.plot(points["x"], points["y"], **look | {"marker": "" if len(points) > 1 else "_"})
     axis.set(xscale="log", yscale="log", title=scene)
-    low, high = axis.get_xlim()
-    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,)))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
     if axis.lines:
         x, y = axis.lines[0].get_data()
         axis.plot([x[0], x[-1]], [y[0], y[0] * x[0] / x[-1]], zorder=1, **SLOPE)
+    for one, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
+        one.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100 * low else (1,)))
+        one.set_major_formatter(FuncFormatter(lambda x, _: f"{x:,.10g}"))
+        one.set_minor_formatter(NullFormatter())
 
 
 def _points(results: Results, scene: str, method: str, against: str, error: Error) -> pd.DataFrame:
