@@ -640,6 +640,7 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
     assert len(rows_of(output)) == 5
     missing = missing_of(output)
     assert missing["cornell_box"]["text"] == "3 of 8 renders: 3 at 4 spp"
+    assert "--seconds" not in missing["cornell_box"]["command"]
     keep_missing(output, ["another"], {}, "")
     assert missing_of(output) == missing != {}
     assert swept(*words) == 0 and missing_of(output) == {}

@@ -387,8 +387,9 @@ def swept(
                 print(f"{others} stored renders of other presets, or before an edit, stay without rows")
             write_tables(table, output)
         again = "" if isinstance(preset, Mapping) else project.command("sweep", preset, "-o", output)
-        names = [cells.scene.name for cells in whole.cells]
-        keep_missing(output, names, sweep.cut, again and f"{again} --seconds {sweep.wanted}")
+        if again and limit < math.inf:
+            again += f" --seconds {sweep.wanted}"
+        keep_missing(output, [cells.scene.name for cells in whole.cells], sweep.cut, again)
     _tell(sweep, table)
     return table, sweep.failed
 
