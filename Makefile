@@ -110,7 +110,7 @@ stress: $(INSTALLED)
 same: $(INSTALLED)
 	$(VENV)/bin/python scripts/versus.py $(BEFORE) --same --pairs 1 --spp 16
 
-# Planted bugs, and whether the tests see them: an hour.
+# Planted bugs, and whether the tests see them: half an hour.
 planted-bugs: $(INSTALLED)
 	$(VENV)/bin/python scripts/planted_bugs.py
 

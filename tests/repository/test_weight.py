@@ -24,8 +24,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2968, "tests": 28093}
-MOST_WORDS = 29227
+OUTSIDE = {"scripts": 2971, "tests": 28093}
+MOST_WORDS = 29228
 
 
 def _lines(files):
