@@ -195,11 +195,6 @@ def test_commands_take_the_users_scene_at_a_width_that_fits(here, capsys, words,
     assert [file.name for file in here.glob("renders/*")] == made
 
 
-def test_a_pyramid_is_of_the_users_scene(command, here):
-    command("pyramid", "elsewhere/room.xml", "--spp", "4", "--resolution", "16")
-    assert {"pyramid_room.exr", "pyramid_room_weighted.png"} <= {file.name for file in here.glob("renders/*")}
-
-
 def test_samples_are_those_that_a_sampler_takes(here, capfd):
     """Of 32 `multijitter` makes 5 x 7."""
     count = '<sampler type="independent"><integer name="sample_count" value="32"/></sampler>'

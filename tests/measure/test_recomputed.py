@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from mitsuba_bdpt.measure import figures, metrics, report, tables
+from mitsuba_bdpt.measure import metrics, report, tables
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.analysis import Results
 from mitsuba_bdpt.measure.reference import Reference
@@ -82,19 +82,6 @@ def test_efficiencies_follow_from_the_table_of_renders(tmp_path, own):
     line = report.efficiency_table(found).splitlines()[2]
     for cell, text in zip(cells, line.split("|")[2:], strict=False):
         assert text.lstrip("≥≤~ ").startswith(cell)
-
-
-@pytest.mark.parametrize("error", ["rel_mse", "rel_mse_trimmed"])
-def test_points_of_figures_are_the_errors_of_the_table(error):
-    rows, means = rendered(0.01)
-    found = Results(rows, {"box": means})
-    column = {"rel_mse_trimmed": 6, "rel_mse": 7}[error]
-    for line in report.errors_table(found).splitlines()[2:]:
-        cells = [cell.strip() for cell in line.split("|")]
-        ((x, middle, low, high, bound),) = figures._points(found, "box", cells[2], "spp", error).to_numpy()
-        ends = "too few renders for an interval" if np.isnan(low) else f"{low:.2e}–{high:.2e}"
-        assert f"{bound} {middle:.2e} ({ends})".lstrip() == cells[column]
-        assert x == 64 and np.isnan(high) == (cells[2] == "few")
 
 
 def test_the_columns_of_the_table_are_described():

@@ -12,28 +12,7 @@ from mitsuba_bdpt.measure import agreement, making, reference, scenes
 from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.models import PresetFile
 from mitsuba_bdpt.measure.preset import read_preset
-from mitsuba_bdpt.measure.project import Project
 from repository import PROJECT, ROOT
-
-
-@pytest.fixture
-def project(tmp_path):
-    """A project with the scenes of this one and their recipes."""
-    for name in ("presets", "references"):
-        (tmp_path / name).mkdir()
-    for name in ("scenes", "presets/benchmark.toml", "references/scenes.toml"):
-        (tmp_path / name).symlink_to(ROOT / name)
-    return Project(tmp_path)
-
-
-@pytest.fixture
-def job(project):
-    """Makes jobs: the reference of a scene, 8 pixels wide, of some depth."""
-
-    def made(max_depth, name="cornell_box", **more):
-        return Job(project, project.scene(name), 8, max_depth, **({"spp": 4} | more))
-
-    return made
 
 
 @pytest.fixture

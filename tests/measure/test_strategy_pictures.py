@@ -10,28 +10,14 @@ from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.measure import pyramid
 from mitsuba_bdpt.measure.project import Project
 from repository import PROJECT
-
-SCENE = """<scene version="3.0.0">
-    <default name="spp" value="4"/> <default name="resolution" value="16"/>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, 0, 3" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm">
-            <integer name="width" value="$resolution"/> <integer name="height" value="$resolution"/>
-            <rfilter type="box"/> <string name="pixel_format" value="rgb"/>
-            <string name="component_format" value="float32"/>
-        </film>
-    </sensor>
-    <shape type="sphere"><float name="radius" value="5"/><boolean name="flip_normals" value="true"/></shape>
-    <shape type="sphere"><float name="radius" value="0.3"/>
-        <emitter type="area"><rgb name="radiance" value="3, 2, 1"/></emitter></shape>
-</scene>"""
+from support.measured import ROOM
 
 
 def test_pyramid(tmp_path, capsys):
     """An EXR whose layers OpenEXR finds by the names of the contract, whose weighted ones add up to the image
     (float32: 1e-4), and two pictures of the pyramid with a row for k = 2 and one for k = 3."""
     file = tmp_path / "room.xml"
-    file.write_text(SCENE)
+    file.write_text(ROOM)
     output = tmp_path / "made" / "room.v2.exr"
     options = ["--max-depth", "3", "--spp", "8", "--resolution", "16"]
     assert main(["pyramid", str(file), "-o", str(output), *options]) == 0
@@ -68,7 +54,7 @@ def test_pyramid(tmp_path, capsys):
 def test_what_cannot_be_drawn_leaves_no_file(tmp_path, monkeypatch, capsys, dark, options, message):
     monkeypatch.chdir(tmp_path)
     file = tmp_path / "room.xml"
-    file.write_text(SCENE.replace('value="3, 2, 1"', 'value="0"') if dark else SCENE)
+    file.write_text(ROOM.replace("3, 2, 1", "0") if dark else ROOM)
     assert main(["pyramid", str(file), "--spp", "1", "--resolution", "4", *options]) == 2
     assert re.search(message, capsys.readouterr().err)
     assert not [path for path in tmp_path.rglob("*") if path.is_file() and path != file]
@@ -93,7 +79,7 @@ def test_scenes_by_name_or_file(tmp_path):
     assert PROJECT.scene("cornell_box").file.name == "cornell_box.xml"
     assert PROJECT.scene("scenes/small_casters/area_cube.xml").name == "area_cube"
     file = tmp_path / "cornell_box"
-    file.write_text(SCENE)
+    file.write_text(ROOM)
     assert PROJECT.scene(str(file)).file == file
     for name in ("nothing", "scenes/nothing"):
         with pytest.raises(ValueError, match=f"scene='{name}' is neither .* there are ajar_door, "):

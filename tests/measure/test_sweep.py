@@ -33,14 +33,15 @@ from mitsuba_bdpt.measure import (
     showing,
     sweep,
 )
-from mitsuba_bdpt.measure.making import Job
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.results import cell_file, errors, image_file, keep_missing, missing_of, write_tables
 from mitsuba_bdpt.measure.scenes import path_tracers
 from mitsuba_bdpt.measure.timing import Timed
+from repository import PROJECT, ROOT
+from support import measured
+from support.measured import new_project
 
-ROOT = Path(__file__).resolve().parents[2]
 PRESET = """
 resolution = 8
 max_depth = 3
@@ -54,22 +55,6 @@ type = "bdpt"
 type = "path"
 match = "seconds"
 """
-
-REPOSITORY = Project(ROOT)
-
-
-def new_project(path):
-    """A project with the scenes of this one and their recipes."""
-    for name in ("presets", "references"):
-        (path / name).mkdir()
-    for name in ("scenes", "presets/benchmark.toml", "references/scenes.toml"):
-        (path / name).symlink_to(ROOT / name)
-    return path
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return new_project(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -92,21 +77,6 @@ def finished(done, folder, known):
     """The words of a sweep of `PRESET` in the project of the test that is over, and its folder."""
     shutil.copytree(done / "out", folder / "out")
     return (preset_file(folder), "-o", folder / "out"), folder / "out"
-
-
-@pytest.fixture
-def project(folder):
-    return Project(folder)
-
-
-@pytest.fixture
-def job(project):
-    """Makes jobs: the reference of a scene, 8 pixels wide, of some depth."""
-
-    def made(max_depth, name="cornell_box", **more):
-        return Job(project, project.scene(name), 8, max_depth, **({"spp": 4} | more))
-
-    return made
 
 
 @pytest.fixture
@@ -328,20 +298,20 @@ def test_rows_follow_a_better_reference(finished, monkeypatch, project, swept):
 )
 def test_mistakes_in_a_preset_are_named(tmp_path, edit, message):
     with pytest.raises(CommandError, match=message):
-        read_preset(preset_file(tmp_path, PRESET.replace(*edit)), REPOSITORY)
+        read_preset(preset_file(tmp_path, PRESET.replace(*edit)), PROJECT)
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "presets").glob("*.toml")), ids=lambda p: p.stem)
 def test_presets_are_read(path):
     named = ["cornell_box"] if path.stem == "public" else None
-    for method in read_preset(path, REPOSITORY, named).cells[0].methods:
+    for method in read_preset(path, PROJECT, named).cells[0].methods:
         mi.load_dict(dict(method.parameters))
 
 
 def test_rivals_are_those_that_see_the_media():
     names = ["cornell_box", "lamp_behind_glass", "fog_lamp", "skin_ball", "cloud_sky"]
     tracers = {"path", "path multijitter", "ptracer"}, {"volpath", "volpathmis"}
-    for cells in read_preset(REPOSITORY.preset("benchmark"), REPOSITORY, names).cells:
+    for cells in read_preset(PROJECT.preset("benchmark"), PROJECT, names).cells:
         has_media, rendered = cells.scene.has_media, {m.name for m in cells.methods}
         assert has_media == (cells.scene.name in ("fog_lamp", "skin_ball", "cloud_sky"))
         assert tracers[has_media] <= rendered and not tracers[not has_media] & rendered
@@ -350,11 +320,11 @@ def test_rivals_are_those_that_see_the_media():
 
 def test_three_lines_are_a_preset(tmp_path):
     text = 'scenes = ["cornell_box", "fog_lamp"]\nspp = [4, 16]\nseeds = 5\n'
-    cells = read_preset(preset_file(tmp_path, text), REPOSITORY).cells
+    cells = read_preset(preset_file(tmp_path, text), PROJECT).cells
     assert [[m.name for m in one.methods] for one in cells] == [["bdpt", "path"], ["bdpt", "volpath"]]
     assert {m.match for one in cells for m in one.methods[1:]} == {"seconds"}
     assert [(one.resolution, one.spp, one.seeds) for one in cells] == [(128, (4, 16), (5, 5))] * 2
-    (one,) = read_preset({"seeds": 3}, REPOSITORY, scenes=["cornell_box"]).cells
+    (one,) = read_preset({"seeds": 3}, PROJECT, scenes=["cornell_box"]).cells
     assert one.scene.name == "cornell_box" and one.spp == (4, 16, 64) and one.seeds == (3, 3, 3)
 
 
@@ -460,29 +430,10 @@ def test_a_time_limit_is_of_everything(tmp_path, monkeypatch):
 
 
 def test_the_table_is_tidy(tmp_path):
-    row = {
-        "scene": "box",
-        "method": "path multijitter",
-        "sampler": "multijitter",
-        "spp": 16,
-        "seed": 1,
-        "parameters": '{"type": "path", "rr_depth": 3}',
-        "decisions": "[]",
-        "statistics": '{"rays": 3}',
-        "versions": '{"mitsuba": "3.9.1"}',
-        "machine": "a",
-        "started": "2026-11-28T15:23:37+00:00",
-        "key": "abc",
-        "budget": 8,
-        "seconds": 1.5,
-        "variance": 0.25,
-        "rel_mse": 0.5,
-        "energy": 0.9,
-        "flip": None,
-        "rays_camera": 7,
-        "tile_means": [1.0, 2.0],
-    }
-    table = pd.DataFrame([row, row | {"seed": 2, "key": "gone"}])
+    values = {"sampler": "multijitter", "spp": 16, "budget": 8, "key": "abc", "rays_camera": 7, "flip": None}
+    values |= {"parameters": '{"type": "path", "rr_depth": 3}', "variance": 0.25, "energy": 0.9}
+    one = measured.row("path multijitter", **values)
+    table = pd.DataFrame([one, one | {"seed": 2, "key": "gone"}])
     stored = image_file(tmp_path, table.iloc[0])
     stored.parent.mkdir()
     stored.write_bytes(b"an image")
@@ -495,7 +446,7 @@ def test_the_table_is_tidy(tmp_path):
     assert first["image"] == stored.name == "box_path-multijitter_8_1_abc.exr" and second["image"] == ""
     (kept, _) = json.loads((tmp_path / "rows.json").read_text())
     assert kept["parameters"] == {"type": "path", "rr_depth": 3}
-    assert set(pyarrow.parquet.read_table(tmp_path / "rows.parquet").column_names) == set(row)
+    assert set(pyarrow.parquet.read_table(tmp_path / "rows.parquet").column_names) == set(one)
     assert not list(tmp_path.rglob(".*"))
 
 
@@ -546,7 +497,7 @@ def test_what_time_does_not_allow_is_cut(folder, monkeypatch):
 
 def test_the_limit_is_shared_by_scenes_that_lack_renders(tmp_path, monkeypatch):
     text = PRESET.replace('["cornell_box"]', '["cornell_box", "pool", "furnace_emission"]')
-    made = sweep.Sweep(read_preset(preset_file(tmp_path, text), REPOSITORY), tmp_path)
+    made = sweep.Sweep(read_preset(preset_file(tmp_path, text), PROJECT), tmp_path)
     clock, shares = [0.0], []
     monkeypatch.setattr(sweep.time, "monotonic", lambda: clock[0])
 
@@ -589,7 +540,7 @@ def test_a_second_run_uses_the_seconds_of_the_first(folder, monkeypatch, known):
 
 def test_seconds_of_larger_budgets_are_extrapolated(tmp_path):
     """At least half of the proportion, for noise."""
-    preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), REPOSITORY)
+    preset = read_preset(preset_file(tmp_path, PRESET.replace("[2, 4]", "[2, 4, 16]")), PROJECT)
     made = sweep.Pending(preset.cells[0], tmp_path)
     for known, budget, expected in (
         ({}, 4, 0),
@@ -648,7 +599,7 @@ def test_the_report_begins_with_what_was_cut(folder, monkeypatch, capsys, known,
 
 
 def keys(folder, text=PRESET):
-    return {cell.key for cell in read_preset(preset_file(folder, text), REPOSITORY).cells[0].planned}
+    return {cell.key for cell in read_preset(preset_file(folder, text), PROJECT).cells[0].planned}
 
 
 def test_cells_are_named_after_all_that_determines_them(tmp_path, monkeypatch):

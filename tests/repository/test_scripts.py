@@ -23,18 +23,9 @@ from mitsuba_bdpt.measure import compare, equal_time
 from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.scenes import depth_of
 from mitsuba_bdpt.measure.timing import Timed
+from support.measured import ROOM
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-
-ROOM = """<scene version="3.0.0">
-    <integrator type="path"><integer name="max_depth" value="3"/></integrator>
-    <sensor type="perspective">
-        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
-            <string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
-    </sensor>
-    <emitter type="constant"/>
-    <shape type="sphere"><point name="center" x="0" y="0" z="3"/></shape>
-</scene>"""
 
 
 @pytest.fixture

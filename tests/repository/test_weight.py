@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2971, "tests": 28093}
+OUTSIDE = {"scripts": 2971, "tests": 27904}
 MOST_WORDS = 29228
 
 

@@ -1,4 +1,4 @@
-"""Rows of sweeps, made by hand."""
+"""Rows of sweeps, made by hand; projects and a scene file to measure."""
 
 import json
 
@@ -6,6 +6,29 @@ import numpy as np
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.figures import RAYS
 from mitsuba_bdpt.measure.results import relative_errors
+from repository import ROOT
+
+ROOM = """<scene version="3.0.0">
+    <integrator type="path"><integer name="max_depth" value="3"/></integrator>
+    <sensor type="perspective">
+        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
+            <string name="pixel_format" value="rgb"/><string name="component_format" value="float32"/>
+            <rfilter type="box"/></film>
+    </sensor>
+    <shape type="sphere"><float name="radius" value="5"/><boolean name="flip_normals" value="true"/></shape>
+    <shape type="sphere"><point name="center" x="0" y="0" z="3"/><float name="radius" value="0.3"/>
+        <emitter type="area"><rgb name="radiance" value="3, 2, 1"/></emitter></shape>
+</scene>"""
+
+
+def new_project(path):
+    """Make a folder a project with the repository's scenes and their recipes."""
+    for name in ("presets", "references"):
+        (path / name).mkdir()
+    for name in ("scenes", "presets/benchmark.toml", "references/scenes.toml"):
+        (path / name).symlink_to(ROOT / name)
+    return path
+
 
 TRUE = np.full(51, 2.0)
 KNOWN = Means.known(np.full((4, 4, 3), 2.0))
