@@ -13,7 +13,7 @@ MOST = {
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1462,
+    "cli": 1463,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,

@@ -76,7 +76,8 @@ class Parser(argparse.ArgumentParser):
         wrong = re.search(r"(?:COMMAND: invalid choice: '|unrecognized arguments: )([^\s'=]*)", message)
         name = wrong[1] if wrong else ""
         parameter = name.lstrip("-").replace("-", "_")
-        if (option := f"--{parameter.replace('_', '-')}") in self.known:
+        option = f"--{parameter.replace('_', '-')}"
+        if option != name and option in self.known:
             question = f"did you mean {option}?"
         elif parameter in PARAMETERS:
             question = f"that is a parameter of the integrator: -P {parameter}=VALUE"
