@@ -73,8 +73,8 @@ def _near(found: Summary) -> str:
 
 def _over_rivals(results: Results, scene: str, **more: str) -> dict[str, Callable[[], Summary]]:
     """Efficiency over each of `Results.standard`."""
-    over, rivals = partial(results.efficiency, scene, **more), results.standard_in(scene) or RIVALS
-    return {f"over {rival}": partial(over, rival) for rival in rivals}
+    over, rivals = partial(results.efficiency, scene, **more), results.present(scene, results.standard)
+    return {f"over {rival}": partial(over, rival) for rival in rivals or RIVALS}
 
 
 def near_one(results: Results, scene: str) -> Measured:

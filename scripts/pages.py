@@ -25,7 +25,7 @@ import repository
 import scale
 import stress
 from mitsuba_bdpt.measure.analysis import Results
-from mitsuba_bdpt.measure.report import Report, efficiency_table, said
+from mitsuba_bdpt.measure.report import Report, efficiency_table, formatted
 from mitsuba_bdpt.measure.tables import markdown
 
 REPORTS = repository.ROOT / "docs" / "reports"
@@ -53,7 +53,8 @@ def gallery(results: Results) -> str:
         return f"{results.against_path(scene)}" + f"<br>{lacks}" * bool(lacks)
 
     cells = [
-        f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{said(figure, scene)}" for scene in results.scenes
+        f"![{scene}]({GALLERY}/{scene}.png)<br>`{scene}`<br>{formatted(figure, scene)}"
+        for scene in results.scenes
     ]
     cells += [""] * (-len(cells) % GALLERY_COLUMNS)
     first, *rows = np.reshape(cells, (-1, GALLERY_COLUMNS)).tolist()

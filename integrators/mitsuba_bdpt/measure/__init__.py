@@ -1,4 +1,4 @@
-"""Measuring: errors, bias and speed of renders, references, sweeps and what they show.
+"""Measuring: errors, bias and speed of renders, references, and sweeps.
 
 Each command that measures is a function here, of the same options under the same names, which takes a scene
 as a dictionary (that of ``mi.load_dict``) where the command takes a file::

@@ -70,10 +70,10 @@ class Sample:
         return Sample(mean, error, a + b - 1, (a * self.nonzero + b * other.nonzero) / (a + b))
 
     @staticmethod
-    def known(mean: ArrayLike, error: ArrayLike = 0.0) -> Sample:
-        """Return values (m,) with known standard errors."""
+    def known(mean: ArrayLike) -> Sample:
+        """Return exact values (m,)."""
         mean = np.asarray(mean, dtype=np.float64)
-        return Sample(mean, np.broadcast_to(error, mean.shape), np.inf, np.ones_like(mean))
+        return Sample(mean, np.zeros_like(mean), np.inf, np.ones_like(mean))
 
 
 class Difference(NamedTuple):
@@ -134,23 +134,23 @@ class BiasCheck:
 
 
 def tile_columns(image: ArrayLike, tiles: int = TILES) -> np.ndarray:
-    """Return the quantities of a bias check, (3 tiles^2 + 3,).
-
-    `tile_means` by row, column and channel, then the mean of the whole image by channel.
-    """
+    """Return `tile_means` and the means of the channels, flat, (3 tiles^2 + 3,)."""
     return np.concatenate([tile_means(image, tiles).ravel(), tile_means(image, 1).ravel()])
 
 
 @dataclass(frozen=True)
 class Means:
-    """Samples of `tile_columns` and of the image's mean over all channels, the input of `compare_means`."""
+    """Samples of `tile_columns` and of the image's mean, for `compare_means`."""
 
     columns: Sample
     whole: Sample
 
     @staticmethod
     def of(columns: ArrayLike, fewest: int = FEWEST_RUNS) -> Means:
-        """Return the means of at least ``fewest`` ``columns`` (renders, 3 tiles^2 + 3), one seed each."""
+        """Return the means of ``columns`` (renders, 3 tiles^2 + 3), one seed each.
+
+        Raises ``CommandError`` for fewer than ``fewest``.
+        """
         values = np.asarray(columns, dtype=np.float64)
         if len(values) < fewest:
             raise CommandError(f"{len(values)} renders are too few for the test; give {fewest} or more.")

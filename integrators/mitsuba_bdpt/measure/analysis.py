@@ -56,10 +56,9 @@ class Unavailable(CommandError):
 def slope(samples: Iterable[float], errors: Iterable[ArrayLike]) -> Estimate:
     """Exponent of error ~ samples^slope; -1 for squared errors of Monte Carlo.
 
-    ``samples`` (n,) counts; ``errors``: for each count the errors of at least 2 independent runs. Least
-    squares of log(error) over log(samples), a point per run. The 95 % interval is the `bootstrap`'s, of runs
-    drawn within each count; their deviations from its mean are multiplied by sqrt(k / (k - 1)), since
-    resampling k values has (k - 1) / k of their variance. Source: B. Efron, R. Tibshirani, An Introduction to
+    ``errors``: of at least 2 independent runs for each of ``samples`` (n,). Least squares of logarithms, with
+    the `bootstrap`'s interval of runs drawn within each count, whose deviations are times sqrt(k / (k - 1)):
+    k resampled values have (k - 1) / k of the variance. Source: B. Efron, R. Tibshirani, An Introduction to
     the Bootstrap, 1993, sections 9 and 13.
     """
     x, y = np.log([*samples]), [np.log(row) for row in errors]
@@ -96,10 +95,9 @@ class Summary:
 
 
 def summary(values: Sequence[float] | pd.Series) -> Summary:
-    """Return the `Summary` of at least two values; the interval is the `bootstrap`'s.
+    """Return the `Summary` of at least two values, with the `bootstrap`'s interval.
 
-    It lies within the range of the n values, which contains the median with probability 1 - 2^(1 - n): 94 %
-    for 5, 99.8 % for 10. Source: as `slope`, section 13.
+    The range of n values contains the median with probability 1 - 2^(1 - n). Source: as `slope`, section 13.
     """
     middle = bootstrap([np.asarray(values)], np.median)
     ends = float(min(values)), float(max(values))
@@ -114,9 +112,7 @@ def _ratios(over: pd.Series, under: pd.Series) -> pd.Series:
     return found
 
 
-def _errors(
-    rows: pd.DataFrame, kind: Error = "rel_mse_trimmed", differs: bool = False
-) -> tuple[pd.Series, Bound]:
+def _errors(rows: pd.DataFrame, kind: Error, differs: bool) -> tuple[pd.Series, Bound]:
     """Return the errors of at least two renders by seed, above 0, and their bound."""
     if len(rows) < 2:
         raise Unavailable(ALONE_HERE)
@@ -155,7 +151,7 @@ class Results:
 
     @cached_property
     def rivals(self) -> list[str]:
-        """Integrators that the first is compared with at equal time, Mitsuba's path tracers first."""
+        """Integrators that the first is compared with, Mitsuba's path tracers first."""
         others = [name for name in self.methods[1:] if name not in self.aside]
         return sorted(others, key=lambda name: name not in (*RIVALS, *MEDIA_RIVALS))
 
@@ -167,18 +163,18 @@ class Results:
 
     @cached_property
     def standard(self) -> list[str]:
-        """`path`, `volpath` and `volpathmis`, by any name; other rivals if none of these was rendered."""
+        """`path`, `volpath` and `volpathmis`, by any name; without them all rivals."""
         tracers = RIVALS[0], *MEDIA_RIVALS
         return [rival for rival in self.rivals if self.kind(rival) in tracers] or self.rivals
 
     def kind(self, method: str) -> str:
-        """Return the type of an integrator; of one without parameters, the first word of its name."""
+        """Return the type of an integrator, by default the first word of its name."""
         rows = self.rows[self.rows["method"] == method]
         has_parameters = "parameters" in rows and len(rows)
         return json.loads(rows["parameters"].iloc[0])["type"] if has_parameters else method.split()[0]
 
     def has_efficiency(self, scenes: Sequence[str]) -> bool:
-        """Return whether the first integrator has an efficiency over a rival in one of the ``scenes``."""
+        """Return whether `efficiency` is available in one of the ``scenes``."""
         for scene, rival in product(scenes, self.rivals):
             with suppress(Unavailable):
                 return bool(self.efficiency(scene, rival))
@@ -187,10 +183,6 @@ class Results:
     def present(self, scene: str, methods: Sequence[str], *budget: int) -> list[str]:
         """Return those of the ``methods`` that were rendered in a scene."""
         return [name for name in methods if len(self.of(scene, name, *budget))]
-
-    def standard_in(self, scene: str) -> list[str]:
-        """Return the `standard` integrators that were rendered in a scene."""
-        return self.present(scene, self.standard)
 
     @cached_property
     def _groups(self) -> dict[Any, pd.DataFrame]:
@@ -204,10 +196,10 @@ class Results:
 
     @cached_property
     def deciding(self) -> int:
-        """The budget of comparisons: ``compared``, or the largest that every scene has, else the largest.
+        """The budget of comparisons: ``compared``, or the largest that all scenes have.
 
         Where a time limit left single renders at some budgets, only budgets with two renders of each
-        integrator count, of those with so many at any budget.
+        integrator count, of those with so many at any budget. Without a common one, the largest.
         """
         every: set[int] = set(self.rows["budget"])
         common = every
@@ -225,7 +217,7 @@ class Results:
         return int(self.compared or max(common))
 
     def bias(self, scene: str, method: str) -> BiasCheck:
-        """Return the bias check at the budget with the most samples of those with enough renders."""
+        """Return the bias check at the budget with most samples and enough renders."""
         rows = self.of(scene, method)
         if scene not in self.references:
             raise Unavailable(FEW if len(rows) else "not rendered")
@@ -237,7 +229,7 @@ class Results:
 
     @cache  # noqa: B019
     def lacks(self, scene: str, method: str) -> str:
-        """Describe the energy that an integrator lacks in a scene; empty if the bias check finds nothing."""
+        """Describe the energy that an integrator lacks; empty if its bias check passes."""
         try:
             check = self.bias(scene, method)
         except Unavailable:
@@ -248,7 +240,10 @@ class Results:
         return "" if check.passed else lacking(check)
 
     def missing(self, scene: str, method: str) -> Estimate:
-        """Return the missing share of the energy, at the deciding budget or the largest of two renders."""
+        """Return the missing share of the energy.
+
+        At the deciding budget, else at the largest with two renders.
+        """
         counts = self.of(scene, method)["budget"].value_counts()
         several = counts.index[counts > 1]
         if not len(several):
@@ -260,7 +255,7 @@ class Results:
 
     @cache  # noqa: B019
     def differs(self, scene: str, method: str, budget: int | None = None) -> bool:
-        """Return whether the mean differs from the reference, by the bias check or at a budget."""
+        """Return whether the mean at a budget differs from the reference."""
         rows, reference = self.of(scene, method, budget or self.deciding), self.references.get(scene)
         if reference is None or rows.empty:
             return False
@@ -276,7 +271,7 @@ class Results:
         return relative_error(rows, error, self.differs(scene, method, budget))
 
     def convergence(self, scene: str, method: str) -> Estimate:
-        """Return the `slope` of the raw error; infinite interval with few renders at a budget."""
+        """Return the `slope` of the raw error, without interval for few renders."""
         rows = self.of(scene, method)
         if rows.empty:
             raise Unavailable("not rendered")
@@ -300,10 +295,10 @@ class Results:
         budget: int | None = None,
         first: str | None = None,
     ) -> Summary:
-        """Return the ratios of efficiencies 1 / (seconds * error), ``first`` over ``rival``, by seed.
+        """Return the ratios of efficiencies 1 / (seconds * error) over ``rival``, by seed.
 
-        At the deciding budget by default. Where both means differ from the reference but not from each other,
-        raw errors are variances: what both lack is no difference between them.
+        Of ``first``, by default the first integrator, at the deciding budget by default. Where both means
+        differ from the reference but not from each other, raw errors are variances.
         """
         first, budget = first or self.methods[0], budget or self.deciding
         ours, theirs = self.of(scene, first, budget), self.of(scene, rival, budget)
@@ -320,8 +315,11 @@ class Results:
     def against_path(
         self, scene: str, error: Error = "rel_mse_trimmed", budget: int | None = None
     ) -> Summary:
-        """Return the smallest efficiency over `standard`, of those that pass the bias check if any does."""
-        rivals = self.standard_in(scene)
+        """Return the smallest efficiency over `standard`.
+
+        Only over those that pass the bias check, if any does.
+        """
+        rivals = self.present(scene, self.standard)
         if not rivals:
             raise Unavailable(f"{' or '.join(self.standard or RIVALS[:1])} was not rendered")
         fair = [rival for rival in rivals if not self.lacks(scene, rival)] or rivals
@@ -329,8 +327,8 @@ class Results:
         return min(found, key=lambda ratio: ratio.median)
 
     def path_lacks(self, scene: str) -> str:
-        """Return the last type of `standard` and the energy it lacks in a scene; empty unless all do."""
-        rivals = self.standard_in(scene)
+        """Describe the energy that all of `standard` lack, by the last; else empty."""
+        rivals = self.present(scene, self.standard)
         found = [self.lacks(scene, rival) for rival in rivals]
         return f"{self.kind(rivals[-1])}: {found[-1]}" if found and all(found) else ""
 

@@ -33,8 +33,6 @@ class SceneDict:
 Scene = str | Path | Mapping[str, Any] | SceneDict
 """A scene's file, its name in PROJECT/scenes, or a dictionary."""
 
-_SCENES = (str, Path, Mapping, SceneDict)
-
 Plugin = str | Mapping[str, Any]
 """An integrator's type, or its parameters as a dictionary; ``sampler`` among them is the sensor's."""
 
@@ -130,14 +128,15 @@ def _measured(scenes: Scene | Sequence[Scene], root: str | Path) -> Iterator[tup
     project, before = Project(Path(available.text_of_path("project", root))), mi.variant()
     mi.set_variant(VARIANT)
     try:
-        yield project, [_file(project, one) for one in ([scenes] if isinstance(scenes, _SCENES) else scenes)]
+        is_one = isinstance(scenes, str | Path | Mapping | SceneDict)
+        yield project, [_file(project, one) for one in ([scenes] if is_one else scenes)]
     finally:
         if before is not None:
             mi.set_variant(before)
 
 
 def _file(project: Project, scene: Scene) -> str:
-    """Return the file or name of a scene; writes a dictionary into PROJECT/dictionaries/NAME.xml."""
+    """Return the file or name of a scene; dictionaries are written into files."""
     import mitsuba as mi
 
     from .scenes import digest

@@ -44,7 +44,7 @@ def measured(
 
 
 def line(first: pd.DataFrame, second: pd.DataFrame) -> dict[str, str]:
-    """Return the ratios of a scene, for errors that are all 0 the reason why there are none."""
+    """Return the ratios of a scene, or that all errors are 0."""
     if not (first["rel_mse_trimmed"].all() and second["rel_mse_trimmed"].all()):
         return {"time": "every value (trimmed) is exactly that of the reference"}
     time = first["seconds"] / second["seconds"]
@@ -98,7 +98,7 @@ def lines(
 
 
 def text(names: Sequence[str], table: pd.DataFrame) -> str:
-    """Return the ``table`` as Markdown, after what its ratios are; ``names``: of both integrators."""
+    """Format the ``table`` as Markdown, with what its ratios are of both ``names``."""
     first, second = names
     return (
         f"Time and errors of {first} divided by those of {second}; "

@@ -1,4 +1,4 @@
-"""Images side by side for print: whole images, magnified windows, false colours of the errors."""
+"""Images for print side by side, with magnified windows and error maps."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Window = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class Shot:
-    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE with its bound."""
+    """A render: integrator, samples per pixel, seconds, image, trimmed relMSE."""
 
     name: str
     spp: int
@@ -50,7 +50,8 @@ class Shot:
 
     @property
     def caption(self) -> str:
-        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {self.error.brief} (trimmed)"
+        error = f"{self.error.bound} {self.rel_mse:.2g}".lstrip()
+        return f"{self.name}\n{self.spp} spp, {self.seconds:.2g} s\nrelMSE {error} (trimmed)"
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def windows(first: np.ndarray, last: np.ndarray) -> list[Window]:
 
 
 def centres(given: Sequence[str] | None) -> list[tuple[float, float]] | None:
-    """Return the centres of two windows, from texts "X,Y" in shares of the image; None: to be chosen."""
+    """Parse the centres of two windows, "X,Y" in shares of the image; None: automatic."""
     if given is None:
         return None
     found: list[tuple[float, float]] = []
@@ -144,7 +145,7 @@ def draw(
 
 
 def _captions(block: Block, wide: float) -> list[str]:
-    """Return the captions, wrapped to the width of an image of a block ``wide`` inches wide."""
+    """Return the captions, wrapped to an image's width in a block of ``wide`` inches."""
     every = [*(re.sub(r"(?<=\d) ", "\u00a0", shot.caption) for shot in block.shots), "reference"]
     most = max(int((wide / len(every) - GAP) / CHARACTER), 8)
     return ["\n".join(textwrap.fill(line, most) for line in caption.split("\n")) for caption in every]

@@ -40,7 +40,7 @@ MATCHED, CLOSE = 3, 0.05  # times that samples are matched at most, and differen
 
 @dataclass(frozen=True)
 class Subject:
-    """Scene, reference image, ``max_depth``, and the error of an image against the reference."""
+    """Scene, reference image, ``max_depth``, and error against the reference."""
 
     scene: Any
     target: np.ndarray

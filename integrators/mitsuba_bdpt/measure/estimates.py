@@ -1,4 +1,4 @@
-"""The relMSE of an integrator at one budget, from the renders of several seeds and a noisy reference.
+"""The relMSE of an integrator, from renders of few seeds and a noisy reference.
 
 The estimators, and when an error is a bound: docs/development/measuring.md, *How errors are estimated*. The
 raw relMSE is the variance (`metrics.spread`) where the mean of the renders agrees with the reference, else
@@ -42,7 +42,7 @@ MATERIAL = 0.05
 
 
 def has_interval(found: Estimate, count: int) -> bool:
-    """Return whether a positive error of ``count`` renders has an interval that says something."""
+    """Return whether a positive error has an interval no wider than `WIDE`."""
     return count >= FEWEST_WITH_INTERVAL and found.high <= WIDE * found.low
 
 
@@ -64,10 +64,11 @@ def with_interval(found: Estimate, count: int, is_positive: bool = True) -> str:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """relMSE of an integrator at one budget: the mean over ``count`` seeds with a 95 % interval.
+    """Mean relMSE of an integrator at one budget, with a 95 % interval.
 
-    ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where the reference is too
-    noisy. ``variance`` and ``squared_bias``: parts of the raw error of two renders or more.
+    Over ``count`` seeds. ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where
+    the reference is too noisy. ``variance`` and ``squared_bias``: parts of the raw error of two renders or
+    more.
     """
 
     total: Estimate
@@ -80,11 +81,6 @@ class RelativeError:
         return f"{self.bound} {with_interval(self.total, self.count)}".lstrip()
 
     @property
-    def brief(self) -> str:
-        """Bound and relMSE with two digits, for captions."""
-        return f"{self.bound} {self.total.value:.2g}".lstrip()
-
-    @property
     def parts(self) -> list[str]:
         """Variance and squared bias, or why there are none."""
         if self.variance is None or self.squared_bias is None:
@@ -94,10 +90,10 @@ class RelativeError:
 
 
 def seed_errors(rows: pd.DataFrame, error: Error, differs: bool) -> tuple[pd.Series, Bound]:
-    """Return an estimate of the relMSE from each row, whose mean is unbiased, and its bound.
+    """Return an estimate of the relMSE from each row, and its bound.
 
-    ``differs``: whether the mean of the renders differs from the reference. If not, raw errors are scaled to
-    the mean of `metrics.spread`, whose own values are not of one seed: each has a part of the others'
+    Their mean is unbiased. ``differs``: whether the mean of the renders differs from the reference. If not,
+    raw errors are scaled to the mean of `metrics.spread`, whose values each have a part of all seeds'
     fireflies.
     """
     measured, own = rows[error], rows[f"reference_{error}"]
@@ -120,7 +116,7 @@ def _has_variance(rows: pd.DataFrame) -> bool:
 
 
 def _is_variance(rows: pd.DataFrame, differs: bool) -> bool:
-    """Return whether the raw relMSE is the variance alone: the mean was tested, and agrees."""
+    """Return whether the raw relMSE is the variance alone: no bias was found."""
     return not differs and len(rows) >= FEWEST_TESTED and _has_variance(rows)
 
 
@@ -144,9 +140,10 @@ def relative_error(rows: pd.DataFrame, error: Error, differs: bool) -> RelativeE
 
 
 def mean_of(values: Sequence[float] | pd.Series) -> Estimate:
-    """Return the mean of positive values with Student's 95 % interval of its logarithm, by the jackknife.
+    """Return the mean of positive values with a 95 % interval.
 
-    From 0 to infinity for a single value; of few values with a long tail too narrow.
+    Student's, of the logarithm, by the jackknife: too narrow for few values with a long tail, from 0 to
+    infinity for a single one.
     """
     given = pd.Series(values)
     without = (given.sum() - given) / (len(given) - 1) if len(given) > 1 else None
@@ -154,7 +151,10 @@ def mean_of(values: Sequence[float] | pd.Series) -> Estimate:
 
 
 def _of_logarithm(value: float, without: pd.Series | None) -> Estimate:
-    """Return Student's interval of the logarithm of ``value``, of the estimates ``without`` each of n."""
+    """Return ``value`` with Student's interval of its logarithm.
+
+    ``without``: the estimates without each of n values.
+    """
     if without is None:
         return Estimate(value, 0.0, math.inf)
     if without.min() <= 0:
@@ -165,23 +165,20 @@ def _of_logarithm(value: float, without: pd.Series | None) -> Estimate:
 
 
 def _half_width(without: pd.Series) -> float:
-    """Half of Student's interval, by the jackknife: of the estimates ``without`` each of n values."""
+    """Return half of Student's interval, of n jackknife estimates."""
     n = len(without)
     return float(stats.t.isf((1 - CONFIDENCE) / 2, n - 1) * math.sqrt(n - 1) * without.std(ddof=0))
 
 
 def bootstrap(samples: Sequence[np.ndarray], statistic: Callable[..., Any]) -> Estimate:
-    """Return a statistic of independent ``samples``, and its 95 % interval: percentiles of resamples."""
+    """Return a statistic of independent ``samples`` with its percentile 95 % interval."""
     how = {"n_resamples": RESAMPLES, "confidence_level": CONFIDENCE, "method": "percentile", "rng": 0}
     low, high = stats.bootstrap(samples, statistic, **how).confidence_interval
     return Estimate(float(statistic(*samples)), float(low), float(high))
 
 
 def variance(rows: pd.DataFrame) -> Estimate:
-    """Return the variance relative to the reference, with an interval over seeds like `mean_of`.
-
-    From 0 to infinity for two renders, whose only difference shows no spread.
-    """
+    """Return the variance relative to the reference, with an interval like `mean_of`."""
     return _of_logarithm(float(rows["variance"].mean()), _variance_without(rows))
 
 
@@ -195,10 +192,10 @@ def _variance_without(rows: pd.DataFrame) -> pd.Series | None:
 
 
 def squared_bias(rows: pd.DataFrame) -> Estimate | None:
-    """Return the squared bias relative to the reference, raw, with a 95 % interval; both may be negative.
+    """Return the raw squared bias relative to the reference, with a 95 % interval.
 
-    None for a single render; infinite interval for two, and where the reference's noise, which all seeds
-    share, is more than `SHARE_OF_BIAS` of the measured error.
+    Both may be negative. None for a single render; infinite interval for two, and where the noise of the
+    reference, which all seeds share, is more than `SHARE_OF_BIAS` of the measured error.
     """
     n = len(rows)
     if n < 2 or not _has_variance(rows):
@@ -240,7 +237,7 @@ def compared(rows: pd.DataFrame, other: Means) -> bool:
 
 
 def bound_of_ratio(over: Bound, under: Bound) -> Bound:
-    """Return the bound of a ratio of two errors with the bounds ``over`` and ``under``."""
+    """Return the bound of a ratio of two errors with these bounds."""
     turned: dict[Bound, Bound] = {"≥": "≤", "≤": "≥"}
     other = turned.get(under, under)
     return "~" if over and other and over != other else over or other

@@ -1,4 +1,4 @@
-"""Figures of a sweep, for print: PDF, SVG or PNG by the file's ending, one or two columns wide.
+"""Figures of a sweep, for print: PDF, SVG or PNG, one or two columns wide.
 
 Text has 7 points at the width of a column of a journal, 8.5 cm, or of its page, 17.8 cm. An integrator has
 its colour and marker in all panels; raw errors are solid, trimmed ones dashed; a hollow marker is a bound.
@@ -44,8 +44,7 @@ RAYS = {
     "shadow_inner": ("visibility, s ≥ 2, t ≥ 2", "#CC79A7", "\\\\"),
 }
 
-PANELS = {1: 2, 2: 4}
-"""Scenes side by side, at most."""
+PANELS = {1: 2, 2: 4}  # scenes side by side at most, by columns of a page
 
 DASHES: dict[Error, object] = {"rel_mse": "-", "rel_mse_trimmed": (0, (3, 1.5))}
 SLOPE = {"color": "black", "linestyle": (0, (1, 2)), "linewidth": 0.8}
@@ -61,10 +60,10 @@ def style(methods: Sequence[str], method: str) -> dict:
 def convergence(
     results: Results, path: Path, columns: int = 2, scenes: Sequence[str] | None = None, against: str = "spp"
 ) -> None:
-    """Plot relMSE over ``against``, "seconds" or "spp", a panel per scene, raw and trimmed.
+    """Plot relMSE over ``against``, "seconds" or "spp": a panel per scene.
 
-    Means over seeds, those of the report's tables, with the 95 % interval of the raw error, and the median of
-    the seconds; the dotted line has slope -1.
+    Means over seeds, raw (with the 95 % interval) and trimmed, over the median of the seconds; the dotted
+    line has slope -1.
     """
     scenes = scenes or results.scenes
     across = min(PANELS[columns], len(scenes)) if len(scenes) > PANELS[1] or columns == 2 else 1
@@ -94,7 +93,7 @@ def _entries(methods: Sequence[str], shown: Sequence[str], before: str = "", **m
 
 
 def _legend(figure, handles: Sequence) -> None:
-    """Put a legend of as many columns as fit under the axes, and make the figure higher by it."""
+    """Put a legend under the axes, as wide as fits; makes the figure higher."""
     width, height = figure.get_size_inches()
     for across in range(len(handles), 0, -1):
         legend = figure.legend(handles=handles, loc="outside lower center", ncols=across, labelspacing=0.3)
@@ -133,7 +132,7 @@ def _curves(axis, results: Results, scene: str, against: str) -> None:
 
 
 def _points(results: Results, scene: str, method: str, against: str, error: Error) -> pd.DataFrame:
-    """Return an integrator's positive errors ``y`` over ``x`` by budget, with interval, if any, and bound."""
+    """Return positive errors ``y`` over ``x`` by budget, with interval and bound."""
     points: list[dict[str, object]] = []
     groups = results.of(scene, method).groupby("budget")
     # Where time was too short for a second render, a single one would look as certain as the others.
@@ -200,7 +199,7 @@ def _name_scenes(axis, scenes: Sequence[str]) -> None:
 
 
 def _dot(axis, results: Results, scene: str, rival: str, error: Error, y: float) -> set[int]:
-    """Plot one efficiency with its interval at the height ``y``; return its number of seeds, if any."""
+    """Plot one efficiency at the height ``y``; return its number of seeds, if any."""
     try:
         ratio = results.efficiency(scene, rival, error)
     except Unavailable:
@@ -247,8 +246,8 @@ PLOTS: dict[str, Callable[[Results, Path, int, Sequence[str]], None]] = {
 }
 """What the command `figure` draws, beside the images of ``crops``."""
 
+# Options that plots lack.
 NOT_FOR = {"windows": tuple(PLOTS), "integrators": ("rays",), "spp": ("samples", "seconds")}
-"""Options that plots lack."""
 
 
 def shots(folder: Path, results: Results, scene: str, methods: Sequence[str]) -> list[crops.Shot]:
@@ -283,7 +282,7 @@ def _check_names(option: str, given: Sequence[str], known: Sequence[str]) -> Non
 
 
 def _among(results: Results, names: Sequence[str] | None) -> Results:
-    """Return the results of the first integrator and of these others; None: all that are compared."""
+    """Return the results of the first and these integrators; None: all compared."""
     methods = results.rows["method"]
     if names is None:
         return replace(results, rows=results.rows[~methods.isin(results.aside)])

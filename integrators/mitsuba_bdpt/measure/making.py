@@ -16,6 +16,7 @@ import math
 import platform
 import time
 from argparse import Namespace
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -103,10 +104,7 @@ class Job:
 
     @property
     def spp_per_render(self) -> int:
-        """Samples per pixel of a render of the whole image where there is time.
-
-        At most `PASS_SPP`; the smallest power of two for which `FEWEST_RUNS` are enough.
-        """
+        """Samples per pixel of a render, by `FEWEST_RUNS`: a power of two to `PASS_SPP`."""
         return min(max(2 ** math.ceil(math.log2(self.samples / FEWEST_RUNS)), LEAST_SPP), PASS_SPP)
 
     @property
@@ -130,14 +128,6 @@ class Job:
             return ""
         return f"the reference at {where} has {spp} of {self.samples} samples per pixel; going on"
 
-    @property
-    def stored(self) -> Reference | None:
-        """The stored reference; None if it is of another scene."""
-        try:
-            return load_reference(self.project, self.scene, self.resolution, self.depth)
-        except ValueError:
-            return None
-
 
 def requested(project: Project, name: str, options: MakeReference | Namespace) -> Job:
     """Return the job of a scene, a file or a name, by the ``options``."""
@@ -147,19 +137,20 @@ def requested(project: Project, name: str, options: MakeReference | Namespace) -
 
 
 def obtained(job: Job) -> Reference:
-    """Return the stored reference; makes or refines it first if it lacks samples (see `Job.lack`).
+    """Return the stored reference; makes or refines it first if it lacks samples.
 
-    That is reported on standard output. It ends at 10 times the samples of the renders, or at the time limit.
+    That is reported on standard output, see `Job.lack`. It ends at 10 times the samples of the renders, or at
+    the time limit.
     """
     job = replace(job, share=SHARE_ON_THE_WAY, by=job.by or header_of(job.path).get("by"))
     check(job)
     if job.lack:
-        print(said(job, *make(job)), flush=True)
+        print(summary(job, *make(job)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
 def check(job: Job) -> Recipe:
-    """Return the recipe; raises ``CommandError``, before rendering, if a reference cannot be made."""
+    """Return the recipe; raises ``CommandError`` if a reference cannot be made."""
     recipe = recipe_of(job.project, job.scene.name)
     if (width := fitted(job.scene, job.resolution)) != job.resolution:
         raise CommandError(f"resolution={job.resolution} of {job.scene.name!r} must be {width}")
@@ -193,9 +184,9 @@ def make(job: Job) -> tuple[Reference, bool]:
 
 
 def fitted(scene: SceneFile, wanted: int) -> int:
-    """Load a scene, and return the nearest width at which it can be measured; prints a message if it differs.
+    """Return the width nearest to ``wanted`` at which a scene can be measured.
 
-    Raises ``CommandError`` if there is none near.
+    Prints a message if it differs. Raises ``CommandError`` if there is none near.
     """
     widths = range(TILES, max(4 * wanted, TILES + 1), TILES)
     fitting = [n for n in widths if scene.size(n)[1] % TILES == 0]
@@ -305,7 +296,7 @@ def _known(job: Job, radiance: Radiance) -> Reference:
 
 
 def _maker(job: Job, recipe: Recipe) -> tuple[mi.Integrator, dict[str, Any]]:
-    """Return what renders a reference, and its parameters, with ``merging_radius``, which is none."""
+    """Return what renders a reference, and its parameters with ``merging_radius``."""
     by = job.by or recipe.by
     tracer = {"type": path_tracers(job.scene.has_media)[0]}
     parameters = {"path": tracer, "bdpt": EVERYTHING, "merging": MERGING}[by] | {"max_depth": job.depth}
@@ -317,14 +308,19 @@ def _maker(job: Job, recipe: Recipe) -> tuple[mi.Integrator, dict[str, Any]]:
 
 
 def _rendered(job: Job, recipe: Recipe) -> tuple[Reference, bool]:
-    """Render and store a reference, or return the better one that is stored; False if time was over first."""
+    """Render and store a reference, or return the better one that is stored.
+
+    With False if time was over first.
+    """
     started = time.perf_counter()
     integrator, parameters = _maker(job, recipe)
     sampler = OF_MEDIA if parameters["type"] == path_tracers(True)[0] else SAMPLER
     made_by = {"integrator": parameters, "sampler": sampler}
     scene = job.scene.load(job.resolution, sampler)
     windows = [Window(job, share, sampler) for share in recipe.windows]
-    halves, stored = Halves(job.scene.name), job.stored
+    halves, stored = Halves(job.scene.name), None
+    with suppress(ValueError):  # there is none, or it is of another scene
+        stored = load_reference(job.project, job.scene, job.resolution, job.depth)
     if stored is not None and made_by.items() <= stored.provenance.items():
         halves.go_on_from(stored, [window.slices for window in windows])
         if halves.is_enough(job):
@@ -381,7 +377,7 @@ def _made(job: Job, halves: Halves, spp: int, made_by: dict[str, Any], is_over: 
 
 
 def _fitting(job: Job, scene, integrator, started: float) -> int:
-    """Return the samples per pixel of renders of which `FEWEST_RUNS` fit into a job's seconds.
+    """Return the samples per pixel of which `FEWEST_RUNS` renders fit into the time.
 
     A power of two, `LEAST_SPP` to ``job.spp_per_render``, or what the sampler makes of it. Prints a warning
     where not even the least fit.
@@ -431,12 +427,12 @@ class Window:
         return halves.rounds > 0 and halves.spp[self.slices].min() < FOCUS_TIMES * halves.spp.min()
 
 
-def said(job: Job, made: Reference, reached: bool) -> str:
+def summary(job: Job, made: Reference, reached: bool) -> str:
     spp = made.provenance.get("spp", "known answer")
     text = f"{job.scene.name}: {spp} spp, own relMSE {made.error:.1e}"
     if reached:
         return text
-    own = job.project, job.project.called(job.scene), job.resolution, job.depth
+    own = job.project, job.scene, job.resolution, job.depth
     short = f"as many as fit into {job.seconds:.3g} s, of {job.samples} to judge {job.spp} spp"
     return f"{text}, {short}; to go on: {make_command(*own, '--spp', str(job.spp))}"
 
@@ -466,5 +462,5 @@ def run(options: Namespace) -> int:
             status = 1
             continue
         status |= not reached
-        print(said(job, made, reached), flush=True)
+        print(summary(job, made, reached), flush=True)
     return int(status)

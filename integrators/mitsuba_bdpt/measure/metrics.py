@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import CommandError
 
-Image = ArrayLike
-"""Floats in linear sRGB of shape (height, width, 3)."""
+Image = ArrayLike  # floats in linear sRGB of shape (height, width, 3)
 
 CONFIDENCE = 0.95  # of intervals
 TRIM = 0.001  # share of the worst values that the trimmed relMSE excludes
@@ -77,7 +76,7 @@ def rel_mse_epsilon(reference: Image) -> float:
 
 
 def relative_errors(image: Image, reference: Image) -> np.ndarray:
-    """Squared relative errors (x - r)^2 / (r^2 + eps), (height, width, 3); eps is `rel_mse_epsilon`."""
+    """Return (x - r)^2 / (r^2 + eps), (height, width, 3); eps: `rel_mse_epsilon`."""
     image, reference = pair_of(image, reference)
     return (image - reference) ** 2 / (reference**2 + rel_mse_epsilon(reference))
 
@@ -99,8 +98,7 @@ def rel_mse(image: Image, reference: Image, trim: float = 0.0) -> float:
 def reference_rel_mse(difference: Image, image: Image, reference: Image, trim: float = 0.0) -> float:
     """Return what the reference's own error adds to `rel_mse`.
 
-    ``difference``: an image of the reference's error, such as half the difference of its halves. Returns its
-    relMSE over the values that the measurement keeps.
+    ``difference``: an image of that error. Returns its relMSE over the values that the measurement keeps.
     """
     kept = _kept(relative_errors(image, reference).ravel(), trim)
     reference = image_of("reference", reference)

@@ -1,4 +1,4 @@
-"""Contents of the TOML files of a project: presets and recipes of references, checked by pydantic."""
+"""Contents of TOML files, presets and recipes, checked by pydantic."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ ModelT = TypeVar("ModelT", bound=Model)
 
 
 def checked(kind: type[ModelT], data: Mapping[str, Any], where: object) -> ModelT:
-    """Return the model of ``data``; raises ``CommandError`` with ``where``, key, value and reason."""
+    """Return the model of ``data``; raises ``CommandError`` with ``where`` and key."""
     try:
         return kind.model_validate(data)
     except ValidationError as error:
@@ -103,7 +103,7 @@ class SceneKeys(Model):
 
 
 class PresetFile(Model):
-    """A preset; by default the package's integrator and Mitsuba's path tracer in equal time.
+    """A preset; by default compares `bdpt` and `path` in equal time.
 
     ``clock``: whose seconds decide. ``scenes``: files, names or patterns; None where the command names them.
     """
@@ -128,7 +128,7 @@ class PresetFile(Model):
         return first.model_copy(update={"match": "spp"}), *others
 
     def depth(self, scene: str, own: int) -> int:
-        """Return the ``max_depth`` of a scene: its table's, else the preset's, else the file's ``own``."""
+        """Return the ``max_depth`` of a scene: its table's, the preset's, or its ``own``."""
         return self.scene.get(scene, SceneKeys()).max_depth or self.max_depth or own
 
     def budgets(self, scene: str) -> tuple[tuple[int, ...], tuple[int, ...]]:

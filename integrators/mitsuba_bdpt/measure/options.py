@@ -76,7 +76,7 @@ SECONDS, WIDTH = Number(float, 0), Number(int, 4, step=4)
 
 
 def option(default: Any, kind: Any, text: str, **declared: Any) -> Any:
-    """Return a field: default (None is valid beside the ``kind``), argparse's type or choices, and help.
+    """Return a field: default, argparse's type or choices, and help.
 
     ``declared``: further arguments for argparse, and ``short``, another name there.
     """
@@ -110,7 +110,7 @@ _columns = partial(
 
 
 def text_of_path(name: str, value: Any) -> str:
-    """Return the ``value`` of an argument as text; raises ``UsageTypeError`` unless it is that or a path."""
+    """Return a ``value`` as text; raises ``UsageTypeError`` unless text or path."""
     if not isinstance(value, str | Path):
         raise UsageTypeError(f"{name}={value!r} must be a text or a path")
     return str(value)
@@ -120,7 +120,7 @@ class Options:
     """Base of all options."""
 
     def __post_init__(self):
-        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` where a text or path is none.
+        """Raise ``CommandError`` for invalid values, ``UsageTypeError`` for no path.
 
         Options of several values accept a single one.
         """

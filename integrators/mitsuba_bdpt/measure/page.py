@@ -30,8 +30,7 @@ from .project import Project
 from .reference import HALF_MAX
 from .report import Report
 
-TITLE = "mitsuba-bdpt: sweep"
-"""How the title of every page begins."""
+TITLE = "mitsuba-bdpt: sweep"  # begins the title of every page
 
 FRAME = Path(__file__).with_suffix(".html")
 
@@ -50,13 +49,13 @@ COLUMNS = {
 
 
 def answers(results: Results) -> dict[str, str]:
-    """Return the efficiencies over scenes' strongest path tracers, by decreasing median, as texts."""
+    """Return efficiencies over the strongest path tracers as texts, best first."""
     found: dict[str, tuple[float, str]] = {}
     for scene in results.scenes:
         lacks = results.path_lacks(scene)
         added = f"; the bias check fails, {lacks}" if lacks else ""
         try:
-            ratio, over = results.against_path(scene), " and ".join(results.standard_in(scene))
+            ratio, over = results.against_path(scene), " and ".join(results.present(scene, results.standard))
         except Unavailable as why:
             found[scene] = -1.0, f"{why}{added}"
         else:

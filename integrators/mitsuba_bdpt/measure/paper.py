@@ -14,9 +14,7 @@ from ..files.images import check_output
 from ..files.whole import replacing
 from .options import FIGURE_FORMATS
 
-WIDTHS = {1: 8.5 / 2.54, 2: 17.8 / 2.54}
-"""Inches, by columns of a page."""
-
+WIDTHS = {1: 8.5 / 2.54, 2: 17.8 / 2.54}  # inches, by columns of a page
 DPI = 200  # of PNG
 PAPER = {
     "font.size": 7,
@@ -39,7 +37,7 @@ PAPER = {
 
 
 def save(figure, path: Path) -> None:
-    """Write a figure in the format of the file's ending, the same bytes for the same figure."""
+    """Write a figure in the file's format; the same figure gives the same bytes."""
     kind = path.suffix[1:].lower()
     none = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,7 +47,7 @@ def save(figure, path: Path) -> None:
 
 
 def check_figure(output: Path) -> None:
-    """Raise ``CommandError`` now if a figure cannot be written, or not in the format of the file's ending."""
+    """Raise ``CommandError`` if a figure cannot be written into this file."""
     if output.suffix.lower() not in FIGURE_FORMATS:
         raise CommandError(f"output={str(output)!r} must end in {', '.join(FIGURE_FORMATS)}")
     check_output(output, output.suffix.lower())

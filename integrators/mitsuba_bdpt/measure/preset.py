@@ -1,4 +1,4 @@
-"""Presets: what a sweep renders, as TOML, or in Python as a dictionary of the same keys.
+"""Presets: what a sweep renders, as TOML or as a dictionary of the same keys.
 
 docs/user/measuring_scenes.md describes the keys, `models.PresetFile` checks them. `Cells` are the renders of
 a scene, each named after all that determines it.
@@ -104,7 +104,10 @@ class Cells:
         self.groups = [self.of(spp, seed) for seed, spp, n in pairs if seed < FIRST_SEED + n]
 
     def of(self, budget: int, seed: int) -> list[Cell]:
-        """Return a cell per integrator, reversed for even seeds: cancels drifts of the machine's speed."""
+        """Return a cell per integrator, reversed for even seeds.
+
+        That cancels drifts of the machine's speed.
+        """
         first = self.methods[0]
         found = [
             Cell(
@@ -135,7 +138,7 @@ class Cells:
         return Job(*self.where, spp=max(self.spp), share=SHARE_ON_THE_WAY)
 
     @cached_property
-    def judge(self) -> tuple[Reference, str]:
+    def reference(self) -> tuple[Reference, str]:
         """The stored reference, and the SHA-256 of its file, computed before reading."""
         path = self.job.path
         sha256 = digest(path) if path.exists() else ""

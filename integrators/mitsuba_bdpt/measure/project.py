@@ -70,9 +70,9 @@ class Project:
         )
 
     def matching(self, name: str) -> list[SceneFile]:
-        """Return the scenes of a pattern like ``rooms/*/scene.xml``, sorted; else `scene` of that name.
+        """Return the scenes of a pattern like ``rooms/*/scene.xml``, or of a name.
 
-        A ``~`` is the home folder. Raises ``CommandError`` if there are none.
+        Sorted. A ``~`` is the home folder. Raises ``CommandError`` if there are none.
         """
         name = str(Path(name).expanduser()) if name.startswith("~") else name
         if not glob.has_magic(name):
@@ -84,10 +84,6 @@ class Project:
             f"scenes={name!r} matches no file; give the paths of XML files, e.g. 'rooms/*/scene.xml'"
         )
 
-    def called(self, scene: SceneFile) -> str:
-        """Return the name by which `scene` finds a scene."""
-        return scene.name if scene.file == self.scenes / f"{scene.name}.xml" else str(scene.file)
-
     def command(self, *words: str | Path) -> str:
         there = [] if self.root == Path() else ["--project", str(self.root)]
         return shlex.join(["mitsuba-bdpt", *map(str, words), *there])
@@ -98,10 +94,7 @@ class Project:
         return self.command("sweep", folder.name if known else "PRESET", "-o", folder)
 
     def depth(self, scene: SceneFile) -> int:
-        """Return the default ``max_depth`` of a scene.
-
-        That of presets/benchmark.toml if it exists, else that of the scene's file.
-        """
+        """Return the ``max_depth`` of a scene by presets/benchmark.toml, else its file's."""
         file = self.root / "presets" / "benchmark.toml"
         data = read_toml(file) if file.is_file() else {}
         return checked(PresetFile, data, file).depth(scene.name, scene.max_depth)

@@ -66,9 +66,9 @@ def render(file: SceneFile, options: Pyramid | Namespace):
 
 
 def panels(images: dict) -> dict:
-    """Return the `technique_images` of two or more edges, None for strategies without contribution.
+    """Return the `technique_images` of two or more edges, None where they are black.
 
-    Raises ``CommandError`` if none contributes.
+    Raises ``CommandError`` if all are.
     """
     found = {key: image if image.any() else None for key, image in images.items() if key[0] >= SHORTEST}
     if all(image is None for image in found.values()):
@@ -80,10 +80,10 @@ def panels(images: dict) -> dict:
 
 
 def draw(found: dict, path: Path, exposure: float, columns: int = 2):
-    """Draw the pyramid: a row per path length k, the strategies s = 0 ... k + 1 from left to right.
+    """Draw the pyramid: a row per path length k, strategies s = 0 ... k + 1.
 
     Rows are centred. Strategies that are impossible or bring no light are empty frames. Rows below the last
-    with light are left out; those without any are not labelled as brightened. As wide as so many ``columns``
+    with light are left out; those without any are not labelled as brightened. ``columns``: width, in columns
     of a page.
     """
     shape = next(image.shape for image in found.values() if image is not None)

@@ -8,7 +8,7 @@ header, with the data of bias checks. `making` makes them.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,12 @@ import numpy as np
 from ..errors import CommandError
 from ..files.images import attribute, read_layers, write_layers
 from .agreement import Means, Sample
-from .metrics import reference_rel_mse, rel_mse
+from .metrics import rel_mse
 from .options import REFERENCE_SECONDS
 from .project import Project
 from .scenes import SceneFile, digest
 
-HALF_MAX = 65504.0
-"""The largest number in half precision."""
-
+HALF_MAX = 65504.0  # the largest number in half precision
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -52,22 +50,17 @@ class Reference:
         made_by = self.provenance["integrator"]
         return not isinstance(made_by, str) and bool(made_by.get("merging"))
 
-    def share_of(self, image: np.ndarray, trim: float) -> float:
-        """Return the share of its own error in ``rel_mse(image, self.image, trim)``."""
-        return reference_rel_mse(self.difference, image, self.image, trim)
-
 
 def reference_path(project: Project, name: str, resolution: int, max_depth: int) -> Path:
     return project.references / f"{name}_{resolution}_{max_depth}.exr"
 
 
-def make_command(project: Project, called: str, resolution: int, max_depth: int, *more: str) -> str:
-    """Return the command line that makes or refines a reference.
-
-    ``called``: the scene's name. ``more``: further options and their values.
-    """
-    size = "--resolution", str(resolution), "--max-depth", str(max_depth)
-    return project.command("reference", called, *size, *more, "--seconds", f"{REFERENCE_SECONDS:g}")
+def make_command(project: Project, scene: SceneFile, resolution: int, max_depth: int, *more: str) -> str:
+    """Return the command that makes or refines a reference; ``more``: options."""
+    known = project.scenes / f"{scene.name}.xml"
+    words = scene.name if scene.file == known else scene.file, "--resolution", str(resolution)
+    words = *words, "--max-depth", str(max_depth), *more, "--seconds", f"{REFERENCE_SECONDS:g}"
+    return project.command("reference", *words)
 
 
 def load_reference(project: Project, scene: SceneFile, resolution: int, max_depth: int) -> Reference:
@@ -76,7 +69,7 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
     Raises ``CommandError``, with the command that makes it, if it is missing or of another scene file.
     """
     path = reference_path(project, scene.name, resolution, max_depth)
-    make = make_command(project, project.called(scene), resolution, max_depth)
+    make = make_command(project, scene, resolution, max_depth)
     if not path.is_file():
         raise CommandError(
             f"no reference for scene={scene.name!r} at {resolution} and depth {max_depth}; {make}"
@@ -93,7 +86,7 @@ def load_reference(project: Project, scene: SceneFile, resolution: int, max_dept
 
 
 def header_of(path: Path) -> dict[str, Any]:
-    """Return the provenance in the header of a reference; empty if the file is missing or no reference."""
+    """Return the provenance of a reference; empty if the file is missing or none."""
     try:
         return json.loads(attribute(path, "provenance") or "{}")
     except ValueError:
@@ -138,14 +131,13 @@ def means_of(kept: Any) -> Means | None:
 
 def kept_of(means: Means | None) -> dict[str, Any] | None:
     """Inverse of `means_of`, for JSON."""
-    if means is None:
-        return None
-    plain = {name: asdict(getattr(means, name)) for name in ("columns", "whole")}
-    for sample in plain.values():
-        for key in ("mean", "error", "nonzero"):
-            sample[key] = [float(f"{x:.9g}") for x in sample[key]]
-        sample["freedom"] = None if np.isinf(sample["freedom"]) else sample["freedom"]
-    return plain
+
+    def plain(of: Sample) -> dict[str, Any]:
+        values = {"mean": of.mean, "error": of.error, "nonzero": of.nonzero}
+        rounded = {key: [float(f"{x:.9g}") for x in found] for key, found in values.items()}
+        return rounded | {"freedom": None if np.isinf(of.freedom) else of.freedom}
+
+    return means and {"columns": plain(means.columns), "whole": plain(means.whole)}
 
 
 def source_digest() -> str:

@@ -40,13 +40,12 @@ from .reference import Reference
 from .results import load, missing_of
 from .tables import markdown, spanned, table
 
-Figure = Callable[[str], object]
-"""A figure of a scene, see `said`."""
+Figure = Callable[[str], object]  # a figure of a scene, see `formatted`
 
 # -- tables -----------------------------------------------------------------------------------
 
 
-def said(figure: Callable[..., object], *given: object) -> str:
+def formatted(figure: Callable[..., object], *given: object) -> str:
     """Call ``figure`` and format what it returns, or the reason why there is none."""
     try:
         return str(figure(*given))
@@ -56,12 +55,12 @@ def said(figure: Callable[..., object], *given: object) -> str:
 
 def by_scene(scenes: Sequence[str], columns: Mapping[str, Figure]) -> str:
     """Return a table of a row per scene; ``columns``: figures by head."""
-    cells = {head: [said(figure, scene) for scene in scenes] for head, figure in columns.items()}
+    cells = {head: [formatted(figure, scene) for scene in scenes] for head, figure in columns.items()}
     return markdown(pd.DataFrame({"scene": [f"`{scene}`" for scene in scenes], **cells}))
 
 
 def efficiency_table(results: Results) -> str:
-    """Efficiency per scene and rival, trimmed and raw, and the energy that rivals lack.
+    """Table of efficiencies per scene and rival, and the energy that rivals lack.
 
     A table per set of rivals: scenes with media have others.
     """
@@ -74,7 +73,7 @@ def efficiency_table(results: Results) -> str:
 
 
 def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Figure]:
-    """Return the columns of the first integrator's efficiencies over the ``rivals`` and everything."""
+    """Return the columns of efficiencies over the ``rivals`` and ``skip=none``."""
     columns: dict[str, Figure] = {
         f"over {rival}, {kind}": partial(results.efficiency, rival=rival, error=error)
         for rival in rivals
@@ -88,7 +87,7 @@ def _efficiencies(results: Results, rivals: Sequence[str]) -> dict[str, Figure]:
 
 
 def _lacking(results: Results, rivals: Sequence[str], scene: str) -> str:
-    """Describe what each of the ``rivals`` lacks in a scene; once where they lack the same."""
+    """Describe what each of the ``rivals`` lacks in a scene, once if it is the same."""
     found = {rival: results.lacks(scene, rival) for rival in rivals}
     several = len(rivals) > 1 and len(set(found.values())) > 1
     texts = [f"{rival}: {text}" if several else text for rival, text in found.items() if text]
@@ -96,7 +95,7 @@ def _lacking(results: Results, rivals: Sequence[str], scene: str) -> str:
 
 
 def errors_table(results: Results) -> str:
-    """Table of relMSE at the deciding budget: a row per scene and integrator, with its bias."""
+    """Table of relMSE and energy at the deciding budget, by scene and integrator."""
     lines: list[dict[str, str]] = []
     for scene in results.scenes:
         for method in results.present(scene, results.methods, results.deciding):
@@ -115,14 +114,14 @@ def errors_table(results: Results) -> str:
                     "variance": variance,
                     "squared bias": squared_bias,
                     "energy": results.lacks(scene, method)
-                    or said(lambda *one: _energy(results.missing(*one)), scene, method),
+                    or formatted(lambda *one: _energy(results.missing(*one)), scene, method),
                 }
             )
     return markdown(pd.DataFrame(lines))
 
 
 def budgets_table(results: Results) -> str:
-    """Efficiency over the strongest of `Results.standard`, by budget; "–" where there is none."""
+    """Table of efficiencies over the strongest of `Results.standard`, by budget."""
 
     def figure(error: Error, budget: int, scene: str) -> str:
         with suppress(Unavailable):
@@ -136,7 +135,7 @@ def budgets_table(results: Results) -> str:
 
 def _first_rival(results: Results, scene: str) -> str:
     """Return the first of `Results.standard` in a scene."""
-    return (results.standard_in(scene) or results.standard or RIVALS)[0]
+    return (results.present(scene, results.standard) or results.standard or RIVALS)[0]
 
 
 def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, str]) -> str:
@@ -150,7 +149,7 @@ def checks_table(results: Results, made: dict[str, Reference], notes: dict[str, 
 
     def over_light_tracer(scene: str) -> str:
         lacks = results.lacks(scene, LIGHT_TRACER)
-        return said(results.efficiency, scene, LIGHT_TRACER) + (f"; {lacks}" if lacks else "")
+        return formatted(results.efficiency, scene, LIGHT_TRACER) + (f"; {lacks}" if lacks else "")
 
     columns: dict[str, tuple[str, Figure]] = {
         f"cost of a sample over {rival}": (ours, partial(costs, ours)),
@@ -181,7 +180,7 @@ def _bias(results: Results, reference: Reference, scene: str) -> str:
         check = results.bias(scene, ours)
     except Unavailable as why:
         reason = str(why)
-        return said(lambda: f"energy {_energy(results.missing(scene, ours))} ({reason}: no verdict)")
+        return formatted(lambda: f"energy {_energy(results.missing(scene, ours))} ({reason}: no verdict)")
     failed = "fails by what `merging` finds" if reference.merged and check.missing.low > 0 else "**failed**"
     verdict = "passed" if check.passed else failed
     return f"{verdict}, p = {check.family_p:.2g}, energy {_energy(check.missing)}"
@@ -202,7 +201,7 @@ DOUBTFUL = 0.3  # share of a reference's own error in an integrator's from which
 
 
 def references_table(results: Results, made: dict[str, Reference]) -> str:
-    """Table of the references, with the largest share of their own error in an integrator's, trimmed."""
+    """Table of the references, with the largest share of their error in another's."""
     found = results.rows[results.rows["budget"] == results.deciding].groupby(["scene", "method"])
     sums = found[["reference_rel_mse_trimmed", "rel_mse_trimmed"]].sum()
     shares = (sums.iloc[:, 0] / sums.iloc[:, 1]).fillna(0).groupby("scene").max()
@@ -229,7 +228,7 @@ def _maker(kept: Reference) -> str:
 
 
 def machine(rows: pd.DataFrame) -> str:
-    """Describe machine and software of the measurements: of most rows, then others with their scenes."""
+    """Describe the machine and software of most rows, then others with their scenes."""
     versions = {
         text: [f"{name} {one}" for name, one in json.loads(text).items()] for text in rows["versions"]
     }
@@ -250,7 +249,7 @@ APART, APART_TIMES = 60.0, 10.0
 
 
 def conditions_table(results: Results) -> str:
-    """Table of unusual conditions of the times, with the scenes; empty if there are none."""
+    """Table of unusual conditions of the times, with scenes; empty without any."""
     found: dict[str, list[str]] = defaultdict(list)
     for scene in results.scenes:
         for condition in _conditions(results, scene):
@@ -260,7 +259,7 @@ def conditions_table(results: Results) -> str:
 
 
 def _conditions(results: Results, scene: str) -> Iterator[str]:
-    """Yield what makes the times of a scene differ from those of a quiet sweep in one run."""
+    """Yield what makes the times of a scene differ from those of a quiet sweep."""
     everything = results.rows[results.rows["scene"] == scene]
     matched = everything.get("equal_time_spp", pd.Series(dtype=float)).dropna().unique()
     for spp in sorted({*matched} - {everything["budget"].max()}):
@@ -286,8 +285,7 @@ def _is_disturbed(rows: pd.DataFrame) -> bool:
     return wall > max(DISTURBED, BUSY * processor)
 
 
-MARK = "Made by `mitsuba-bdpt report`"
-"""What every report has in it."""
+MARK = "Made by `mitsuba-bdpt report`"  # in every report
 
 TEMPLATE = Path(__file__).with_suffix(".md.jinja")
 TABLES = (
@@ -309,7 +307,7 @@ class Report:
 
     @staticmethod
     def of(project: Project, folder: Path, spp: int | None = None) -> Report:
-        """Read a folder; raises ``CommandError`` like `results.load`, or for notes of other scenes."""
+        """Read a folder; raises ``CommandError`` if its files do not fit together."""
         results, made, notes = load(project, folder)
         results = replace(results, compared=spp)
         if unknown := sorted(set(notes) - set(results.scenes)):

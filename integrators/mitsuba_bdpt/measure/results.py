@@ -44,11 +44,11 @@ def image_file(output: Path, render: Any) -> Path:
 def store(output: Path, cells: Cells, cell: Cell, row: dict, image: np.ndarray) -> None:
     """Write image and row of a cell, with errors against the stored reference."""
     write_layers(image_file(output, cell), {"": image}, {"cell": json.dumps(asdict(cell))}, np.float32)
-    write_json(cell_file(output, cell), row | errors(image, *cells.judge, cell.seed == FIRST_SEED))
+    write_json(cell_file(output, cell), row | errors(image, *cells.reference, cell.seed == FIRST_SEED))
 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
-    """Return all error measures of an image; of HDR-FLIP, slower than most renders, only with ``flip``."""
+    """Return all error measures of an image; HDR-FLIP, which is slow, with ``flip``."""
     return relative_errors(image, ref) | {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
@@ -62,11 +62,11 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
 
 
 def relative_errors(image: np.ndarray, ref: Reference) -> dict[str, float]:
-    """Return the relMSE of an image, raw and trimmed, and what the reference's own error adds to each."""
+    """Return the relMSE of an image, raw and trimmed, and the reference's shares."""
     found: dict[str, float] = {}
     for name, trim in (("rel_mse", 0.0), ("rel_mse_trimmed", metrics.TRIM)):
         found[name] = metrics.rel_mse(image, ref.image, trim)
-        found[f"reference_{name}"] = ref.share_of(image, trim)
+        found[f"reference_{name}"] = metrics.reference_rel_mse(ref.difference, image, ref.image, trim)
     return found
 
 
@@ -80,8 +80,8 @@ def rows(cells: Cells, output: Path) -> pd.DataFrame:
         file = cell_file(output, cell)
         if file.exists():
             row = read_cell(file)
-            if row["reference_sha256"] != cells.judge[1]:
-                row |= errors(_image(output, cell), *cells.judge, cell.seed == FIRST_SEED)
+            if row["reference_sha256"] != cells.reference[1]:
+                row |= errors(_image(output, cell), *cells.reference, cell.seed == FIRST_SEED)
                 write_json(file, row)
             found.append(row)
     table = pd.DataFrame(found)
@@ -91,7 +91,7 @@ def rows(cells: Cells, output: Path) -> pd.DataFrame:
 
 
 def _image(output: Path, render: Any) -> np.ndarray:
-    """Read the image of a finished cell, see `image_file`; raises ``CommandError`` if it is missing."""
+    """Read the image of a finished cell; raises ``CommandError`` if it is missing."""
     try:
         (image,), _ = read_layers(image_file(output, render), "")
     except (OSError, CommandError) as error:
@@ -101,7 +101,7 @@ def _image(output: Path, render: Any) -> np.ndarray:
 
 
 def _variances(output: Path, cells: Cells, table: pd.DataFrame) -> pd.Series:
-    """Return `metrics.spread` of each row, over the seeds of its integrator and budget.
+    """Return `metrics.spread` of each row, over seeds.
 
     NaN for fewer than two renders, differing numbers of samples, or missing images.
     """
@@ -111,7 +111,7 @@ def _variances(output: Path, cells: Cells, table: pd.DataFrame) -> pd.Series:
         are_there = all(image_file(output, render).exists() for render in renders)
         if len(group) > 1 and group["spp"].nunique() == 1 and are_there:
             images = [_image(output, render) for render in renders]
-            found[group.index] = metrics.spread(images, cells.judge[0].image)
+            found[group.index] = metrics.spread(images, cells.reference[0].image)
     return found
 
 
@@ -124,7 +124,10 @@ def _stored(folder: Path, remedy: str) -> pd.DataFrame:
 
 
 def beside(table: pd.DataFrame, order: Sequence[str] | None, output: Path) -> pd.DataFrame:
-    """Return ``table`` and stored rows of other scenes, in ``order``; None: as stored, new ones last."""
+    """Return ``table`` and stored rows of other scenes, in ``order``.
+
+    None: as stored, new ones last.
+    """
     if not (output / "rows.parquet").exists():
         return table
     others = _stored(output, "run the sweep without --scenes, which writes it anew")
@@ -135,7 +138,7 @@ def beside(table: pd.DataFrame, order: Sequence[str] | None, output: Path) -> pd
 
 
 def keep_missing(output: Path, scenes: Sequence[str], cut: Mapping[str, str], command: str) -> None:
-    """Write what was cut of the ``scenes``, with the ``command`` that renders it, for the report.
+    """Write what was cut of the ``scenes``, with the ``command`` that renders it.
 
     Entries of other scenes stay.
     """
@@ -163,7 +166,7 @@ COLUMNS = (
 
 
 def write_tables(table: pd.DataFrame, output: Path) -> None:
-    """Write rows.parquet with all columns, rows.csv with a number or a text in each cell, and rows.json.
+    """Write rows.parquet with all columns, rows.csv with plain cells, and rows.json.
 
     rows.json has the parameters, decisions, statistics and versions of each render, in the order of the rows.
     """
@@ -197,7 +200,7 @@ def decided(row: Mapping[str, Any]) -> float:
 
 
 def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Reference], dict[str, str]]:
-    """Return the results in a folder, and the references of its scenes and the notes by scene.
+    """Return the results in a folder, its references and its notes by scene.
 
     Rows have the seconds by which they are compared. The integrators that notes.toml lists as ``aside`` are
     not compared. Raises ``CommandError`` if there are no results, or if errors are against other references

@@ -41,7 +41,7 @@ class SceneFile:
         return hashlib.sha256(b"".join(content)).hexdigest()
 
     def _instantiated(self, sampler: str | None, merges: bool) -> mi.Scene:
-        """Return the scene; with another type of ``sampler`` unless None. ``merges`` meshes of a BSDF."""
+        """Return the scene, with a ``sampler`` unless None; ``merges`` meshes of a BSDF."""
         config = mi.parser.ParserConfig(mi.variant())
         config.parallel, config.merge_meshes = False, merges
         with searching(self.file):
@@ -91,7 +91,7 @@ class SceneFile:
 
     @cached_property
     def _look(self) -> tuple[int, bool, tuple[int, int], int]:
-        """Load the scene once; returns `max_depth`, `has_media`, the film's size and number of channels."""
+        """`max_depth`, `has_media`, the film's size and number of channels."""
         scene = self.load()
         film = choose_sensor(scene, 0).film()
         width, height = map(int, film.size())
@@ -104,10 +104,7 @@ def digest(*paths: Path) -> str:
 
 
 def path_tracers(media: bool) -> tuple[str, ...]:
-    """Return Mitsuba's path tracers for a scene with or without media.
-
-    `path` ignores media; without media the others are slower.
-    """
+    """Return Mitsuba's path tracers for a scene with or without media."""
     return ("volpath", "volpathmis") if media else ("path",)
 
 
@@ -160,7 +157,7 @@ def _widened(size: tuple[int, int], width: int) -> tuple[int, int]:
 
 
 def _resize(scene: mi.Scene, width: int) -> None:
-    """Scale the first sensor's film to a width, however the file sets its size, without crop window."""
+    """Scale the first sensor's film to a width; removes its crop window."""
     old_width, old_height = map(int, choose_sensor(scene, 0).film().size())
     size = list(_widened((old_width, old_height), width))
     changed = mi.traverse(scene.sensors()[0])

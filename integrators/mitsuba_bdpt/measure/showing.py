@@ -47,9 +47,9 @@ EVERY, SHARE = 30.0, 0.02
 
 
 class Renders:
-    """Progress of renders that differ in length, whose ``works`` are in proportion to their seconds.
+    """Progress of renders of differing lengths.
 
-    ``limit``: of the seconds.
+    ``works``: in proportion to their seconds. ``limit``: of the seconds.
     """
 
     def __init__(self, works: Sequence[float], limit: float = math.inf):

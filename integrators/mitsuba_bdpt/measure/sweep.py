@@ -67,7 +67,7 @@ class Bench:
         return timed(self.scene(cell.sampler), self.integrator(cell), spp, seed)
 
     def warm(self, cell: Cell, spp: int) -> float:
-        """Render once, which compiles for ``spp``; returns the seconds of pilots, used again later."""
+        """Render once, which compiles for ``spp``; returns the seconds of pilots."""
         key = cell.method, spp
         if key not in self._pilots:
             self.timed(cell, spp, 0)
@@ -86,9 +86,9 @@ class Bench:
         return self._taken(cell, 2 ** max(round(math.log2(wanted)), 0))
 
     def equal(self, cell: Cell) -> dict[str, float]:
-        """Return the ``samples`` of an integrator in the time of one of the first, and at which ``spp``.
+        """Return the ``samples`` of an integrator in the time of one of the first.
 
-        Measured once, and kept in a file.
+        Measured once, at ``spp``, and kept in a file.
         """
         if cell.method not in self._spp:
             one = next(c for c in self.cells.of(max(self.cells.spp), 0) if c.method == cell.method)
@@ -102,7 +102,7 @@ class Bench:
         return self._spp[cell.method]
 
     def _time_ratio(self, first: Cell, cell: Cell, budget: int) -> float:
-        """Return the seconds of a sample by the ``first`` integrator over those by a cell's."""
+        """Return the seconds of the ``first`` integrator's samples over those of a cell's."""
         sides = [(one, self._taken(one, budget)) for one in (first, cell)]
         for one, spp in sides:
             self.warm(one, spp)
@@ -161,7 +161,7 @@ def measure(bench: Bench, cell: Cell) -> tuple[dict, np.ndarray]:
 
 
 class Pending:
-    """The renders of a scene that are not in ``output``, in the order of seeds, all budgets of each.
+    """The renders of a scene that are not in ``output``, by seeds, then budgets.
 
     Integrators of one budget and seed are rendered together or not at all.
     """
@@ -225,7 +225,7 @@ class Pending:
         return sum(count * self._seconds_of(method, budget) for method, budget, count in renders)
 
     def _seconds_of(self, method: str, budget: int) -> float:
-        """Return the seconds of a render: the last of its budget, else extrapolated; 0 before the first."""
+        """Return the seconds of a render: the last of its budget, else extrapolated."""
         known = self._seconds[method]
         if not known or budget in known:
             return known.get(budget, 0.0)
@@ -256,10 +256,10 @@ class Sweep:
             check(cells.job)
 
     def prepare(self, seconds: float | None = None, limit: float = math.inf) -> None:
-        """Make the references that are missing, or of another version of their scene, before rendering.
+        """Make the references that are missing, or of another version of their scene.
 
-        Each reference takes at most about ``seconds``, by default `REFERENCE_SECONDS`, or equal shares of
-        half the ``limit``. A scene without one is skipped, and recorded in ``failed``.
+        Each takes at most about ``seconds``, by default `REFERENCE_SECONDS`, or equal shares of half the
+        ``limit``. A scene without one is skipped, and recorded in ``failed``.
         """
         if seconds is None:
             lacking = sum(bool(cells.job.lack) for cells in self.scenes)
@@ -333,23 +333,24 @@ class Sweep:
 
 
 def _work(cell: Cell) -> float:
-    """Return what a render takes, in proportion: equal for all integrators at equal time."""
+    """Return the relative duration of a render, equal for all integrators."""
     return float(cell.budget) * cell.resolution**2
 
 
 def poor_reference(cells: Cells, table: pd.DataFrame) -> str:
-    """Return a message about rows that the reference is too noisy for, with the command that refines it."""
+    """Return a message with the command that refines a reference that is too noisy."""
     here = table[table["scene"] == cells.scene.name]
     groups = here.groupby(["method", "budget"], sort=False)
     poor = [key for key, at in groups if seed_errors(at, "rel_mse_trimmed", False)[1]]
     if not poor:
         return ""
-    project, scene, resolution, depth = cells.where
-    make = make_command(project, project.called(scene), resolution, depth, "--spp", str(max(cells.spp)))
+    make = make_command(*cells.where, "--spp", str(max(cells.spp)))
     others = f" and {len(poor) - 1} more" if len(poor) > 1 else ""
     method, budget = poor[-1]
-    text = f"{scene.name}: the reference is too noisy for the renders of {method} at {budget} spp{others}, "
-    return f"{text}whose trimmed errors are upper bounds. To go on: {make}"
+    return (
+        f"{cells.scene.name}: the reference is too noisy for the renders of {method} at {budget} spp"
+        f"{others}, whose trimmed errors are upper bounds. To go on: {make}"
+    )
 
 
 def swept(
@@ -390,11 +391,11 @@ def swept(
         if again and limit < math.inf:
             again += f" --seconds {sweep.wanted}"
         keep_missing(output, [cells.scene.name for cells in whole.cells], sweep.cut, again)
-    _tell(sweep, table)
+    _print_summary(sweep, table)
     return table, sweep.failed
 
 
-def _tell(sweep: Sweep, table: pd.DataFrame) -> None:
+def _print_summary(sweep: Sweep, table: pd.DataFrame) -> None:
     """Print what time did not allow, warnings, and the number of rows."""
     # What was cut comes first: the figures depend on it.
     if sweep.cut:

@@ -19,8 +19,7 @@ class Timed(NamedTuple):
     cpu_seconds: float
 
 
-Render = Callable[[int], Timed]
-"""Renders with a seed."""
+Render = Callable[[int], Timed]  # renders with a seed
 
 
 def timed(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> Timed:
@@ -40,11 +39,11 @@ def alternating(
     *,
     is_warm: bool = False,
 ) -> Iterator[list[Timed]]:
-    """Render with all sides in turn; yields the renders of each round, in the order of the sides.
+    """Render with all sides in turn; yields the renders of each round.
 
-    Seeds are 1 to ``rounds``, after a round of seed 0 that compiles and is not returned, unless everything
-    ``is_warm``. Every other round is in reversed order, which cancels drifts of the machine's speed. Calls
-    ``on_render`` before each render.
+    In the order of the sides. Seeds are 1 to ``rounds``, after a round of seed 0 that compiles and is not
+    returned, unless everything ``is_warm``. Every other round is in reversed order, which cancels drifts of
+    the machine's speed. Calls ``on_render`` before each render.
     """
     for seed in range(int(is_warm), rounds + 1):
         found: dict[int, Timed] = {}
