@@ -3,7 +3,6 @@
 import json
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import goals
 import mitsuba_bdpt  # noqa: F401  (chooses the LLVM; must come before mitsuba)
@@ -22,9 +21,8 @@ from mitsuba_bdpt.measure.reference import Reference
 from mitsuba_bdpt.measure.report import Report
 from mitsuba_bdpt.measure.results import load
 from mitsuba_bdpt.measure.scenes import digest
+from repository import ROOT
 from support.measured import KNOWN, TRUE, row
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def runs(method, count, **values):

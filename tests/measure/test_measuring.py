@@ -6,7 +6,6 @@ import re
 import shlex
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -20,8 +19,7 @@ from mitsuba_bdpt.measure import equal_time, making, reference, sweep, timing
 from mitsuba_bdpt.measure.preset import read_preset
 from mitsuba_bdpt.measure.project import Project
 from mitsuba_bdpt.measure.scenes import SceneFile
-
-ROOT = Path(__file__).resolve().parents[2]
+from repository import ROOT
 
 # A child of a shape that no render takes.
 REFUSED = f"""<medium type="homogeneous" name="interior"><volume type="gridvolume" name="sigma_t">

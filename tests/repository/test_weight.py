@@ -9,7 +9,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5098,
+    "measure": 5095,
     "transport merging guided_emission": 5718,
     "planning": 1731,
     "emitters": 2209,
@@ -24,7 +24,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2972, "tests": 27904}
+OUTSIDE = {"scripts": 2972, "tests": 27900}
 MOST_WORDS = 29228
 
 

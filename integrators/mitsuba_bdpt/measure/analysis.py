@@ -45,8 +45,7 @@ NONE = "bdpt skip=none"
 INDEPENDENT = "bdpt points=independent"
 LIGHT_TRACER = "ptracer"
 
-ALONE_HERE = "fewer than two renders: seeds = 2 or more"
-"""Why there is no figure, with the preset's key that mends it."""
+ALONE_HERE = "fewer than two renders: seeds = 2 or more"  # with the preset's key that mends it
 
 
 class Unavailable(CommandError):

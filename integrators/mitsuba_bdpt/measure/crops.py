@@ -29,8 +29,7 @@ GAP, LINE, CHARACTER = 0.03, 0.105, 0.052  # inches between images, per line of 
 SCALE = 0.48  # inches of the scale of errors
 SMALL = 6  # points
 
-Window = tuple[int, int, int]
-"""Left, top, side in pixels."""
+Window = tuple[int, int, int]  # left, top, side in pixels
 
 
 @dataclass(frozen=True)

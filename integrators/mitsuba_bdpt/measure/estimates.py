@@ -64,11 +64,10 @@ def with_interval(found: Estimate, count: int, is_positive: bool = True) -> str:
 
 @dataclass(frozen=True)
 class RelativeError:
-    """Mean relMSE of an integrator at one budget, with a 95 % interval.
+    """relMSE of an integrator at one budget: mean over ``count`` seeds.
 
-    Over ``count`` seeds. ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where
-    the reference is too noisy. ``variance`` and ``squared_bias``: parts of the raw error of two renders or
-    more.
+    ``bound``: "≥" where the mean of the renders differs from the reference, "≤" where the reference is too
+    noisy. ``variance`` and ``squared_bias``: parts of the raw error of two renders or more.
     """
 
     total: Estimate
