@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2972, "tests": 27905}
-MOST_WORDS = 29228
+MOST_WORDS = 29259
 
 
 def _lines(files):
