@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2972, "tests": 27905}
-MOST_WORDS = 29259
+MOST_WORDS = 29273
 
 
 def _lines(files):
