@@ -28,7 +28,7 @@ import numpy as np
 import repository
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
-from mitsuba_bdpt.measure.results import relative_errors
+from mitsuba_bdpt.measure.results import rel_mse_columns
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import ratio, table
 from mitsuba_bdpt.measure.timing import Timed, alternating, timed
@@ -59,7 +59,7 @@ def subject(name: str) -> tuple[dict, int]:
 
 def row(name: str, reference, method: str, found: list[Timed]) -> dict:
     """What the renders of one method do in a scene."""
-    errors = [relative_errors(one.image, reference) for one in found]
+    errors = [rel_mse_columns(one.image, reference) for one in found]
     judged = None
     if reference.means is not None:
         means = Means.of([tile_columns(one.image) for one in found])

@@ -11,7 +11,7 @@ from mitsuba_bdpt.errors import FailureError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.measure import api, estimates, sweep
 from mitsuba_bdpt.measure.reference import read_reference
-from mitsuba_bdpt.measure.results import relative_errors
+from mitsuba_bdpt.measure.results import rel_mse_columns
 
 PRESET = """
 resolution = 8
@@ -86,7 +86,7 @@ def test_measurements_take_dictionaries(here):
     path, bdpt = measure.compare_at_equal_time(named, spp=4, **common)
     assert (path.name, bdpt.name, bdpt.spp) == ("path", "bdpt", 4) and bdpt.image.shape == (4, 8, 3)
     kept = read_reference(Path("project/references/mine_8_3.exr"))
-    row = pd.DataFrame([relative_errors(bdpt.image, kept)])
+    row = pd.DataFrame([rel_mse_columns(bdpt.image, kept)])
     error = estimates.relative_error(row, "rel_mse_trimmed", False)
     assert bdpt.error == error and f"{error.total.value:.2g} (trimmed)" in bdpt.caption
     images = measure.render_pyramid(named, spp=1, max_depth=2, **common)

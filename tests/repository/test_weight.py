@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2972, "tests": 27905}
-MOST_WORDS = 29273
+OUTSIDE = {"scripts": 2972, "tests": 27911}
+MOST_WORDS = 29272
 
 
 def _lines(files):

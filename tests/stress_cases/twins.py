@@ -34,7 +34,7 @@ def decided(statistics) -> list[dict]:
 
 
 def compare_with_twin(make, bad, parameters, spp=SPP, count=None) -> None:
-    """Assert that ``make(bad)`` renders as ``make(0.0)`` does, and warns once of what is not finite.
+    """Assert that ``make(bad)`` renders as ``make(0.0)`` does, and warns once of non-finite values.
 
     It counts ``count`` values (some, if None), the twin none. A pilot decides where there are `PILOTED`
     samples, and finds the same mean; the twin renders by its decision, in which rays that are traced for the

@@ -5,7 +5,7 @@ import json
 import numpy as np
 from mitsuba_bdpt.measure.agreement import Means, tile_columns
 from mitsuba_bdpt.measure.figures import RAYS
-from mitsuba_bdpt.measure.results import relative_errors
+from mitsuba_bdpt.measure.results import rel_mse_columns
 from repository import ROOT
 
 ROOM = """<scene version="3.0.0">
@@ -69,4 +69,4 @@ def row(method="bdpt", seed=1, **values):
 def judged(method, seed, image, reference, **values):
     """The row of an image with its errors against a reference."""
     means = {"tile_means": tile_columns(image).tolist(), "mean": float(image.mean())}
-    return row(method, seed, **relative_errors(image, reference), **means, **values)
+    return row(method, seed, **rel_mse_columns(image, reference), **means, **values)

@@ -21,7 +21,7 @@ from .making import Job, fitted, obtained
 from .options import VARIANT, Compare
 from .project import Project
 from .reference import Reference
-from .results import relative_errors
+from .results import rel_mse_columns
 from .scenes import check_plugins, integrator_of, samples_taken
 from .showing import steps
 from .tables import described, markdown
@@ -39,7 +39,7 @@ def measured(
     for turn in alternating(sides, rounds, on_render):
         for rows, one in zip(found, turn, strict=True):
             times = {"seconds": one.seconds, "cpu_seconds": one.cpu_seconds}
-            rows.append(times | relative_errors(one.image, target))
+            rows.append(times | rel_mse_columns(one.image, target))
     return [pd.DataFrame(rows) for rows in found]
 
 

@@ -29,7 +29,7 @@ from .metrics import TRIM, rel_mse
 from .options import RESOLUTION, VARIANT, EqualTime
 from .paper import check_figure
 from .project import Project
-from .results import relative_errors
+from .results import rel_mse_columns
 from .scenes import SceneFile, depth_of, integrator_of, path_tracers, samples_taken
 from .showing import steps
 from .timing import alternating, timed
@@ -57,7 +57,7 @@ def subject(project: Project, file: SceneFile, options: EqualTime | Namespace) -
         scene = file.load(job.resolution, options.sampler)
 
         def error(image: np.ndarray) -> RelativeError:
-            row = pd.DataFrame([relative_errors(image, kept)])
+            row = pd.DataFrame([rel_mse_columns(image, kept)])
             return relative_error(row, "rel_mse_trimmed", differs=False)
 
         return Subject(scene, kept.image, job.depth, error)

@@ -49,7 +49,7 @@ def store(output: Path, cells: Cells, cell: Cell, row: dict, image: np.ndarray) 
 
 def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
     """Return all error measures of an image; HDR-FLIP, which is slow, with ``flip``."""
-    return relative_errors(image, ref) | {
+    return rel_mse_columns(image, ref) | {
         "reference_sha256": ref_sha256,
         "width": image.shape[1],
         "height": image.shape[0],
@@ -61,8 +61,8 @@ def errors(image, ref: Reference, ref_sha256: str, flip: bool) -> dict:
     }
 
 
-def relative_errors(image: np.ndarray, ref: Reference) -> dict[str, float]:
-    """Return the relMSE of an image, raw and trimmed, and the reference's shares."""
+def rel_mse_columns(image: np.ndarray, ref: Reference) -> dict[str, float]:
+    """Return a row's relMSE, raw and trimmed, and the reference's shares of both."""
     found: dict[str, float] = {}
     for name, trim in (("rel_mse", 0.0), ("rel_mse_trimmed", metrics.TRIM)):
         found[name] = metrics.rel_mse(image, ref.image, trim)
