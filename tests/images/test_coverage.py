@@ -106,14 +106,26 @@ WITH_SENSORS = (("sphere", "directional"), ("spot", "envmap"))
 QUICK = {(e, s) for i, s in enumerate(parts.SENSORS) for e in WITH_SENSORS[i % 2]}
 
 
-def pairs(slow=lambda emitter, sensor: True):
-    """Parameters of a test for all pairs, those for which ``slow`` holds marked so."""
-    return [pytest.param(*p, marks=[pytest.mark.slow] * slow(*p), id=" + ".join(p)) for p in PAIRS]
+# One emitter of each plugin; of those that take part in the same strategies the first.
+PLUGINS = {parts.plugin_of(make()): name for name, make in reversed(parts.EMITTERS.items())}
+DISTINCT = {part: PLUGINS[plugin] for plugin, part in parts.EMITTER_PARTS.items()}.values()
 
 
-@pytest.mark.parametrize(
-    ("emitter", "sensor"), pairs(lambda e, s: not (s == "perspective" or (e, s) in QUICK))
-)
+def pairs(quick, slow):
+    """Parameters of a test: the ``quick`` pairs, and those for which ``slow`` holds, marked so."""
+    chosen = [(p, quick(*p)) for p in PAIRS if quick(*p) or slow(*p)]
+    return [pytest.param(*p, marks=[pytest.mark.slow] * (not now), id=" + ".join(p)) for p, now in chosen]
+
+
+def is_quick(emitter, sensor):
+    return sensor == "perspective" or (emitter, sensor) in QUICK
+
+
+def in_turns(emitter, sensor):
+    return (list(parts.EMITTERS).index(emitter) + list(parts.SENSORS).index(sensor)) % 2
+
+
+@pytest.mark.parametrize(("emitter", "sensor"), pairs(is_quick, lambda e, s: e in DISTINCT))
 def test_pair(emitter, sensor):
     """The image is `path`'s, known to 1 %; the weighted layers add up to it (1e-4 of its mean: other orders
     of sums); for k = 1, 2, 3 every strategy that takes part by `scene_parts` has the mean of the first, all
@@ -160,9 +172,9 @@ def strategies(images, method, emitter, sensor):
     return found
 
 
-@pytest.mark.parametrize(("emitter", "sensor"), pairs())
+@pytest.mark.parametrize(("emitter", "sensor"), pairs(lambda e, s: False, in_turns))
 def test_pair_with_defaults(emitter, sensor):
-    """The default choice of what to skip, one connection, roulette."""
+    """The default choice of what to skip, one connection, roulette; every second pair."""
     ours = tiles(renders(parts.pair(emitter, sensor), bdpt(skip="auto"), 2 * SAMPLES, 0))
     other = parts.pair(emitter, sensor, reference=True)
     with evaluated_mode(emitter == "timed_sunsky"):
@@ -173,11 +185,6 @@ def test_pair_with_defaults(emitter, sensor):
 # -- what is left out -------------------------------------------------------------------------
 
 CLASSES = {"s=0": (0, 3), "s=1": (1, 2), "t=1": (2, 1), "t=0": (3, 0), "inner": (2, 2), "(1,1)": (1, 1)}
-
-
-# One emitter of each plugin; in every run one of those that take part in the same.
-PLUGINS = {parts.plugin_of(make()): name for name, make in reversed(parts.EMITTERS.items())}
-DISTINCT = {part: PLUGINS[plugin] for plugin, part in parts.EMITTER_PARTS.items()}.values()
 
 
 @pytest.mark.parametrize("sensor", parts.SENSORS)

@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2972, "tests": 27911}
-MOST_WORDS = 29272
+MOST_WORDS = 29276
 
 
 def _lines(files):
