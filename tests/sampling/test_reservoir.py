@@ -3,6 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from mitsuba_bdpt.sampling.reservoir import offer
 
 SIZES = (0.0, 1.0, 0.0, 2.0, 5.0, 0.0)
@@ -24,6 +25,22 @@ def test_candidates_are_drawn_in_proportion_to_their_size():
         if size:
             shares = np.histogram(drawn, 16, (0, 1))[0] / len(drawn)
             np.testing.assert_allclose(shares, 1 / 16, atol=1e-3)
+
+
+@pytest.mark.parametrize("unit", [2.0**-120, 2.0**-99, 2.0**100])
+def test_draws_do_not_depend_on_the_unit(unit):
+    """Rationale: products with faint sizes underflowed, numbers became 0, and the last candidate was drawn:
+    4e-4 of a room's light was missing. Expected: the same to the bit, also after fainter candidates."""
+    count = 1 << 12
+    for first in (1.0, 2.0**-24):
+        found = []
+        for scale in (1.0, unit):
+            u, total, taken = (dr.arange(mi.Float, count) + 0.5) / count, mi.Float(0), []
+            for size in (first, *SIZES):
+                total, take, u = offer(total, mi.Float(size * scale), u)
+                taken += [np.array(mi.Bool(take) & dr.full(mi.Bool, True, count)), np.array(u)]
+            found.append(taken)
+        np.testing.assert_array_equal(*found)
 
 
 def test_nothing_is_drawn_of_nothing():

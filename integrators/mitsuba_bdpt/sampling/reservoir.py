@@ -8,6 +8,9 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+# Sum of sizes below which its products with random numbers, of 24 bits, may underflow; a power of two.
+FAINT = 2.0**-96
+
 
 def offer(total: mi.Float, size: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Bool, mi.Float]:
     """Offer a candidate of this ``size`` after others that sum to ``total``.
@@ -16,7 +19,9 @@ def offer(total: mi.Float, size: mi.Float, u: mi.Float) -> tuple[mi.Float, mi.Bo
     rescaled by that decision to be uniform again: u / share or (u - share) / (1 - share).
     """
     before, total = total, total + size
-    u_total = u * total
-    take = u_total < size
-    rest = dr.select(take, u_total, u_total - size) / dr.select(take, size, before)
+    # Products with u are exact to the last bit in every unit of the sizes.
+    scale = dr.select(total < FAINT, 1 / FAINT, 1)
+    u_total, scaled = u * (total * scale), size * scale
+    take = u_total < scaled
+    rest = dr.select(take, u_total, u_total - scaled) / dr.select(take, scaled, before * scale)
     return total, take, dr.select(total > 0, rest, u)
