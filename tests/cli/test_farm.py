@@ -4,11 +4,13 @@ import errno
 import json
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
@@ -21,6 +23,8 @@ from mitsuba_bdpt import workers
 from mitsuba_bdpt.cli import checkpoints, render
 from mitsuba_bdpt.cli.arguments import build_parser, main
 from mitsuba_bdpt.cli.mistakes import TERMINATED
+from mitsuba_bdpt.files import images
+from mitsuba_bdpt.host import signals
 from mitsuba_bdpt.measure.scenes import SceneFile
 from mitsuba_bdpt.run.snapshot import read
 
@@ -314,6 +318,34 @@ def test_an_image_that_cannot_be_written_leaves_the_checkpoint(monkeypatch, caps
     assert Path("a.checkpoint.npz").exists()
     assert main([*arguments, "--resume"]) == 0
     assert rendered.image("a.exr", "RGB")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+
+
+@pytest.mark.parametrize("error", [OSError(28, "a full disk"), RuntimeError("[Bitmap] a full disk")])
+def test_a_png_that_cannot_be_written_does_not_cost_the_exr(monkeypatch, capsys, error):
+    """Expected: one line that names both, the status of a failure; the checkpoint has served."""
+
+    def failed(*arguments):
+        raise error
+
+    monkeypatch.setattr(images, "write_png", failed)
+    assert main([*SMALL, "--spp", "8", "-o", "a.exr", "--checkpoint", "0"]) == 1
+    (said,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert "'a.png' could not be written: " in said and said.endswith("a full disk; the image is 'a.exr'")
+    assert rendered.image("a.exr", "RGB")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
+
+
+def test_a_signal_is_answered_while_a_call_runs(monkeypatch):
+    """Rationale: handlers of Python run after a call of Mitsuba's, and Ctrl-C waited for a pass without a
+    word. Expected: a thread answers while this one takes no signal."""
+    reader, writer = os.pipe()
+    monkeypatch.setattr(signals, "_say", lambda text: os.write(writer, text.encode()))
+    before = signal.signal(signal.SIGINT, lambda number, frame: None)
+    try:
+        with signals.announced("stopping"):
+            threading.Timer(0, os.kill, (os.getpid(), signal.SIGINT)).start()
+            assert select.select([reader], [], [], 60)[0] and os.read(reader, 8) == b"stopping"
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_nobody_listens_any_more():

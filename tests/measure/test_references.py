@@ -176,6 +176,20 @@ def test_a_reference_on_the_way_has_a_tenth_of_the_samples(job, renders):
     assert making.make(job(2, spp=64, by="bdpt", seconds=1e5))[0].provenance["spp"] >= 6400
 
 
+def test_a_reference_on_the_way_is_looked_at_once(monkeypatch, job, renders):
+    """Rationale: its header was read four times, and write access tested twice. Expected: read before and
+    after the integrator that made it is known; tested once."""
+    calls = []
+    for name in ("header_of", "check_writable"):
+        real = getattr(making, name)
+        monkeypatch.setattr(making, name, lambda path, n=name, real=real: [calls.append(n), real(path)][1])
+    making.obtained(job(2, spp=8, by="bdpt", seconds=1e5))
+    assert calls.count("header_of") <= 2 and calls.count("check_writable") == 1
+    calls.clear()
+    making.obtained(job(2, spp=8, by="bdpt", seconds=1e5))
+    assert calls.count("header_of") <= 2 and "check_writable" not in calls
+
+
 def test_a_better_reference_stays(project, job):
     made, _ = making.make(job(2))
     other = replace(made, provenance=made.provenance | {"sampler": "another"})

@@ -85,7 +85,7 @@ def versions() -> Iterator[Finding]:
             if package == llvm.WHEEL:  # for one platform only; `llvm_library` reports whether it is needed
                 yield Finding("note", package, "not installed")
             else:
-                remedy = f"mend it with: python -m pip install {package}"
+                remedy = f"install it with: python -m pip install {package}"
                 yield Finding("FAIL", package, f"not installed; {remedy}")
 
 

@@ -37,6 +37,8 @@ UNLIMITED_SPP = 1 << 16
 PASS_SPP = 16
 """Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
 
+STOPPING = "interrupted; stopping after this pass"
+
 
 @dataclass
 class Outcome:
@@ -115,13 +117,15 @@ def finish(film: mi.Film, integrator: mi.Integrator, options: Namespace, outcome
         return False
     pairs = {name: dict(getattr(options, name)) for name in ("defines", "properties")}
     settings, found = plain(vars(options) | {"spp": spp} | pairs), report(outcome)
-    write(film, options, {"bdptSettings": json.dumps(settings), STATISTICS: json.dumps(found)})
+    no_png = write(film, options, {"bdptSettings": json.dumps(settings), STATISTICS: json.dumps(found)})
     if options.statistics is not None:
         write_json(options.statistics, {"settings": settings} | found)
     outcome.written()
     print_line(summary(options, outcome, film, integrator.settings if is_ours(integrator) else None, spp))
     if outcome.error is not None:
         raise outcome.error
+    if no_png:
+        raise FailureError(no_png)
     return not outcome.interrupted
 
 
@@ -140,10 +144,13 @@ def is_open_ended(options: Namespace) -> bool:
     return not options.spp and (options.time is not None or options.target_error is not None)
 
 
-def write(film: mi.Film, options: Namespace, attributes: Mapping[str, str]) -> None:
-    """Write the image; where that fails into a temporary folder, which the error names."""
+def write(film: mi.Film, options: Namespace, attributes: Mapping[str, str]) -> str:
+    """Write the image; where that fails into a temporary folder, which the error names.
+
+    Returns why there is no PNG, see `write_images`.
+    """
     try:
-        write_images(film, options.output, attributes, options.exposure)
+        return write_images(film, options.output, attributes, options.exposure)
     except OSError as error:
         error.filename = error.filename or str(options.output)
         rescued = Path(tempfile.mkdtemp(prefix="mitsuba-bdpt-")) / options.output.name
@@ -260,8 +267,9 @@ def render_here(scene, integrator, options: Namespace, spp: int, watchers: list)
     with closing(display(options.progress, limit, is_open_ended(options))) as shown:
         integrator.on_pass = partial(_call_all, [*watchers, shown])
         try:
-            integrator.render(scene, options.sensor, options.seed, spp, develop=False, start=start)
-            dr.sync_thread()
+            with signals.announced(STOPPING):
+                integrator.render(scene, options.sensor, options.seed, spp, develop=False, start=start)
+                dr.sync_thread()
         except KeyboardInterrupt:
             interrupted = True
         finally:
@@ -296,8 +304,9 @@ def render_foreign(scene, integrator, options: Namespace, spp: int) -> Outcome:
         try:
             while done < spp and (done == 0 or time.perf_counter() - started < limit):
                 size, seed = min(size, spp - done), options.seed + done // PASS_SPP
-                integrator.render(scene, options.sensor, seed, size)
-                dr.sync_thread()
+                with signals.announced(STOPPING):
+                    integrator.render(scene, options.sensor, seed, size)
+                    dr.sync_thread()
                 if limit is not None:
                     # Raw sums include their weights, so passes of any size add up.
                     total = total + size * np.array(film.develop(raw=True), dtype=np.float64)

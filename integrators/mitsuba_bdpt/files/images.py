@@ -49,10 +49,19 @@ def header_of(path: Path) -> dict[str, Any]:
         return {}
 
 
-def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> None:
-    """Write the film as an EXR with header `attributes`, and as a PNG beside it."""
+def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exposure: float) -> str:
+    """Write the film as an EXR with header `attributes`, and as a PNG beside it.
+
+    Returns why there is no PNG; empty if there is one. Errors of the EXR are raised.
+    """
     _write_exr(output, _channels(film), dict(attributes))
-    write_png(film, film.bitmap(), output.with_suffix(".png"), exposure)
+    png = output.with_suffix(".png")
+    try:
+        write_png(film, film.bitmap(), png, exposure)
+    except (OSError, RuntimeError) as error:  # Mitsuba's for an image that is too large for a PNG
+        why = getattr(error, "strerror", None) or error
+        return f"{str(png)!r} could not be written: {why}; the image is {str(output)!r}"
+    return ""
 
 
 def _channels(film: mi.Film) -> dict[str, np.ndarray]:

@@ -111,14 +111,19 @@ class Job:
     def path(self) -> Path:
         return reference_path(self.project, self.scene.name, self.resolution, self.depth)
 
+    @cached_property
+    def header(self) -> dict[str, Any]:
+        """Provenance of the stored reference, before this job."""
+        return header_of(self.path)
+
     @property
     def lack(self) -> str:
-        """Why the reference has to be made or refined; empty if it need not.
+        """Why the reference has to be made or refined before this job; empty if it need not.
 
         Of this version of the scene it is enough with its samples, or if a time limit ended it when as many
         were wanted.
         """
-        header, where = header_of(self.path), f"{self.resolution} and depth {self.depth}"
+        header, where = self.header, f"{self.resolution} and depth {self.depth}"
         if header.get("scene_sha256", self.scene_sha256) != self.scene_sha256:
             return f"the scene has changed since its reference at {where} was made; making one anew"
         if not self.path.is_file():
@@ -142,20 +147,22 @@ def obtained(job: Job) -> Reference:
     That is reported on standard output, see `Job.lack`. It ends at 10 times the samples of the renders, or at
     the time limit.
     """
-    job = replace(job, share=SHARE_ON_THE_WAY, by=job.by or header_of(job.path).get("by"))
-    check(job)
+    job = replace(job, share=SHARE_ON_THE_WAY, by=job.by or job.header.get("by"))
     if job.lack:
         print(summary(job, *make(job)), flush=True)
     return load_reference(job.project, job.scene, job.resolution, job.depth)
 
 
-def check(job: Job) -> Recipe:
-    """Return the recipe; raises ``CommandError`` if a reference cannot be made."""
+def check(job: Job, writes: bool = False) -> Recipe:
+    """Return the recipe; raises ``CommandError`` if a reference cannot be made.
+
+    ``writes``: it is also rewritten if it lacks nothing.
+    """
     recipe = recipe_of(job.project, job.scene.name)
     if (width := fitted(job.scene, job.resolution)) != job.resolution:
         raise CommandError(f"resolution={job.resolution} of {job.scene.name!r} must be {width}")
     try:
-        if job.lack:
+        if writes or job.lack:
             job.path.parent.mkdir(parents=True, exist_ok=True)
             check_writable(job.path)
     except OSError as error:
@@ -172,8 +179,7 @@ def make(job: Job) -> tuple[Reference, bool]:
     Returns it, and whether it has enough. A reference cut short by time does not replace a better one of
     the same light and version of the scene.
     """
-    recipe = check(job)
-    check_writable(job.path)
+    recipe = check(job, writes=True)
     if recipe.radiance is not None:
         reference = _known(job, recipe.radiance)
         write(job.path, reference)

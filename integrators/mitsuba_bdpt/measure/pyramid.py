@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 import mitsuba as mi
 import numpy as np
 
-from ..errors import CommandError
+from ..errors import CommandError, FailureError
 from ..files.images import check_channels, check_output, write_images
 from ..files.loading import choose_sensor
 from .metrics import tone_map
@@ -133,7 +133,8 @@ def pictured(
         check_figure(path)
     film, images = render(file, options)
     shown = {kind: panels(images[kind]) for kind in KINDS}
-    write_images(film, image, {"heuristic": options.heuristic}, options.exposure)
+    if why := write_images(film, image, {"heuristic": options.heuristic}, options.exposure):
+        raise FailureError(why)
     for kind, path in pictures.items():
         draw(shown[kind], path, options.exposure, options.columns)
     return pictures, images

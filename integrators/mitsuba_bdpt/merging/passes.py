@@ -16,7 +16,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import Footprints, after
+from .radius import Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 # Camera samples of a pass per photon subpath (experiments, "Which paths are merged").
@@ -67,7 +67,7 @@ class Passes:
         # Densities decide where the light of an even sky is merged.
         self._aim = replace(aim, no_sky=False)
         self._radius, self._pixels = settings.internals.merging_radius, pixels
-        self._uncropped = max(pixels, math.prod(sensor.film().size()))  # photons do not know the crop window
+        self._uncropped = max(pixels, film_pixels(sensor))
 
     def trace(
         self, kernel: TraceContext, points: Points, samples: int, done: int, start: mi.Float | None

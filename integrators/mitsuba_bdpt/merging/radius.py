@@ -32,6 +32,11 @@ def after(radius: float, samples: int) -> float:
     return radius * (samples / _OF_SAMPLES) ** ((SHRINKING - 1) / 2)
 
 
+def film_pixels(sensor: mi.Sensor) -> int:
+    """Number of pixels of the whole film: photons do not know the crop window."""
+    return math.prod(sensor.film().size())
+
+
 # Most change of the radius per distance, which the widths of cells allow for (`merging.cell_at`).
 _STEEPEST = 0.5
 

@@ -26,7 +26,7 @@ from ..transport.walk import Side, Vertex, Walk, random_walk
 from .merging import Merging, Sample
 from .merging import sample as draw
 from .passes import sort
-from .radius import Footprints
+from .radius import Footprints, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 # Merging radius in distances between camera samples (of a set of wavelengths) on the film.
@@ -95,7 +95,7 @@ def estimate(
     if mi.is_spectral:
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
     footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
-    of_samples = RADIUS * math.sqrt(math.prod(kernel.camera.sensor.film().size()) * sets / count)
+    of_samples = RADIUS * math.sqrt(film_pixels(kernel.camera.sensor) * sets / count)
     discs = footprints.radius(of_samples if footprints.measured else 1.0)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths)
