@@ -11,7 +11,7 @@ SCENES := $(basename $(notdir $(wildcard scenes/*.xml)))
 	planted-bugs scale
 
 render: $(INSTALLED)
-	$(VENV)/bin/python scripts/render.py scenes/veach_bidir.xml -o renders/veach_bidir.exr
+	$(VENV)/bin/mitsuba-bdpt render scenes/veach_bidir.xml -o renders/veach_bidir.exr
 
 # Two processes, since much of a test is compiling kernels, on one core.
 PYTEST := $(VENV)/bin/python -m pytest -n 2 --dist worksteal
@@ -39,16 +39,16 @@ costs: $(INSTALLED)
 
 # The images of the README and of docs/reports/figures.md.
 gallery: $(INSTALLED)
-	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
-	$(VENV)/bin/python scripts/render.py scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
+	$(VENV)/bin/mitsuba-bdpt render scenes/lamp_behind_glass.xml -o renders/lamp_behind_glass.exr
+	$(VENV)/bin/mitsuba-bdpt render scenes/lamp_behind_glass.xml --integrator path -o renders/lamp_behind_glass_path.exr
 	mkdir -p docs/images/gallery
 	cp renders/lamp_behind_glass.png renders/lamp_behind_glass_path.png docs/images
 	for scene in $(SCENES); do \
-		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
+		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
 	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
-		$(VENV)/bin/python scripts/render.py scenes/$$scene.xml -o renders/gallery/$$scene.exr \
+		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
 
@@ -91,15 +91,14 @@ package: $(INSTALLED)
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check build twine
 	$(VENV)/bin/python -m build
 	$(VENV)/bin/python -m twine check --strict dist/*
-	$(VENV)/bin/python scripts/check_package.py dist
 	$(PYTHON) -m venv build/try
 	build/try/bin/python -m pip install --quiet --disable-pip-version-check dist/*.whl
-	cd build/try && bin/python -m mitsuba_bdpt doctor
+	cd build/try && bin/mitsuba-bdpt doctor
 
 # A small sweep of time against error, under ten minutes on two cores; goes on where it was stopped.
 sweep: $(INSTALLED)
-	$(VENV)/bin/python scripts/sweep.py presets/small.toml -o results/small
-	$(VENV)/bin/python scripts/report.py results/small
+	$(VENV)/bin/mitsuba-bdpt sweep presets/small.toml -o results/small
+	$(VENV)/bin/mitsuba-bdpt report results/small
 	$(VENV)/bin/mitsuba-bdpt page results/small
 
 # Attempts to break the renderer, twenty minutes on two cores, and their record: docs/reports/stress.json.
@@ -122,10 +121,10 @@ references: $(INSTALLED)
 
 # The data and plots of docs/reports/benchmark, about an hour, best on a quiet machine; goes on where it was stopped.
 benchmark: $(INSTALLED)
-	-$(VENV)/bin/python scripts/sweep.py presets/benchmark.toml -o results/benchmark
-	$(VENV)/bin/python scripts/floor.py --record results/benchmark/probes.json
-	$(VENV)/bin/python scripts/report.py results/benchmark
-	cp $(addprefix results/benchmark/,rows.parquet probes.json *.png) docs/reports/benchmark
+	-$(VENV)/bin/mitsuba-bdpt sweep presets/benchmark.toml -o results/benchmark
+	$(VENV)/bin/python scripts/floor.py -o results/benchmark/floor.json
+	$(VENV)/bin/mitsuba-bdpt report results/benchmark
+	cp $(addprefix results/benchmark/,rows.parquet floor.json *.png) docs/reports/benchmark
 	$(VENV)/bin/mitsuba-bdpt figure docs/reports/benchmark --plot efficiency --integrators "path multijitter" volpathmis \
 		-o docs/images/efficiency.png
 

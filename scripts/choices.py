@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -37,12 +36,12 @@ from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
 from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning.choice import Prediction
 from mitsuba_bdpt.planning.configuration import CANDIDATES, Configuration, Decision
 from mitsuba_bdpt.run import rendering
 
 import mitsuba as mi  # isort: skip
-import drjit as dr  # isort: skip
 
 SPP, SEEDS, PILOT_SEEDS = 64, 8, 16
 REFERENCE_SPP, REFERENCE_SEED, FIRST_SEED = 4096, 1_000_000, 1000
@@ -71,11 +70,8 @@ def loaded(name: str):
 
 def measured(scene, integrator, seed: int, expected) -> np.ndarray:
     """Processor seconds of a render, and its raw and trimmed error."""
-    dr.sync_thread()
-    started = time.process_time()
-    image = np.array(integrator.render(scene, seed=seed, spp=SPP))[..., :3]
-    seconds = time.process_time() - started
-    return np.array([seconds, rel_mse(image, expected), rel_mse(image, expected, TRIM)])
+    found = timed(scene, integrator, SPP, seed)
+    return np.array([found.cpu_seconds, *(rel_mse(found.image, expected, trim) for trim in (0.0, TRIM))])
 
 
 def product(rows, seeds=slice(None)) -> np.ndarray:

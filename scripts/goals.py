@@ -8,9 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import repository
+from mitsuba_bdpt.files.texts import read_toml
 from mitsuba_bdpt.measure.analysis import (
     MEDIA_RIVALS,
     NONE,
@@ -30,6 +32,8 @@ IMPOSSIBLE = "bdpt skip=impossible"
 ALONE = "bdpt light_paths=0"
 UNAIMED = "bdpt guiding=photons"
 MERGING = "bdpt merging"
+
+FLOOR = repository.ROOT / "docs" / "reports" / "benchmark" / "floor.json"
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,11 @@ def over_path(results: Results, scene: str, error: Error = "rel_mse_trimmed") ->
     """Efficiency over the strongest path tracer without bias; else over the strongest, and what it lacks."""
     lacks, found = results.path_lacks(scene), results.against_path(scene, error)
     return Measured(f"{found}" + f"; {lacks}" * bool(lacks), [found.median])
+
+
+def over_path_raw(results: Results, scene: str) -> Measured:
+    """`over_path` by the raw error."""
+    return over_path(results, scene, "rel_mse")
 
 
 def _near(found: Summary) -> str:
@@ -156,49 +165,24 @@ def pilot(results: Results, scene: str) -> Measured:
     return Measured(text, [shares[max(shares)]])
 
 
-PROBES = repository.ROOT / "docs" / "reports" / "benchmark" / "probes.json"
-
-
-def probed(results: Results, name: str) -> dict[str, list[float]]:
-    """Return the results of a probe for the software of the rows."""
-    probe, row = json.loads(PROBES.read_text()).get(name, {}), results.rows.iloc[0]
-    if probe.get("versions") != json.loads(row["versions"]) | {"machine": row["machine"]}:
-        raise Unavailable("not measured of this version on this machine")
-    return probe["values"]
-
-
 def floor(results: Results) -> Measured:
-    """Kernel time over that of its rays alone."""
-    found = {name: summary(v) for name, v in probed(results, "floor").items()}
+    """Kernel time over that of its rays alone, of the software of the rows."""
+    record, row = json.loads(FLOOR.read_text()), results.rows.iloc[0]
+    if record["versions"] != json.loads(row["versions"]) | {"machine": row["machine"]}:
+        raise Unavailable("not measured of this version on this machine")
+    found = {name: summary(values) for name, values in record["values"].items()}
     text = ", ".join(f"{one} `{name}`" for name, one in found.items())
     return Measured(text, [one.median for one in found.values()])
 
 
-def coldstart(results: Results) -> Measured:
-    """Seconds of a process to the first image, also over `path`'s."""
-    values = probed(results, "coldstart")
-    ratios = summary(np.divide(values["bdpt"], values["path"]))
-    seconds = float(np.median(values["bdpt"]))
-    return Measured(f"{seconds:.2f} s, {ratios} `path`'s", [seconds, ratios.median])
-
-
-def memory(results: Results) -> Measured:
-    """Peak memory of a process in GiB."""
-    found = {name: float(np.median(v)) for name, v in probed(results, "memory").items()}
-    return Measured(", ".join(f"{v:.2f} GiB for {name}" for name, v in found.items()), [*found.values()])
-
-
 @dataclass(frozen=True)
 class Goal:
-    """``what`` must reach ``bounds``: one for all numbers of ``measure``, or one for each.
-
-    ``text``: how the table writes the bounds; ``aim``: what more is worth; ``scenes``: given to ``measure``.
-    """
+    """``what`` must reach ``bounds``; fields as in goals.toml."""
 
     what: str
-    bounds: tuple[float, ...]
+    bounds: Sequence[float]
     measure: Callable[..., Measured]
-    scenes: tuple[str, ...] = ()
+    scenes: Sequence[str] = ()
     aim: str = "–"
     text: str = "{:g}x"
     at_most: bool = False
@@ -218,96 +202,12 @@ class Goal:
         return [self.what, bound, self.aim, found.text, met]
 
 
-def _over_path(least: float, scene: str, what: str | None = None, aim: str = "–", raw: bool = False) -> Goal:
-    measure = partial(over_path, error="rel_mse") if raw else over_path
-    return Goal(what or f"… `{scene}`", (least,), measure, (scene,), aim)
+def _read(measure: str, what: str | None = None, **row) -> Goal:
+    """A goal of goals.toml."""
+    return Goal(what or f"… `{row['scenes'][0]}`", measure=globals()[measure], **row)
 
 
-_NOTHING = ", nothing to gain"
-_END = "{:g}x, lower end of the interval"
-GOALS = (
-    _over_path(
-        2,
-        "cornell_box",
-        "efficiency over the stronger `path`, `cornell_box`, depth 6, 64 spp, trimmed",
-        "2.2x",
-    ),
-    _over_path(30, "uplight_room", aim="40x"),
-    _over_path(50, "veach_bidir", "… `veach_bidir`, depth 7", "100x"),
-    _over_path(200, "glass_caustics", aim="300x"),
-    _over_path(30, "glass_caustics", "… `glass_caustics`, raw", raw=True),
-    _over_path(100, "rough_glass_caustics", "… `rough_glass_caustics` (alpha 0.005), raw", raw=True),
-    Goal("… the same with `merging`", (200,), merged, ("rough_glass_caustics",)),
-    _over_path(60, "frosted_glass_caustics", "… `frosted_glass_caustics` (alpha 0.02), raw", raw=True),
-    Goal("… the same with `merging`", (80,), merged, ("frosted_glass_caustics",)),
-    _over_path(2.3, "ajar_door", aim="4x"),
-    _over_path(2, "many_lights", aim="4x"),
-    _over_path(2.2, "window_room", aim="3x"),
-    Goal(f"… `open_sky`{_NOTHING}", (0.96,), near_one, ("open_sky",), "1.0x", _END),
-    Goal(f"… `veach_mis`{_NOTHING}", (0.96,), near_one, ("veach_mis",), "1.0x", _END),
-    Goal("guided emission over `guiding=photons`, `pool`, 64 spp, trimmed", (2.3,), unaimed, ("pool",), "3x"),
-    Goal("… `ring_caustic`", (2.3,), unaimed, ("ring_caustic",), "3x"),
-    Goal("… `smallvcm_cornell_sun`", (1.7,), unaimed, ("smallvcm_cornell_sun",), "2.2x"),
-    _over_path(
-        100,
-        "fog_beam",
-        "efficiency over the stronger of `volpath` and `volpathmis`, `fog_beam`, 64 spp, trimmed",
-        "300x",
-    ),
-    _over_path(80, "fog_beam_thick", aim="250x"),
-    _over_path(120, "fog_caustic", aim="350x"),
-    _over_path(80, "fog_lamp_in_glass", aim="250x"),
-    _over_path(6, "fog_lamp", aim="15x"),
-    _over_path(2, "cloudy_ball", aim="3x"),
-    _over_path(2, "glass_slab", aim="5x"),
-    _over_path(0.97, "skin_ball", f"… `skin_ball`{_NOTHING} by light subpaths", "1.3x"),
-    _over_path(0.97, "cloud_sky", f"… `cloud_sky`{_NOTHING} by light subpaths", "1.1x"),
-    Goal("worst scene of all", (0.98,), worst, aim="1.0x"),
-    Goal(
-        "path tracing alone (`light_paths=0`) over `path` with multijitter, `cornell_box`",
-        (1.0,),
-        alone,
-        ("cornell_box",),
-        "1.2x",
-        "{:.1f}x",
-    ),
-    Goal("default over `skip=none`, geometric mean over all scenes", (3,), against_none, aim="4x"),
-    Goal(
-        "cost of a sample over `path`'s, `cornell_box`, depth 6: `skip=none` / `skip=impossible`",
-        (3.0, 1.8),
-        costs,
-        ("cornell_box",),
-        "2.5x / 1.3x",
-        "{}x / {}x",
-        at_most=True,
-    ),
-    Goal("kernel time over the floor (the rays alone, replayed)", (1.35,), floor, aim="1.2x", at_most=True),
-    Goal(
-        "pilot and decisions, share of a render at 256 spp, `cornell_box`",
-        (2,),
-        pilot,
-        ("cornell_box",),
-        "1 %",
-        "{} %",
-        at_most=True,
-    ),
-    Goal(
-        "peak memory of a process, 1920x1080, depth 8",
-        (1.5,),
-        memory,
-        aim="0.8 GiB",
-        text="{} GiB",
-        at_most=True,
-    ),
-    Goal(
-        "cold start to the first image, `cornell_box`",
-        (2.5, 4),
-        coldstart,
-        aim="2x `path`'s",
-        text="{} s and {}x `path`'s",
-        at_most=True,
-    ),
-)
+GOALS = [_read(**row) for row in read_toml(Path(__file__).with_suffix(".toml"))["goals"]]
 
 
 def goals_table(results: Results) -> str:

@@ -4,12 +4,9 @@ Every mesh is computed from the few numbers below and written as a small binary 
 rounded to 1e-5, so that the files come out the same, byte for byte, on every machine.
 """
 
-from pathlib import Path
-
 import command_line
 import numpy as np
 
-FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "meshes"
 DECIMALS = 5
 
 # The egg of veach_bidir: (height, radius), measured on B. Bitterli's re-model (CC0).
@@ -278,20 +275,11 @@ MESHES = {
 }
 
 
-def make_all(folder=FOLDER):
+def make_all(folder):
     """Writes every mesh of MESHES into `folder`."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     for name, make in MESHES.items():
         write_ply(folder / f"{name}.ply", *make())
 
 
-def main(arguments=None):
-    """Makes them in the folder that the command line names."""
-    parser = command_line.parser(__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
-    make_all(parser.parse_args(arguments).folder)
-
-
 if __name__ == "__main__":
-    main()
+    command_line.make(__doc__, "meshes", make_all)

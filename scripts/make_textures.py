@@ -4,13 +4,9 @@ Environment maps as Mitsuba reads them: rows from the zenith (+y) to the nadir, 
 way of +x, +z and -x back to -z. Slides from the top. Half floats in EXR.
 """
 
-from pathlib import Path
-
 import command_line
 import numpy as np
 import OpenEXR
-
-FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "textures"
 
 # The sky of window_room, 256 columns: the sun covers 4 texels. Radiances are linear RGB.
 SKY_SIZE = (128, 256)
@@ -77,22 +73,13 @@ def planks():
 TEXTURES = {"sky_with_sun": sky_with_sun, "slide": slide, "planks": planks}
 
 
-def make_all(folder=FOLDER):
+def make_all(folder):
     """Writes every texture of TEXTURES into `folder`."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     for name, make in TEXTURES.items():
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         with OpenEXR.File(header, {"RGB": make().astype(np.float16)}) as file:
             file.write(str(folder / f"{name}.exr"))
 
 
-def main(arguments=None):
-    """Makes them in the folder that the command line names."""
-    parser = command_line.parser(__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
-    make_all(parser.parse_args(arguments).folder)
-
-
 if __name__ == "__main__":
-    main()
+    command_line.make(__doc__, "textures", make_all)

@@ -4,12 +4,9 @@ Grids as Mitsuba's `gridvolume` reads them: 32-bit floats, x fastest, then y, th
 """
 
 import struct
-from pathlib import Path
 
 import command_line
 import numpy as np
-
-FOLDER = Path(__file__).resolve().parents[1] / "scenes" / "volumes"
 
 # The cloud of cloud_sky: cells along x, y and z; balls whose union it is.
 CLOUD_SIZE = (24, 12, 24)
@@ -36,10 +33,8 @@ def cloud():
 VOLUMES = {"cloud": cloud}
 
 
-def make_all(folder=FOLDER):
+def make_all(folder):
     """Writes every volume of VOLUMES into `folder`."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     for name, make in VOLUMES.items():
         grid = make().astype("<f4")
         nz, ny, nx = grid.shape
@@ -48,12 +43,5 @@ def make_all(folder=FOLDER):
         (folder / f"{name}.vol").write_bytes(header + grid.tobytes())
 
 
-def main(arguments=None):
-    """Makes them in the folder that the command line names."""
-    parser = command_line.parser(__doc__)
-    parser.add_argument("folder", type=Path, nargs="?", default=FOLDER, help="default: %(default)s")
-    make_all(parser.parse_args(arguments).folder)
-
-
 if __name__ == "__main__":
-    main()
+    command_line.make(__doc__, "volumes", make_all)

@@ -17,31 +17,7 @@ import repository
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.measure.options import WHOLE
 
-TABLE = """<scene version="3.0.0">
-<sensor type="perspective"><float name="fov" value="32"/>
-<transform name="to_world"><lookat origin="0, 2.6, 5" target="0, 0.45, 0" up="0, 1, 0"/></transform>
-<film type="hdrfilm"><integer name="width" value="480"/><integer name="height" value="300"/>
-<string name="component_format" value="float32"/></film></sensor>
-<shape type="rectangle"><transform name="to_world"><scale value="6"/><rotate x="1" angle="-90"/></transform>
-<bsdf type="pplastic"><rgb name="diffuse_reflectance" value="0.25, 0.16, 0.1"/>
-<float name="alpha" value="0.08"/></bsdf>
-</shape>
-<shape type="rectangle"><transform name="to_world"><scale value="6"/><translate value="0, 0, -4"/></transform>
-<bsdf type="diffuse"><rgb name="reflectance" value="0.4"/></bsdf></shape>
-<shape type="sphere"><point name="center" value="-0.95, 0.5, 0"/><float name="radius" value="0.5"/>
-<bsdf type="dielectric"/></shape>
-<shape type="sphere"><point name="center" value="0.2, 0.5, -0.4"/><float name="radius" value="0.5"/>
-<bsdf type="roughconductor"><string name="material" value="Au"/><float name="alpha" value="0.1"/></bsdf>
-</shape>
-<shape type="sphere"><point name="center" value="1.2, 0.4, 0.2"/><float name="radius" value="0.4"/>
-<bsdf type="pplastic"><rgb name="diffuse_reflectance" value="0.1, 0.25, 0.5"/></bsdf></shape>
-<shape type="sphere"><point name="center" value="-2.6, 3.4, -0.6"/><float name="radius" value="0.25"/>
-<bsdf type="diffuse"><rgb name="reflectance" value="0"/></bsdf>
-<emitter type="area"><rgb name="radiance" value="40"/></emitter></shape>
-<shape type="rectangle"><transform name="to_world"><scale value="1.6"/>
-<lookat origin="0, 4, -3" target="0, 0.4, 0" up="0, 1, 0"/></transform>
-<emitter type="area"><rgb name="radiance" value="1.2"/></emitter></shape>
-</scene>"""
+TABLE = Path(__file__).with_suffix(".xml")
 
 
 def pictures(folder: Path, spp: int) -> None:
@@ -53,7 +29,7 @@ def pictures(folder: Path, spp: int) -> None:
 
     mi.set_variant("llvm_ad_spectral_polarized")
     method = mi.load_dict({"type": "bdpt", "max_depth": 8, "layers": "stokes"})
-    image = np.array(method.render(mi.load_string(TABLE, parallel=False), spp=spp, seed=0))
+    image = np.array(method.render(mi.load_file(str(TABLE), parallel=False), spp=spp, seed=0))
     shown = np.clip(image[..., :3], 0, None)
     exposed = np.clip(shown / np.quantile(shown, 0.97), 0, 1) ** (1 / 2.2)
     s0, s1, s2 = (image[..., -12 + 3 * i : -9 + 3 * i].mean(-1) for i in range(3))

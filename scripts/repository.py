@@ -1,6 +1,6 @@
 """This repository as a project to measure in, and its scenes as the benchmark renders them.
 
-Puts the folder tests on the path, for `stress_cases` and `instruments`.
+Puts the folders tests and tests/support on the path, for `stress_cases`, `instruments` and `scenes`.
 """
 
 from __future__ import annotations
@@ -8,25 +8,16 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from mitsuba_bdpt.cli.arguments import main
 from mitsuba_bdpt.files.texts import read_toml
 from mitsuba_bdpt.measure import reference
 from mitsuba_bdpt.measure.options import RESOLUTION  # noqa: F401 (for the scripts)
 from mitsuba_bdpt.measure.project import Project
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "tests"))
+sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "support")]
 
 PROJECT = Project(ROOT)
 SCENES = PROJECT.scenes
-
-
-def verb(name: str) -> int:
-    """The exit status of ``python -m mitsuba_bdpt NAME`` with this process's arguments.
-
-    In this repository, unless they say otherwise.
-    """
-    return main([name, "--project", str(ROOT), *sys.argv[1:]])
 
 
 def scene_file(name: str) -> Path:

@@ -3,7 +3,6 @@
     python scripts/scale.py                          # all rows; writes docs/reports/scale.json
     python scripts/scale.py lamps film               # rows of these kinds, printed
     python scripts/scale.py lamps --sizes 300 1000
-    python scripts/scale.py --list
 
 A row is a kind of object (lamps, materials, ...; or pixels, samples, edits, film filters) and a size: how
 many there are, or which. It has a process of its own with an empty kernel cache, which has rendered something
@@ -43,6 +42,8 @@ from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.tables import ratio, table
 
+import scenes
+
 import drjit as dr  # isort: skip
 import mitsuba as mi  # isort: skip
 
@@ -62,34 +63,15 @@ ROUNDS_OF_NOISE, SECONDS_OF_NOISE = 10, 20.0
 """Of the warm renders of one pixel: the least rounds that show its noise, and how long they may take."""
 
 
-def view(width: int = 64, rfilter: str = "box") -> dict:
-    """A sensor above the ground, of ``width``^2 pixels."""
-    film = {"type": "hdrfilm", "width": width, "height": width, "rfilter": {"type": rfilter}}
-    place = mi.ScalarTransform4f().look_at(origin=[0, 6, 9], target=[0, 0, 0], up=[0, 1, 0])
-    return {"type": "perspective", "fov": 55, "to_world": place, "film": film}
-
-
 def ground(width: int = 64, rfilter: str = "box", **objects: dict) -> dict:
-    """A scene of a diffuse floor of 12 x 12 units and ``objects``."""
-    floor = mi.ScalarTransform4f().rotate([1, 0, 0], -90).scale(6)
-    base = {
-        "type": "scene",
-        "sensor": view(width, rfilter),
-        "floor": {"type": "rectangle", "to_world": floor},
-    }
-    return base | objects
+    """A scene of a diffuse floor of 12 x 12 units and ``objects``, seen from above in ``width``^2 pixels."""
+    view = scenes.camera(origin=(0, 6, 9), target=(0, 0, 0), fov=55, size=width, rfilter=rfilter)
+    return {"type": "scene", "sensor": view, "floor": scenes.floor(size=6)} | objects
 
 
-def facing_down(x: float, z: float, size: float, height: float = 5.0):
-    """Where a rectangle that faces down is."""
-    return mi.ScalarTransform4f().translate([x, height, z]).rotate([1, 0, 0], 90).scale(size)
-
-
-def lamp(radiance: object = 10.0, **shape) -> dict:
-    """A shape that emits; a square above the ground, if none is given."""
-    return (shape or {"type": "rectangle", "to_world": facing_down(0, 0, 1)}) | {
-        "emitter": {"type": "area", "radiance": radiance}
-    }
+def lamp() -> dict:
+    """A square above the ground that emits."""
+    return scenes.square((0, 5, 0), scenes.DOWNWARDS, emitter=scenes.area(10.0))
 
 
 def grid(count: int) -> list[tuple[float, float, float]]:
@@ -101,31 +83,19 @@ def grid(count: int) -> list[tuple[float, float, float]]:
 
 def spheres(count: int) -> dict:
     """Spheres of one material."""
-    shared = {"type": "roughconductor", "id": "shared", "alpha": 0.2}
-    balls = {
-        f"ball{i}": {
-            "type": "sphere",
-            "center": [x, r, z],
-            "radius": r,
-            "bsdf": {"type": "ref", "id": "shared"},
-        }
-        for i, (x, z, r) in enumerate(grid(count))
-    }
+    shared, used = {"type": "roughconductor", "id": "shared", "alpha": 0.2}, {"type": "ref", "id": "shared"}
+    balls = {f"ball{i}": scenes.ball(used, r, (x, r, z)) for i, (x, z, r) in enumerate(grid(count))}
     return ground(shared=shared, lamp=lamp(), **balls)
 
 
 def instances(count: int) -> dict:
     """Instances of one group of shapes."""
-    t = mi.ScalarTransform4f()
     group = {"type": "shapegroup", "cube": {"type": "cube", "bsdf": {"type": "diffuse"}}}
-    placed = {
-        f"placed{i}": {
-            "type": "instance",
-            "to_world": t.translate([x, r, z]).rotate([0, 1, 0], 37 * i).scale(0.7 * r),
-            "group": {"type": "ref", "id": "group"},
-        }
-        for i, (x, z, r) in enumerate(grid(count))
-    }
+    placed = {}
+    for i, (x, z, r) in enumerate(grid(count)):
+        place = scenes.transform().translate([x, r, z]).rotate([0, 1, 0], 37 * i).scale(0.7 * r)
+        used = {"type": "ref", "id": "group"}
+        placed[f"placed{i}"] = {"type": "instance", "to_world": place, "group": used}
     return ground(group=group, lamp=lamp(), **placed)
 
 
@@ -133,29 +103,34 @@ def materials(count: int) -> dict:
     """Spheres with a material each."""
     balls = {}
     for i, (x, z, r) in enumerate(grid(count)):
-        colour = {"type": "rgb", "value": [0.2 + 0.6 * i / count, 0.5, 0.8 - 0.6 * i / count]}
+        colour = scenes.rgb(0.2 + 0.6 * i / count, 0.5, 0.8 - 0.6 * i / count)
         bsdf = {"type": "principled", "base_color": colour, "roughness": 0.2 + 0.6 * i / count}
-        balls[f"ball{i}"] = {"type": "sphere", "center": [x, r, z], "radius": r, "bsdf": bsdf}
+        balls[f"ball{i}"] = scenes.ball(bsdf, r, (x, r, z))
     return ground(lamp=lamp(), **balls)
 
 
 def lamps(count: int) -> dict:
     """Spherical lamps."""
-    made = {
-        f"lamp{i}": lamp(1.0 + i % 7, type="sphere", center=[x, 2.0, z], radius=0.2 * r)
-        for i, (x, z, r) in enumerate(grid(count))
-    }
+    made = {}
+    for i, (x, z, r) in enumerate(grid(count)):
+        made[f"lamp{i}"] = scenes.ball(scenes.matte(), 0.2 * r, (x, 2, z), emitter=scenes.area(1.0 + i % 7))
     return ground(**made)
+
+
+def picture(random, low: float, high: float, size: int) -> dict:
+    """A texture of random texels."""
+    return {
+        "type": "bitmap",
+        "bitmap": mi.Bitmap(random.uniform(low, high, (size, size, 3)).astype(np.float32)),
+    }
 
 
 def textured_lamps(count: int) -> dict:
     """Square lamps with a picture each."""
-    random = np.random.default_rng(1)
-    made = {}
+    random, made = np.random.default_rng(1), {}
     for i, (x, z, r) in enumerate(grid(count)):
-        picture = mi.Bitmap(random.uniform(0.1, 5, (8, 8, 3)).astype(np.float32))
-        radiance = {"type": "bitmap", "bitmap": picture, "raw": True}
-        made[f"lamp{i}"] = lamp(radiance, type="rectangle", to_world=facing_down(x, z, 0.5 * r, 3.0))
+        emitter = scenes.area(picture(random, 0.1, 5, 8) | {"raw": True})
+        made[f"lamp{i}"] = scenes.square((x, 3, z), scenes.DOWNWARDS, 0.5 * r, emitter=emitter)
     return ground(**made)
 
 
@@ -179,26 +154,19 @@ def waves(triangles: int, height: float) -> mi.Mesh:
 def lamp_mesh(triangles: int) -> dict:
     """A lamp of about ``triangles`` triangles; writes its mesh into the working directory."""
     waves(triangles, 4.0).write_ply("lamp.ply")
-    return ground(lamp=lamp(type="ply", filename="lamp.ply", face_normals=False))
+    lamp = {"type": "ply", "filename": "lamp.ply", "face_normals": False, "emitter": scenes.area(10.0)}
+    return ground(lamp=lamp)
 
 
 def film(width: int) -> dict:
-    """A film of ``width``^2 pixels."""
-    return still("box", width)
-
-
-def still(rfilter: str, width: int) -> dict:
-    """A ball on the ground and a lamp."""
-    ball = {"type": "sphere", "center": [0, 1, 0], "radius": 1, "bsdf": {"type": "plastic"}}
-    return ground(width, rfilter, ball=ball, lamp=lamp())
+    """A ball on the ground and a lamp, in ``width``^2 pixels."""
+    return ground(width, ball=scenes.ball({"type": "plastic"}, center=(0, 1, 0)), lamp=lamp())
 
 
 def meter(samples: int) -> dict:
     """An irradiance meter on the ground."""
-    one = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
-    place = mi.ScalarTransform4f().translate([0, 0.01, 2]).rotate([1, 0, 0], -90).scale(0.1)
-    measuring = {"type": "rectangle", "to_world": place, "sensor": {"type": "irradiancemeter", "film": one}}
-    scene = still("box", 1) | {"meter": measuring}
+    scene = film(1)
+    scene["meter"] = scenes.floor(0.01, 0.1, sensor=scenes.meter())
     del scene["sensor"]
     return scene
 
@@ -213,10 +181,10 @@ def cornell(width: int, rfilter: str = "box") -> dict:
 def edited(kind: str) -> dict:
     """What edits change: a lamp, a picture on the floor, a mesh, a camera."""
     waves(1000, 0.5).write_ply("waves.ply")
-    scene = still("box", 64)
-    picture = mi.Bitmap(np.random.default_rng(1).uniform(0.2, 0.8, (64, 64, 3)).astype(np.float32))
-    scene["floor"]["bsdf"] = {"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": picture}}
-    grey = {"type": "twosided", "bsdf": {"type": "diffuse"}}  # the mesh faces down
+    scene = film(64)
+    reflectance = picture(np.random.default_rng(1), 0.2, 0.8, 64)
+    scene["floor"]["bsdf"] = {"type": "diffuse", "reflectance": reflectance}
+    grey = scenes.both_sides(0.5)  # the mesh faces down
     return scene | {"mesh": {"type": "ply", "filename": "waves.ply", "bsdf": grey}}
 
 
@@ -266,7 +234,9 @@ KINDS = {
     "spheres": Kind("spheres of one material", (10, 100, 1000, 10000), spheres),
     "instances": Kind("instances", (10, 100, 300, 1000), instances),
     "materials": Kind("spheres with a material each", (10, 100, 300, 1000), materials),
-    "rooms": Kind("materials of a room, see room.py", (10, 27, 40), lambda count: room.room(count, 64)),
+    "rooms": Kind(
+        "materials of a room, see room.py", (10, 27, 40), lambda n: room.lit_room("ceiling", n, 64, 64)
+    ),
     "lamps": Kind("spherical lamps", (10, 100, 1000, 10000), lamps),
     "textured lamps": Kind("square lamps with a picture each", (10, 128, 1000), textured_lamps),
     "lamp mesh": Kind("triangles of one lamp", (1000, 10000, 100000, 1000000), lamp_mesh),
@@ -331,6 +301,7 @@ FIGURES = {
     "warm": ("warm render", lambda rows, row, method: over_path(row, "warm", method)),
     "first": ("first image", lambda rows, row, method: over_path(row, "first", method)),
     "slope": ("ms an object", slope),
+    "memory": ("memory in GiB", lambda rows, row, method: row[method]["memory"] / 2**30),
     "over box": (
         "ratio over that of the box filter",
         lambda rows, row, method: over_path(row, "warm", method) / over_path(rows[0], "warm", method),
@@ -339,6 +310,8 @@ FIGURES = {
 """Figures of a row, given the rows of its kind: in words, and the function."""
 
 GOALS = (
+    Goal("previews", 8, "first", 4),
+    Goal("film", 4096, "memory", 1.5),
     Goal("samples", 10**6, "warm", 2),
     Goal("meter", 10**6, "warm", 2),
     Goal("lamp mesh", 10**6, "warm", 1.5),
@@ -504,7 +477,7 @@ def goals(record: dict) -> str:
         if value is not None:
             measured, met = f"{value:.3g}", "yes" if value <= goal.most else "**no**"
         lines.append([what, f"{goal.most:g}", measured, met])
-    return table(["over `path`", "at most", "measured", "met"], lines)
+    return table(["what", "at most", "measured", "met"], lines)
 
 
 def main(arguments=None) -> int:
@@ -512,7 +485,6 @@ def main(arguments=None) -> int:
     parser = command_line.parser(__doc__)
     parser.add_argument("kinds", nargs="*", help="kinds of rows; default: all, and the record is written")
     parser.add_argument("--sizes", nargs="+", help="sizes of these kinds, instead of those of the table")
-    parser.add_argument("--list", action="store_true", help="print kinds and sizes, render nothing")
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
@@ -525,10 +497,6 @@ def main(arguments=None) -> int:
             raise CommandError(f"kind={name!r} is not known; use some of {', '.join(KINDS)}")
     if asked.sizes and not asked.kinds:
         raise CommandError("--sizes needs kinds")
-    if asked.list:
-        for name, kind in KINDS.items():
-            print(f"{name} ({kind.what}): {', '.join(map(str, kind.sizes))}")
-        return 0
     rows = []
     for name in asked.kinds or KINDS:
         kind = KINDS[name]

@@ -38,6 +38,16 @@ def test_the_repository_has_one_address():
         )
 
 
+def test_links_of_the_description_lead_somewhere_from_any_page():
+    """An index shows README.md, whose relative links the build replaces."""
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["hatch"]["metadata"]["hooks"]
+    text = (ROOT / "README.md").read_text()
+    for change in hooks["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(change["pattern"], change["replacement"], text)
+    links = re.findall(r"\]\(([^)\s]+)", text)
+    assert len(links) > 5 and all(re.match("https?://|#", link) for link in links)
+
+
 def test_the_extra_of_measuring_is_what_is_looked_for():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     packages = [re.match(r"[\w-]+", text)[0] for text in project["optional-dependencies"]["measure"]]

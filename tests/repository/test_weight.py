@@ -14,23 +14,23 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5095,
-    "transport merging guided_emission": 5718,
+    "measure": 5102,
+    "transport merging guided_emission": 5723,
     "planning": 1731,
     "emitters": 2209,
-    "cli": 1463,
+    "cli": 1472,
     "media": 1347,
     "geometry": 1433,
     "image": 1304,
-    "files": 859,
+    "files": 868,
     "run": 1102,
-    "scene sampling": 775,
-    "host": 713,
+    "scene sampling": 780,
+    "host": 739,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2972, "tests": 27911}
-MOST_WORDS = 29276
+OUTSIDE = {"scripts": 2436, "tests": 27989}
+MOST_WORDS = 29281
 
 
 def _lines(files):

@@ -13,10 +13,14 @@ from mitsuba_bdpt.planning import budget
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.scene.prepared import PreparedScene
 from mitsuba_bdpt.transport import bsdf
-from room import KINDS, LIGHTS, lit_room, room
+from room import KINDS, LIGHTS, lit_room
 
 ALL = [{"light_paths": 1.0, "connections": "one", "cost": 1.0, "variance": 1.0, "mean": 0.5}]
 ALL[0]["coefficients"] = {"t<=1": 1.0, "s=1": 1.0}
+
+
+def room(materials, size):
+    return lit_room("ceiling", materials, size, size)
 
 
 @pytest.fixture
@@ -79,7 +83,9 @@ def test_pilots_of_rooms():
     why; from `budget.least_samples` on one is, also there, and predicts no guided s = 0, which would take two
     more kernels; in renders `budget.GUIDING_TIMES` as long it does."""
     integrator = mi.load_dict({"type": "bdpt", "max_depth": 3})
-    few, many = (mi.load_dict(room(n, 128)) for n in (bsdf.MANY - 2, bsdf.MANY))  # the lamp has one more
+    few, many = (
+        mi.load_dict(room(bsdf.MANY - n, 128)) for n in (7, 4)
+    )  # walls and lamp have six; one is glass
     least = budget.least_samples(PreparedScene(many, many.sensors()[0]))
     assert (1 << 17) < least < (1 << 20)
     assert len(integrator.decide(few, spp=8)) == 1
