@@ -15,22 +15,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5102,
-    "transport merging guided_emission": 5723,
+    "transport merging guided_emission": 5728,
     "planning": 1731,
-    "emitters": 2209,
+    "emitters": 2201,
     "cli": 1472,
     "media": 1347,
-    "geometry": 1433,
+    "geometry": 1434,
     "image": 1304,
     "files": 868,
     "run": 1102,
     "scene sampling": 780,
-    "host": 739,
+    "host": 808,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2436, "tests": 27989}
-MOST_WORDS = 29281
+OUTSIDE = {"scripts": 2436, "tests": 28041}
+MOST_WORDS = 29469
 
 
 def _lines(files):

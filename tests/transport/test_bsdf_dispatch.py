@@ -83,3 +83,55 @@ def test_a_sample_is_one_question(adjoint, monkeypatch):
     si = scene.ray_intersect(mi.Ray3f([0, 0, 1], dr.opaque(mi.Vector3f, [0, 0, -1])))
     bsdf.sample(si.bsdf(), si, mi.Float(0.5), mi.Point2f(0.5), mi.Bool(True), traits, adjoint=adjoint)
     assert len(count) == 1
+
+
+def _lively(i, more):
+    colour = {"type": "rgb", "value": [0.2 + 0.03 * i, 0.5, 0.9 - 0.03 * i]}
+    return {"type": "principled", "base_color": colour, "roughness": 0.2 + 0.02 * i} | more
+
+
+MIXED = [
+    *({"type": "diffuse", "reflectance": 0.1 + 0.05 * i} for i in range(8)),
+    *(_lively(i, {}) for i in range(8)),
+    *(_lively(i, {"metallic": 0.1 * i}) for i in range(8)),
+    *({"type": "twosided", "of": _lively(i, {"clearcoat": 0.1 + 0.1 * i})} for i in range(8)),
+]
+
+
+def _asked(bsdfs, traits):
+    """Samples and evaluations of ``bsdfs``, one after the other, at random directions."""
+    random, count = np.random.default_rng(1), 128 * len(bsdfs)
+    number = mi.UInt32(np.arange(count, dtype=np.uint32) % len(bsdfs))
+    pointer = dr.gather(mi.BSDFPtr, mi.BSDFPtr(bsdfs), number)
+    si = dr.zeros(mi.SurfaceInteraction3f, count)
+    si.n, si.sh_frame = mi.Normal3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, 1))
+    si.wi, wo = (
+        mi.warp.square_to_uniform_sphere(mi.Point2f(random.random((2, count), dtype=np.float32)))
+        for _ in range(2)
+    )
+    u = mi.Point3f(random.random((3, count), dtype=np.float32))
+    target = bsdf.Target(wo, u.x > 0.1, mi.Float(0.7))
+    step, f = bsdf.sample(pointer, si, u.x, mi.Point2f(u.y, u.z), u.x > 0.1, traits, target, True)
+    at = bsdf.evaluate(pointer, si, wo, u.z > 0.1, traits)
+    found = step.wo, step.weight, step.pdf_fwd_w, step.pdf_rev_w, f.value, f.pdf_rev_w, at.value, at.pdf_fwd_w
+    dr.eval(found)
+    return [np.array(x) for x in found]
+
+
+def test_bsdfs_that_differ_in_numbers_are_called_as_one(monkeypatch):
+    """Mitsuba's `principled` leaves out lobes that are 0 at loading, as a metal's of the first of eight.
+    Expected: few functions instead of one per BSDF, the same numbers to the bit, and BSDFs as before, also
+    after a call that failed."""
+    bsdfs = [mi.load_dict(kind) for kind in MIXED]
+    texts, traits = list(map(str, bsdfs)), bsdf.Traits.of(bsdfs)
+    assert len(traits.dispatch._molds) == 4
+    found = _asked(bsdfs, traits)
+    with pytest.raises(RuntimeError):
+        traits.dispatch(mi.BSDFPtr(bsdfs), lambda b, active: 1 / 0, mi.Bool([True] * len(bsdfs)))
+    assert list(map(str, bsdfs)) == texts
+    monkeypatch.setattr(bsdf, "_MOLDS", 0)
+    one_by_one = bsdf.Traits.of(bsdfs)
+    assert not one_by_one.dispatch._molds
+    for x, y in zip(found, _asked(bsdfs, one_by_one), strict=True):
+        assert (x != 0).any()
+        np.testing.assert_array_equal(x, y)

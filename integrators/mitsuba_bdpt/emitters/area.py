@@ -13,7 +13,7 @@ from ..geometry.boxes import scene_box
 from ..geometry.mitsubas_choices import TEXTURE_SAMPLED, is_sampled_by_texture, is_textured
 from ..geometry.quadrics import Sphere, cone_pdf_w, is_small, may_light_itself
 from ..geometry.smooth_meshes import is_flat
-from ..host.introspection import LEAVES, children, named, number, own_parameters
+from ..host.introspection import named, number, own_parameters, parts
 from .group import Context, Group, HitOnlyEmitters, to_area, weight_over
 from .records import Chosen, Direct, Emission, Factor, Place
 from .surfaces import Surfaces
@@ -358,12 +358,4 @@ def _samples_points(emitter) -> bool:
             f"emitter {named(emitter)} has a textured radiance on a mesh without texture coordinates "
             f"({named(shape)}); make the radiance uniform, or give the mesh coordinates"
         )
-    return not _reads_attributes(children(emitter)["radiance"])
-
-
-def _reads_attributes(texture) -> bool:
-    """Whether a texture reads mesh attributes, which need a face index."""
-    if texture.class_name() == "MeshAttribute":
-        return True
-    inner = children(texture).values() if texture.class_name() not in LEAVES else ()
-    return any(_reads_attributes(value) for value in inner if isinstance(value, mi.Texture))
+    return "MeshAttribute" not in {part.class_name() for _, part in parts(emitter)}  # needs a face index

@@ -7,6 +7,7 @@ invalid box too, though rays hit its other triangles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -67,4 +68,4 @@ def points_in(boxes: Sequence[mi.ScalarBoundingBox3f], which: np.ndarray, u: np.
 
 def is_finite(box: mi.ScalarBoundingBox3f) -> bool:
     """Whether a box is not empty and has finite corners."""
-    return box.valid() and bool(np.isfinite([box.min, box.max]).all())
+    return box.valid() and all(map(math.isfinite, (*box.min, *box.max)))

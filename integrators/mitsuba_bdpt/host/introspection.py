@@ -18,7 +18,7 @@ LEAVES = frozenset({"SRGBReflectanceSpectrum", "UniformSpectrum"})
 
 
 def number(x) -> float:
-    return float(dr.slice(x) if dr.is_array_v(x) else x)
+    return float(*x) if dr.is_array_v(x) else float(x)
 
 
 def given_id(owner) -> str:
@@ -46,6 +46,13 @@ def plugin_name(emitter: mi.Emitter) -> str:
 def children(owner) -> dict:
     """Return the child objects and numbers that ``owner.traverse`` reports, by name."""
     return _collector(mi.variant())().of(owner)
+
+
+def parts(plugin: mi.Object, name: str = "") -> list[tuple[str, mi.Object]]:
+    """Return ``plugin`` and all that it holds, each after its holder and with its ``name`` there."""
+    held = {} if plugin.class_name() in LEAVES else children(plugin)
+    inner = (parts(held[key], key) for key in sorted(held) if isinstance(held[key], mi.Object))
+    return [(name, plugin), *(part for found in inner for part in found)]
 
 
 def is_instance(shape: mi.Shape) -> bool:
@@ -166,9 +173,8 @@ def media_of(scene: mi.Scene, sensors: Iterable[mi.Sensor]) -> dict[int, mi.Medi
 
 def registry_id(plugin: mi.Medium | mi.BSDF | mi.Shape) -> int:
     """Index of an object in Dr.Jit's registry."""
-    kinds = {mi.Medium: mi.MediumPtr, mi.BSDF: mi.BSDFPtr, mi.Shape: mi.ShapePtr}
-    pointer = next(pointer for kind, pointer in kinds.items() if isinstance(plugin, kind))
-    return int(dr.reinterpret_array(mi.UInt32, pointer(plugin))[0])
+    kind = next(kind for kind in ("Shape", "BSDF", "Medium") if isinstance(plugin, getattr(mi, kind)))
+    return int(dr.reinterpret_array(mi.UInt32, getattr(mi, f"{kind}Ptr")(plugin))[0])
 
 
 def versions() -> dict[str, str]:

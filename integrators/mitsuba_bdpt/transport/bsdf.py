@@ -17,7 +17,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import polarization
-from ..host.introspection import registry_id
+from ..host.introspection import parts, registry_id
+from ..host.molds import molds
 from . import draws
 from .draws import needs_full_pdf, nested
 from .near_specular import spread_interactions
@@ -126,6 +127,9 @@ MANY = 10
 # calls are used. Recorded in C++, a call of a simple BSDF costs a quarter of one through Python.
 _UNHIT = 0.25
 
+# Largest number of kinds (`molds`), relative to the BSDFs, up to which one is called for each.
+_MOLDS = 0.25
+
 
 class BSDFDispatch:
     """Virtual calls of ``bsdfs``, which are distinct.
@@ -133,25 +137,32 @@ class BSDFDispatch:
     Mitsuba's visit all BSDFs of the process, each with a function in the kernel: also nested ones, which no
     ray hits, and those of other scenes. They are used for `MANY` BSDFs beside few that no ray hits
     (``unhit``; None: some of ``bsdfs`` need a correction), whatever other scenes hold. Else calls go through
-    Python to ``bsdfs`` alone.
+    Python to ``bsdfs`` alone; of `MANY` that have few kinds to one of each (`Mold`). ``apart``: a vertex
+    makes several calls.
     """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
         by_id = {registry_id(b): b for b in bsdfs}
         self.bsdfs, self.count = list(by_id.values()), len(by_id)
         self.many = len(by_id) >= MANY
-        self.by_mitsuba = self.many and unhit is not None and unhit <= _UNHIT * len(by_id)
+        found = molds(self.bsdfs) if self.many else []
+        self._molds = found if len(found) <= _MOLDS * self.count else []
+        self.apart = self.many and not 0 < len(self._molds) < MANY
+        self.by_mitsuba = self.many and not self._molds and unhit is not None and unhit <= _UNHIT * self.count
         # Samples and evaluations are separate calls, whose functions all places share: less to compile.
-        self.shared = self.many and not self.by_mitsuba
-        numbers = [0] * (max(by_id, default=0) + 1)
-        for number, index in enumerate(by_id):
-            numbers[index] = number
-        self._numbers = mi.UInt32(numbers)
+        self.shared = self.apart and not self.by_mitsuba
+        index_of = {id(b): index for index, b in by_id.items()}
+        numbers, rows = ([0] * (max(by_id, default=0) + 1) for _ in range(2))
+        groups = [mold.bsdfs for mold in self._molds] or [[b] for b in self.bsdfs]
+        for number, group in enumerate(groups):
+            for row, index in enumerate(index_of[id(b)] for b in group):
+                numbers[index], rows[index] = number, row
+        self._numbers, self._rows = mi.UInt32(numbers), mi.UInt32(rows)
 
     @cached_property
     def kinds(self) -> int:
         """Number of BSDF structures; BSDFs of one share the functions of a kernel."""
-        return len({draws.structure(bsdf) for bsdf in self.bsdfs})
+        return len({tuple((name, p.class_name()) for name, p in parts(bsdf)) for bsdf in self.bsdfs})
 
     def __call__(self, bsdf, question, *args):
         """Return ``question(bsdf, *args)``; the last of ``args`` is the call's mask.
@@ -161,8 +172,11 @@ class BSDFDispatch:
         # In evaluated mode calls of Python functions fail for `plastic`; its own methods do not.
         if self.by_mitsuba or isinstance(bsdf, mi.BSDF) or not dr.flag(dr.JitFlag.SymbolicCalls):
             return question(bsdf, *args)
-        number = dr.gather(mi.UInt32, self._numbers, dr.reinterpret_array(mi.UInt32, bsdf), args[-1])
-        return dr.switch(number, [partial(question, b) for b in self.bsdfs], *args)
+        index, calls = dr.reinterpret_array(mi.UInt32, bsdf), [partial(question, b) for b in self.bsdfs]
+        if self._molds:
+            calls = [partial(mold, question) for mold in self._molds]
+            args = dr.gather(mi.UInt32, self._rows, index, args[-1]), *args
+        return dr.switch(dr.gather(mi.UInt32, self._numbers, index, args[-1]), calls, *args)
 
 
 @dataclass
@@ -248,8 +262,8 @@ def sample(
     if target:  # the last argument is the call's mask
         given = *given, target.wo, target.active, active | target.active
     # One virtual call, or with `MANY` BSDFs one per question.
-    many = traits.dispatch.many
-    drawn, evaluated = call(bsdf, *given) if many else traits.dispatch(bsdf, call, *given)
+    apart = traits.dispatch.apart
+    drawn, evaluated = call(bsdf, *given) if apart else traits.dispatch(bsdf, call, *given)
     return _step(si, drawn, adjoint), _evaluation(*evaluated, target.cos_ratio) if target else None
 
 

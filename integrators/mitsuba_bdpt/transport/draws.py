@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from ..host.introspection import LEAVES, children
+from ..host.introspection import children
 from .spectra import is_zero
 
 # Plugins whose sample() returns pdf(). Others, third-party ones included, may return that of the picked lobe.
@@ -202,11 +201,3 @@ def family(bsdfs: Iterable[mi.BSDF]) -> list[tuple[mi.BSDF, dict]]:
 def nested(bsdfs: Iterable[mi.BSDF]) -> list[mi.BSDF]:
     """The BSDFs of the `family` of ``bsdfs``."""
     return [bsdf for bsdf, _ in family(bsdfs)]
-
-
-def structure(plugin: mi.Object) -> tuple[Any, ...]:
-    """Class of ``plugin`` and the structures of its BSDFs and textures, by name."""
-    if plugin.class_name() in LEAVES:
-        return (plugin.class_name(),)
-    held = {name: value for name, value in children(plugin).items() if isinstance(value, mi.Object)}
-    return plugin.class_name(), *((name, structure(held[name])) for name in sorted(held))
