@@ -242,6 +242,40 @@ def test_lamps_that_overlap_are_named():
     assert 1.8 < mean[0] / mean[1e-3] < 2.1 and mean[2e-5] / mean[1e-3] == pytest.approx(1, rel=0.02)
 
 
+def on_a_floor(height=0.0, turn=0, scale=(0.5, 0.5, 0.25), kind="cube", **more):
+    """A floor z = 0 under glass whose lowest point is at this height, if it is not turned about x."""
+    place = mi.ScalarTransform4f().translate([0, 0, height + scale[2]]).rotate([1, 0, 0], turn)
+    glass = {"type": kind, "to_world": place.scale(scale), "bsdf": {"type": "dielectric"}} | more
+    lamp = {"type": "sphere", "center": [1, 0.5, 3], "radius": 0.15, "emitter": area(200.0)}
+    eye = camera(origin=(-0.3, 0.3, 4), target=(0, 0, 0), fov=10, size=8)
+    return load(sensor=eye, floor=square((0, 0, 0), size=3), glass=glass, lamp=lamp)
+
+
+def test_glass_in_the_plane_of_a_floor_is_named():
+    """Rays that leave the glass begin below the floor. Expected: a warning, and less than half of the light
+    of glass 1e-4 of the scene's size higher, which has none."""
+    integrator = mi.load_dict({"type": "bdpt", "max_depth": 6, "guiding": "always"})
+    mean, said = {}, {}
+    for height in (0.0, 6e-4):
+        with Warned() as warnings:
+            mean[height] = np.array(integrator.render(on_a_floor(height), seed=1, spp=256)).mean()
+        said[height] = len([text for text in warnings if "share a plane" in text])
+    assert said == {0.0: 1, 6e-4: 0} and mean[0.0] < 0.5 * mean[6e-4]
+
+
+@pytest.mark.parametrize(
+    ("glass", "count"),
+    [({}, 1), ({"height": -0.5}, 1), ({"kind": "rectangle", "scale": (1, 1, 0)}, 1), ({"height": -0.1}, 0)]
+    + [({"turn": 45}, 0), ({"kind": "sphere"}, 0), ({"scale": (0.5, 0.01, 0.5)}, 0)]
+    + [({"kind": "rectangle", "turn": 90, "height": -0.5, "scale": (0.5, 1, 1)}, 0)]
+    + [({"bsdf": {"type": "diffuse"}}, 0)],
+)
+def test_which_glass_shares_a_plane(glass, count):
+    """A block on the floor or below it, a pane on it; none that is sunk into it or stands on an edge, no
+    sphere, no upright pane, no opaque block."""
+    assert len(diagnostics.glass_in_planes(on_a_floor(**glass))) == count
+
+
 def test_which_lamps_overlap():
     """Rectangles that share a part of a plane; not neighbours that share an edge, nor discs."""
     row = [0, 0, 1], [1, 0, 1], [2.5, 0, 1]

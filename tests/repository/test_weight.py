@@ -20,17 +20,17 @@ MOST = {
     "emitters": 2201,
     "cli": 1472,
     "media": 1347,
-    "geometry": 1434,
+    "geometry": 1435,
     "image": 1304,
     "files": 868,
     "run": 1102,
-    "scene sampling": 780,
+    "scene sampling": 825,
     "host": 808,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2436, "tests": 28041}
-MOST_WORDS = 29469
+OUTSIDE = {"scripts": 2436, "tests": 28075}
+MOST_WORDS = 29525
 
 
 def _lines(files):

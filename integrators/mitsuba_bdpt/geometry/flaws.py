@@ -53,7 +53,7 @@ class Flaw(Enum):
         kind = shape.shape_type()
         if extent[1] == 0 or (extent[0] == 0 and kind in ROUND):
             return Flaw.NO_AREA
-        if kind in _FLAT or not _lets_through(shape):
+        if kind in _FLAT or not lets_through(shape):
             return None
         is_within = extent[0] <= offset and (not shape.is_mesh() or extent[0] > offset / 8)  # flat ones round
         return Flaw.THIN if is_within or (shape.is_mesh() and _is_thin_mesh(shape)) else None
@@ -73,7 +73,8 @@ def _has_finite_vertices(shape: mi.Shape) -> bool:
     return "vertex_positions" in params and bool(np.isfinite(np.array(params["vertex_positions"])).all())
 
 
-def _lets_through(shape: mi.Shape) -> bool:
+def lets_through(shape: mi.Shape) -> bool:
+    """Whether the BSDF of a shape transmits light; not of instances."""
     bsdf = None if is_instance(shape) else shape.bsdf()
     flags = mi.BSDFFlags.Transmission, mi.BSDFFlags.Null
     return bsdf is not None and any(mi.has_flag(bsdf.flags(), flag) for flag in flags)

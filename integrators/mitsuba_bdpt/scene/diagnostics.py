@@ -1,13 +1,14 @@
 """Diagnostics: parameters that spoil images.
 
 Images that are black or lack shapes, negative radiance, reflectances above 1, spots too narrow for single
-precision, lamps that overlap, and non-finite values.
+precision, lamps that overlap, glass in the plane of another surface, and non-finite values.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from itertools import product
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -17,6 +18,8 @@ import numpy as np
 from ..emitters.radiance import is_negative
 from ..errors import listed
 from ..geometry.boxes import is_finite
+from ..geometry.flaws import lets_through
+from ..geometry.quadrics import ROUND
 from ..geometry.rounding import offset_at
 from ..host.introspection import LEAVES, all_shapes, children, is_instance, named, number, own_parameters
 from ..host.notices import cached
@@ -42,6 +45,9 @@ _STEP = 2.0**-24
 
 # Largest step relative to 1 - cos of the cutoff angle (0.2 degrees): bounds the relative error of the light.
 _COARSE = 1e-2
+
+# Least width of a face over the size of its shape, through which more than a little of its light passes.
+_OF_PANE = 0.05
 
 # Most bitmap values that are read, of all bitmaps together.
 _QUICKLY_READ = 1 << 17
@@ -82,14 +88,18 @@ def _wrong(prepared: PreparedScene) -> dict[str, list[str]]:
     """Parameters of which light is lost or added, by effects and remedies."""
     scene, sensor, facts = prepared.scene, prepared.sensor, prepared.facts
     bright = non_conserving_bsdfs([shape for shape in all_shapes(scene) if not is_instance(shape)])
-    overlap, _ = cached(scene, sensor, "overlaps", facts, lambda: overlapping_lamps(scene), most=1)
+    coplanar, _ = cached(
+        scene, sensor, "coplanar", facts, lambda: (overlapping_lamps(scene), glass_in_planes(scene)), most=1
+    )
     return {
         "more light returns than arrives, and where it cannot leave the image has no limit as max_depth "
         "grows; keep such parameters at 1 or below": bright,
         "Mitsuba rounds how the light falls off across so narrow a cone, with every integrator, and "
         "strategies do not agree about it; make it 0.2 degrees or more": narrow_spots(scene),
         "they overlap in one plane, where rays hit one of them but other strategies sample each, so that "
-        "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": overlap,
+        "their light is wrong; leave out one, or move it by 1e-5 of the scene's size": coplanar[0],
+        "they share a plane, where rays that leave one begin beyond the other, so that light through them is "
+        "lost, with every integrator; move one by 1e-4 of the scene's size": coplanar[1],
     }
 
 
@@ -179,14 +189,18 @@ def narrow_spots(scene) -> list[str]:
     return found
 
 
-def overlapping_lamps(scene) -> list[str]:
-    """Describe lamps that overlap in one plane along the axes, each with one other; rectangles only."""
-    shapes = [emitter.get_shape() for emitter in scene.emitters()]
+def _boxed(shapes) -> tuple[list, np.ndarray, np.ndarray, np.ndarray]:
+    """Those of ``shapes`` with finite boxes, corners of these, and the ray offset at each."""
     shapes = [shape for shape in shapes if shape and is_finite(mi.ScalarBoundingBox3f(shape.bbox()))]
     boxes = [(shape.bbox().min, shape.bbox().max) for shape in shapes]
     low, high = np.array(boxes, dtype=np.float64).reshape(-1, 2, 3).swapaxes(0, 1)
+    return shapes, low, high, offset_at(np.abs([low, high]).max((0, 2), initial=0))
+
+
+def overlapping_lamps(scene) -> list[str]:
+    """Describe lamps that overlap in one plane along the axes, each with one other; rectangles only."""
     # Shadow rays to the farther of two lamps end before the nearer one, see `rounding`.
-    near = offset_at(np.abs([low, high]).max((0, 2), initial=0))
+    shapes, low, high, near = _boxed(emitter.get_shape() for emitter in scene.emitters())
     found = []
     for axis, a, b in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         (flat,) = np.nonzero(high[:, axis] - low[:, axis] <= near)
@@ -198,6 +212,37 @@ def overlapping_lamps(scene) -> list[str]:
             overlap = (width > near[i]) & (np.abs(low[others, axis] - low[i, axis]) <= near[i])
             found += [(shapes[i], shapes[j]) for j in others[overlap][:1]]
     return [f"lamps {named(a)} and {named(b)}" for a, b in found if _fills_its_box(a) and _fills_its_box(b)]
+
+
+def glass_in_planes(scene) -> list[str]:
+    """Describe shapes that let light through with a face in a flat shape along the axes.
+
+    Not panes that stand on it.
+    """
+    shapes = [shape for shape in scene.shapes() if not is_instance(shape)]
+    through = {id(s) for s in shapes if lets_through(s) and s.shape_type() not in ROUND}
+    shapes, low, high, near = _boxed(shapes if through else ())
+    through = [i for i, shape in enumerate(shapes) if id(shape) in through]
+    found = []
+    for axis in range(3):
+        flat = np.flatnonzero(high[:, axis] - low[:, axis] <= near)
+        for i, side in product(through if len(flat) else (), (low, high)):
+            common = np.minimum(high[flat], high[i]) - np.maximum(low[flat], low[i])
+            least, at = max(near[i], _OF_PANE * (high[i] - low[i]).max()), side[i, axis]
+            touching = (flat != i) & (np.abs(low[flat, axis] - at) <= np.maximum(near[flat], near[i]))
+            touching &= (np.delete(common, axis, axis=1) > least).all(axis=1)
+            if touching.any() and (i in flat or _has_face(shapes[i], axis, at, near[i])):
+                found.append(f"shapes {named(shapes[i])} and {named(shapes[flat[touching][0]])}")
+    return list(dict.fromkeys(found))
+
+
+def _has_face(shape, axis: int, at: float, near: float) -> bool:
+    """Whether a triangle of a mesh lies in the plane ``at`` a coordinate along ``axis``."""
+    params = own_parameters(shape) if shape.is_mesh() else {}
+    if "vertex_positions" not in params:
+        return False
+    within = np.abs(np.array(params["vertex_positions"])[axis::3] - at) <= near
+    return bool(within[np.array(params["faces"])].reshape(-1, 3).all(axis=1).any())
 
 
 def _fills_its_box(shape) -> bool:
