@@ -21,6 +21,7 @@ import choices
 import goals
 import numpy as np
 import pandas as pd
+import peers
 import repository
 import scale
 import stress
@@ -78,6 +79,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "scale goals": partial(_recorded, "scale", scale.goals),
     "stress": partial(_recorded, "stress", stress.summary),
     "cases": partial(_recorded, "stress", stress.tables),
+    "peers": partial(_recorded, "peers", peers.tables),
     "choices": partial(_recorded, "choices", choices.choices_table),
 }
 

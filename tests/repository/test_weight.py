@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2436, "tests": 28075}
-MOST_WORDS = 29525
+OUTSIDE = {"scripts": 2915, "tests": 28095}
+MOST_WORDS = 30167
 
 
 def _lines(files):
