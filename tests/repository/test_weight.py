@@ -23,14 +23,14 @@ MOST = {
     "geometry": 1435,
     "image": 1304,
     "files": 868,
-    "run": 1102,
+    "run": 1100,
     "scene sampling": 825,
     "host": 808,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2915, "tests": 28095}
-MOST_WORDS = 30167
+OUTSIDE = {"scripts": 2915, "tests": 28097}
+MOST_WORDS = 30252
 
 
 def _lines(files):
