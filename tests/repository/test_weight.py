@@ -25,11 +25,11 @@ MOST = {
     "files": 868,
     "run": 1100,
     "scene sampling": 825,
-    "host": 808,
+    "host": 809,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2915, "tests": 28097}
+OUTSIDE = {"scripts": 2915, "tests": 28099}
 MOST_WORDS = 30252
 
 
