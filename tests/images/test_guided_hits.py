@@ -118,7 +118,7 @@ def large(lamp):
 
 def test_the_pilot_guides_where_it_pays(monkeypatch):
     """``always`` guides whatever it costs."""
-    scene = mi.load_dict(large(ball(0.02)))
+    scene = mi.load_dict(large(ball(0.05)))
     method = bdpt()
     image = np.array(mi.render(scene, integrator=method, spp=16))
     found = method.statistics
@@ -158,7 +158,7 @@ def test_paths_that_can_be_guided_are_in_no_sample_of_a_pilot():
         found = pilot.measure(render.prepared, plan, render.settings, seed, 1 << 14, guidable=light)
         return np.count_nonzero(found.errors[0, :, 0])
 
-    light = GuidableLight(*np.ones((4, FINE**2)))
+    light = GuidableLight(*np.ones((5, FINE**2)))
     assert max(parts(True, light), parts(True, None)) <= parts(False, None) / 2
 
 
@@ -237,6 +237,16 @@ def test_light_that_is_hit_too_rarely_is_merged():
     image = np.array(mi.render(mi.load_dict(described), integrator=method, spp=8))
     assert image.any() and method.statistics["merging"]["merges"]
     assert bdpt(merging=False).decide(mi.load_dict(described), spp=16)[0]["guided"]
+
+
+@pytest.mark.parametrize("speck, merges", [(0.001, True), (0.2, False)])
+def test_light_that_is_hit_too_rarely_is_merged_beside_other_light(speck, merges):
+    """Guiding was chosen for the light of the other lamp, and what photons find of a speck's was fireflies:
+    merging the caustics of a mirror has a thousandth of the raw error. Both lamps have the same flux."""
+    lamp = ball(speck) | {"center": ASIDE, "emitter": scenes.area(1 / speck**2)}
+    method = bdpt()
+    mi.render(mi.load_dict(large(ball(0.3)) | {"speck": lamp}), integrator=method, spp=16)
+    assert ("merging" in method.statistics, method.statistics["unbiased"]) == (merges, not merges)
 
 
 # -- through near-specular lobes ---------------------------------------------------------------------------

@@ -253,11 +253,13 @@ def test_films_keep_their_shape(here, width, height, wanted):
     assert (*loaded.size(),) == (*loaded.crop_size(),) == scene.size(nearest) == expected
 
 
-@pytest.mark.parametrize("sampler", ["", STRATIFIED])
+@pytest.mark.parametrize("sampler", ["", STRATIFIED, '<ref id="own"/>'])
 def test_scenes_are_loaded_at_any_size_with_any_sampler(here, sampler):
     """Means of 2 x 2 pixels agree (box filters, the same light) to the noise of 1024 samples."""
     file = here / "elsewhere" / "room.xml"
-    text = ROOM.format(height=32, sampler=sampler)
+    text = ROOM.format(height=32, sampler=sampler).replace(
+        "<sensor", '<sampler type="independent" id="own"/><sensor'
+    )
     file.write_text(text.replace("</film>", '<rfilter type="box"/></film>'))
     scene = SceneFile("room", file)
     loaded = scene.load(32, "multijitter")

@@ -643,7 +643,7 @@ def test_pilots_that_do_not_measure_guided_hits():
 def test_outliers_of_guidable_light_are_in_no_typical_render():
     """Expected: of two tiles of variance 8 the one whose samples fewer than 0.1 % of the pixels have is
     missing from a typical render, which lacks its light."""
-    found = moments.GuidableLight(*np.zeros((4, moments.FINE**2)))
+    found = moments.GuidableLight(*np.zeros((5, moments.FINE**2)))
     found.second[:2], rates = 4.0, np.array([1e-2, 1e-6])
     found.light[:2], found.fourth[:2] = np.sqrt(found.second[:2] * rates), found.second[:2] ** 2 / rates
     mean, typical = moments._of_guidable(found, np.full(moments.FINE**2, 2.0), 64)

@@ -15,22 +15,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5102,
-    "transport merging guided_emission": 5728,
-    "planning": 1731,
+    "transport merging guided_emission": 5730,
+    "planning": 1738,
     "emitters": 2201,
     "cli": 1472,
     "media": 1347,
     "geometry": 1435,
     "image": 1304,
     "files": 868,
-    "run": 1100,
+    "run": 1102,
     "scene sampling": 825,
-    "host": 809,
+    "host": 808,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2915, "tests": 28099}
-MOST_WORDS = 30252
+OUTSIDE = {"scripts": 2915, "tests": 28107}
+MOST_WORDS = 30256
 
 
 def _lines(files):

@@ -172,14 +172,14 @@ def _replace_sampler(nodes, sensor, kind: str) -> None:
     Its sample count is Mitsuba's default, since all renders say theirs, see `samples_taken`.
     """
     properties = mi.Properties(kind)
-    for key in sensor.props.keys():
-        held = sensor.props[key]
-        if isinstance(held, mi.Properties.ResolvedReference):
-            node = nodes[held.index()]
-            if node.type == mi.ObjectType.Sampler:
-                properties.set_id(node.props.id())
-                node.props = properties
-                return
+    held = [sensor.props[key] for key in sensor.props.keys()]
+    named = {one.id() for one in held if isinstance(one, mi.Properties.Reference)}  # by <ref id="..."/>
+    inside = {one.index() for one in held if isinstance(one, mi.Properties.ResolvedReference)}
+    for i, node in enumerate(nodes):
+        if node.type == mi.ObjectType.Sampler and (i in inside or node.props.id() in named):
+            properties.set_id(node.props.id())
+            node.props = properties
+            return
     node = mi.parser.SceneNode()
     node.type, node.props = mi.ObjectType.Sampler, properties
     # Before the list grows, which invalidates Python's references to its entries.

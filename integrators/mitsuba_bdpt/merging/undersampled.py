@@ -27,8 +27,8 @@ FEWEST = 0.1
 KINDS = (0.0, FEWEST, 1.0)
 
 # What photons can guide s = 0 to find: SDS light, second and fourth moments of its samples without guiding
-# (mean over the colours), and vertices at which s = 0 is guided. Dr.Jit adds four numbers as a packet.
-GUIDABLE = ("light", "second", "fourth", "vertices")
+# (mean over the colours), vertices at which s = 0 is guided, and the light that s = 0 does not find.
+GUIDABLE = ("light", "second", "fourth", "vertices", "rare")
 
 
 @dataclass
@@ -112,10 +112,12 @@ class Guidable(Undersampled):
         active &= (photon.edges > 1) | ~mis.is_used(kernel.kappa.direct)
         colours = mi.unpolarized_spectrum(found.value)
         light = mi.Float64(dr.sum(colours) / len(colours))
-        size = dr.select(expected >= self.rarest, light * self.samples / expected, 0)  # of a sample of s = 0
+        found_by_hits = expected >= self.rarest
+        size = dr.select(found_by_hits, light * self.samples / expected, 0)  # of a sample of s = 0
         powers = [light, light * size, light * size * dr.square(size)]
         active &= dr.isfinite(powers[-1])
         sums = [dr.select(active, x, 0) for x in powers] + [mi.Float64(1)]
+        sums.append(dr.select(active & ~found_by_hits, light, 0))
         tile = kernel.camera.region.tile(position, self.tiles)
         dr.scatter_reduce(dr.ReduceOp.Add, self.sums, mi.ArrayXd(sums), tile)
         return active

@@ -97,13 +97,15 @@ class Moments:
 class GuidableLight(NamedTuple):
     """SDS light that photons can guide s = 0 to find, per camera sample, by fine tile.
 
-    Moments are those of s = 0 without guiding; s = 0 is guided at ``vertices``.
+    Moments are those of s = 0 without guiding; s = 0 is guided at ``vertices``. ``rare``: see
+    `unsampled_light.FEWEST_HITS`.
     """
 
     light: np.ndarray
     second: np.ndarray
     fourth: np.ndarray
     vertices: np.ndarray
+    rare: np.ndarray
 
 
 def group(lane):

@@ -132,6 +132,10 @@ class Planner:
         flag = dr.scoped_set_flag(dr.JitFlag.KernelHistory, True)
         with gc_paused(), flag, evaluated_mode(prepared.emitters.evaluated):
             moments = pilot.measure(prepared, full, self.settings, seed, count, samples / count, guidable)
+        least = unsampled_light.WARN_SHARE * moments.mean
+        rare = guidable is not None and not full.guided and guidable.rare.sum() >= least
+        if rare:  # hits by guided directions are fireflies: `merging=auto` decides
+            moments = replace(moments, guidable=(0.0, 0.0))
         learnt = None
         if moments.emission is not None:
             component, counts = components.guided_emission, prepared.emitters.tables
@@ -143,8 +147,9 @@ class Planner:
         if full.guided:  # whatever it costs
             table = [row for row in table if row.candidate.guided] or table
         left_out = choice.left_out(table, "merging" if full.merging else "guided s=0")
-        if full.guidable and not full.guided and guidable is None:
+        if full.guidable and not full.guided and (rare or guidable is None):
             why = "with so many BSDFs the render is too short to predict its gain"
+            why = "rays hardly ever hit the emitters of a part of the light" if rare else why
             left_out.append(not_worth("guided s=0", why))
         if learnt and table and table[0].candidate.emission is None:
             left_out += components.guided_emission.left_out(learnt)

@@ -51,7 +51,7 @@ VERY_NARROW = 100.0
 PREVIEW = 64
 
 # Light of which s = 0 has fewer samples in an image, if all of it were like that, is left to vertex merging
-# where ``merging=auto`` can choose it.
+# where ``merging=auto`` can choose it; with `WARN_SHARE` of the image's light, photons guide none.
 FEWEST_HITS = 16
 
 SEED = 0x6C6F7374
