@@ -13,7 +13,6 @@ ratio over `path` that of errors times seconds. Bias: `compare_means` of the ren
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import time
@@ -172,20 +171,15 @@ def page(found: dict) -> str:
     return table(head, lines)
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """The command line."""
+def main(arguments=None) -> None:
+    """Measure, or print the table of an earlier measurement."""
     parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="*", help="names; by default those of the benchmark")
     parser.add_argument("--variant", default="cuda_ad_rgb")
     parser.add_argument("--device", default="", help="name of the GPU, for the file")
     parser.add_argument("--output", type=Path, required=True, metavar="FILE.json")
     parser.add_argument("--report", action="store_true", help="print the table of the file")
-    return parser
-
-
-def main(arguments=None) -> None:
-    """Measure, or write the page."""
-    options = build_parser().parse_args(arguments)
+    options = parser.parse_args(arguments)
     if not options.report:
         found = {"variant": options.variant, "device": options.device, "spp": SPP, "rows": [], "failed": {}}
         for names in batched(options.scenes or repository.benchmark_scenes(), BESIDE):

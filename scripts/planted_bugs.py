@@ -2,7 +2,6 @@
 
     python scripts/planted_bugs.py                  # all, half an hour on two cores
     python scripts/planted_bugs.py hidden adjoint   # those with such a word in their name
-    python scripts/planted_bugs.py --list           # what is replaced by what
     python scripts/planted_bugs.py --unchanged      # the same tests on a copy without bugs: they have to pass
 
 Each test that is named beside a bug runs against the copy, in a process of its own, and has to fail by an
@@ -99,7 +98,7 @@ def chosen(words: list[str]) -> list[PlantedBug]:
     """Bugs with one of these words in their name, all of them if there is no word."""
     for word in words:
         if not any(word in bug.name for bug in BUGS):
-            raise CommandError(f"no planted bug has {word!r} in its name; see --list")
+            raise CommandError(f"no planted bug has {word!r} in its name; see tests/planted_bugs")
     return [bug for bug in BUGS if not words or any(word in bug.name for word in words)]
 
 
@@ -125,14 +124,9 @@ def main(arguments=None) -> int:
     """Run the tests of the bugs, or print these."""
     parser = command_line.parser(__doc__)
     parser.add_argument("words", nargs="*", help="only bugs with one of these words in their name")
-    parser.add_argument("--list", action="store_true", help="print names and what is replaced, run nothing")
     parser.add_argument("--unchanged", action="store_true", help="run the same tests without the bugs")
     options = parser.parse_args(arguments)
     bugs = chosen(options.words)
-    if options.list:
-        for bug in bugs:
-            print(f"{bug.name}: {bug.file}: {bug.old!r} -> {bug.new!r}")
-        return 0
     wrong = run(bugs, not options.unchanged)
     tests = sum(len(bug.tests) for bug in bugs)
     print(f"{len(bugs)} bugs, {tests} tests: {wrong} wrong")

@@ -40,7 +40,7 @@ def _matte(i: int) -> dict:
     return _two_sided("diffuse", reflectance=_colour(i))
 
 
-def _opaque(i: int) -> dict:
+def _cut_out(i: int) -> dict:
     """A picture with clear parts."""
     return {
         "type": "mask",
@@ -70,7 +70,7 @@ KINDS = (
     lambda i: _two_sided("roughplastic", diffuse_reflectance=_picture(i), alpha=0.1),
     lambda i: _two_sided("bumpmap", arbitrary=_picture(i, 1), bsdf={"type": "roughplastic"}),
     lambda i: _two_sided("normalmap", normalmap=_normals(i), bsdf=_matte(i)["bsdf"]),
-    _opaque,
+    _cut_out,
     lambda i: {"type": "thindielectric", "int_ior": 1.4 + 0.01 * i},
     lambda i: _two_sided("conductor", material="Ag", specular_reflectance=_colour(i)),
     lambda i: _two_sided("plastic", diffuse_reflectance=_colour(i)),

@@ -331,16 +331,15 @@ GOALS = (
 
 
 def taken(kind: Kind, size: int | str, scene: mi.Scene, integrator: mi.Integrator, seed: int) -> dict:
-    """Processor and wall seconds of an edit, if the kind has one, and a render; the image's mean."""
+    """Processor seconds of an edit, if the kind has one, and a render; the image's mean."""
     dr.sync_thread()
-    started, cpu_started = time.perf_counter(), time.process_time()
+    started = time.process_time()
     if kind.before:
         kind.before(scene, str(size), seed)
     image = mi.render(scene, integrator=integrator, spp=kind.spp(size), seed=seed)
     dr.eval(image)
     dr.sync_thread()
-    taken = {"cpu": time.process_time() - cpu_started, "wall": time.perf_counter() - started}
-    return taken | {"mean": float(np.mean(image))}
+    return {"seconds": time.process_time() - started, "mean": float(np.mean(image))}
 
 
 def forget_peak() -> int:
@@ -363,12 +362,8 @@ def here(kind: Kind, size: int | str) -> dict:
     for name, integrator in integrators.items():
         renders[name] = partial(taken, kind, size, scene, integrator)
         before = forget_peak()
-        first = renders[name](0)
-        found[name] = {
-            "first": first["cpu"],
-            "first_wall": first["wall"],
-            "memory": (memory.peak() or 0) - before,
-        }
+        first = renders[name](0)["seconds"]
+        found[name] = {"first": first, "memory": (memory.peak() or 0) - before}
     warm: dict[str, list[dict]] = {name: [] for name in METHODS}
     started, seed = time.perf_counter(), 0
     most = SECONDS_OF_NOISE if kind.one_pixel else WARM_SECONDS
@@ -377,8 +372,7 @@ def here(kind: Kind, size: int | str) -> dict:
         for name in list(METHODS)[:: 1 if seed % 2 else -1]:
             warm[name].append(renders[name](seed))
     for name, times in warm.items():
-        found[name]["warm"] = statistics.median(one["cpu"] for one in times)
-        found[name]["warm_wall"] = statistics.median(one["wall"] for one in times)
+        found[name]["warm"] = statistics.median(one["seconds"] for one in times)
         if kind.one_pixel and len(times) >= ROUNDS_OF_NOISE:
             means = [one["mean"] for one in times]
             found[name]["variance"] = statistics.variance(means) / statistics.mean(means) ** 2

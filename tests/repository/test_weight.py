@@ -29,7 +29,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2915, "tests": 28107}
+OUTSIDE = {"scripts": 2897, "tests": 28107}
 MOST_WORDS = 30256
 
 
