@@ -166,7 +166,7 @@ def film(width: int) -> dict:
 def meter(samples: int) -> dict:
     """An irradiance meter on the ground."""
     scene = film(1)
-    scene["meter"] = scenes.floor(0.01, 0.1, sensor=scenes.meter())
+    scene["meter"] = scenes.square((0, 0.01, 2), scenes.UPWARDS, 0.1, sensor=scenes.meter())
     del scene["sensor"]
     return scene
 

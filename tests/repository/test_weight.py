@@ -23,14 +23,14 @@ MOST = {
     "geometry": 1435,
     "image": 1304,
     "files": 868,
-    "run": 1102,
+    "run": 1100,
     "scene sampling": 825,
-    "host": 808,
+    "host": 809,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2897, "tests": 28107}
-MOST_WORDS = 30256
+OUTSIDE = {"scripts": 2897, "tests": 28111}
+MOST_WORDS = 30341
 
 
 def _lines(files):

@@ -113,13 +113,15 @@ def test_lit_rooms_are_decided(light):
 
 
 @pytest.mark.parametrize(
-    ("spp", "expected"), [(1, [1]), (16, [16]), (64, [1, 63])], ids=["one sample", "an edit", "longer"]
+    ("size", "spp", "expected"),
+    [(64, 1, [1]), (64, 16, [16]), (64, 64, [1, 63]), (1, 1 << 18, [1 << 18])],
+    ids=["one sample", "an edit", "longer", "one pixel"],
 )
-def test_a_short_render_has_one_pass(spp, expected):
+def test_a_short_render_has_one_pass(size, spp, expected):
     """Expected: one pass in a render of 64^2 pixels and 16 samples each, as after an edit, without a pilot;
-    two where the render is longer."""
+    two where the render is longer, but of one pixel, whose first sample gives no mean."""
     scene = mi.cornell_box()
-    scene["sensor"]["film"] |= {"width": 64, "height": 64}
+    scene["sensor"]["film"] |= {"width": size, "height": size}
     scene, integrator = mi.load_dict(scene), mi.load_dict({"type": "bdpt", "skip": "impossible"})
     render = Render(scene, scene.sensors()[0], integrator.settings, 0, spp)
     assert [step.size for step in render._steps()] == expected

@@ -27,21 +27,22 @@ class Mold:
         for texture, *column in zip(textures[0], *values, strict=True):
             if (np.array(column) != column[0]).any():
                 parameters = mi.traverse(texture)
-                own = dr.copy(parameters["value"])
                 # Lists, as in `emitters.tables.table`.
-                table = type(own)(*(mi.Float(numbers) for numbers in np.array(column).T.tolist()))
+                numbers = map(mi.Float, np.array(column).T.tolist())
+                table = type(parameters["value"])(*numbers)
                 dr.make_opaque(table)
-                self._held.append((parameters, own, table))
+                self._held.append((parameters, table))
 
     def __call__(self, question: Callable[..., Any], row: mi.UInt32, *args):
         """Return ``question(bsdf, *args)`` of the BSDF ``row``; the last of ``args`` is the call's mask."""
+        own = [dr.copy(parameters["value"]) for parameters, _ in self._held]
         try:
-            for parameters, _, table in self._held:
+            for parameters, table in self._held:
                 parameters["value"] = dr.gather(type(table), table, row, args[-1])
             return question(self.bsdfs[0], *args)
         finally:
-            for parameters, own, _ in self._held:
-                parameters["value"] = own
+            for (parameters, _), value in zip(self._held, own, strict=True):
+                parameters["value"] = value
 
 
 def molds(bsdfs: Iterable[mi.BSDF]) -> list[Mold]:

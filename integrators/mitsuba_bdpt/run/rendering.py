@@ -23,7 +23,7 @@ from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
 from ..image.sink import Image
 from ..planning import unsampled_light
-from ..planning.budget import expected_samples
+from ..planning.budget import FEW_PIXELS, expected_samples
 from ..planning.choice import Prediction
 from ..planning.configuration import MOST_ROULETTE, NOT_WORTH
 from ..planning.findings import SceneCache
@@ -51,8 +51,8 @@ from .statistics import Meter, rays
 if TYPE_CHECKING:
     from ..merging import Passes
 
-# Least samples of a render whose first pass has one sample per pixel. In shorter ones recording a second pass
-# takes longer than what roulette saves.
+# Least samples of a render whose first pass has one sample per pixel; its mean serves roulette. In shorter
+# ones recording a second pass takes longer than what roulette saves; fewer than `FEW_PIXELS` give no mean.
 TWO_PASSES = 1 << 18
 
 # Samples that estimate the image's mean, at least.
@@ -112,11 +112,10 @@ class Render:
         aims = self.plan.merging or self.plan.guidable
         near_specular = self.prepared.near_specular
         self.aim = Aim.of(scene, self.prepared.emitters, near_specular) if aims else None
-        self.merging = None
+        self.merging, self._pixels = None, int(self.prepared.camera.region.size.prod())
         if self.plan.merging:
-            pixels = int(self.prepared.camera.region.size.prod())
-            narrow = bool(near_specular)
-            self.merging = components.merging.Passes(scene, sensor, settings, self.aim, pixels, narrow)
+            given = settings, self.aim, self._pixels, bool(near_specular)
+            self.merging = components.merging.Passes(scene, sensor, *given)
         features = None
         if settings.denoise or feature_names(settings.aovs):
             features = FeatureLayers(scene, sensor, settings.aovs, spp, settings.denoise)
@@ -248,7 +247,7 @@ class Render:
     def _steps(self) -> Iterator[Step]:
         """Yield the remaining passes; under ``timeout`` one takes at most about a tenth of it."""
         if self._small_first is None:
-            long = self.spp * int(self.prepared.camera.region.size.prod()) >= TWO_PASSES
+            long = self._pixels >= FEW_PIXELS and self.spp * self._pixels >= TWO_PASSES
             self._small_first = long and self.planner.threshold is None and self._plays_roulette()
         steps = schedule(self.spp, self._longest, self.settings, self._small_first)
         earlier = sum(self.passes)
@@ -304,7 +303,7 @@ class Render:
     def _guide(self) -> Guide | None:
         """Return the photon guide, traced before the first pass; None without photons."""
         if self._guides is None:
-            count = photon_pass.photons_of(self.spp * int(self.prepared.camera.region.size.prod()))
+            count = photon_pass.photons_of(self.spp * self._pixels)
             with gc_paused(), evaluated_mode(self.prepared.emitters.evaluated):
                 guide, counts = photon_pass.trace_guide(self.kernel, self.aim, self.points.of_guide(), count)
             self.meter.launched(counts)
@@ -404,7 +403,7 @@ class Render:
 
     def _first_mean(self) -> float:
         """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
-        spp = -(-LEAST_OF_MEAN // int(self.prepared.camera.region.size.prod()))
+        spp = -(-LEAST_OF_MEAN // self._pixels)
         other = self._like(self.settings, 0, spp)
         other._pass(Step(0, 0, spp, spp))
         return number(other.accumulator.mean())
@@ -413,8 +412,7 @@ class Render:
         """Samples per pixel of the whole render; under ``timeout`` those that the passes so far predict."""
         done, timeout = sum(self.passes), self.settings.timeout
         if not done:
-            pixels = int(self.prepared.camera.region.size.prod())
-            return expected_samples(self.settings, self.spp * pixels) // pixels
+            return expected_samples(self.settings, self.spp * self._pixels) // self._pixels
         if not 0 <= timeout < math.inf:
             return max(self.spp, done)
         predicted = max(self.meter.rate(done) * timeout, done, 1)
