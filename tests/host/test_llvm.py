@@ -152,7 +152,8 @@ def render(steps):
     print(*x.numpy())
 
 mi.set_variant("llvm_ad_rgb")
-with quick_compilation() if sys.argv[1:] == ["quick"] else contextlib.nullcontext():
+ways = {"quick": quick_compilation(), "quick, kept": quick_compilation(once=False)}
+with ways.get(sys.argv[1], contextlib.nullcontext()):
     render(10)
 render(20)
 """
@@ -160,19 +161,21 @@ render(20)
 
 def test_quick_compilation(tmp_path):
     """Other code of the kernel within the block, the usual code after it; results equal but for rounding of
-    some sixty operations."""
+    some sixty operations. A kernel that is kept has again other code."""
     printed, kernels = [], []
-    for way in ("usual", "again", "quick"):
+    for way in ("usual", "again", "quick", "quick, kept"):
         cache = tmp_path / way
         cache.mkdir()
         done = run(TWO_KERNELS, way, DRJIT_CACHE_DIR=str(cache))
         assert done.returncode == 0 and not done.stderr, done.stderr
         printed.append(done.stdout)
         kernels.append({file.name: file.read_bytes() for file in cache.glob("*.bin")})
-    np.testing.assert_allclose(*(np.array(printed[i].split(), float) for i in (0, 2)), rtol=60 * 2.0**-23)
     assert kernels[0] == kernels[1], "files of kernels are not reproducible: this test shows nothing"
-    assert kernels[0].keys() == kernels[2].keys()
-    assert sum(kernels[0][name] != kernels[2][name] for name in kernels[0]) == 1
+    usual, numbers = kernels[0], [np.array(text.split(), float) for text in printed]
+    for one, other in ((0, 2), (0, 3), (2, 3)):
+        np.testing.assert_allclose(numbers[one], numbers[other], rtol=60 * 2.0**-23)
+        assert usual.keys() == kernels[one].keys() == kernels[other].keys()
+        assert sum(kernels[one][name] != kernels[other][name] for name in usual) == 1
 
 
 @pytest.mark.parametrize("named", ["", os.devnull, "an untested version"])

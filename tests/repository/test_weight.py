@@ -25,12 +25,12 @@ MOST = {
     "files": 868,
     "run": 1100,
     "scene sampling": 825,
-    "host": 809,
+    "host": 808,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2897, "tests": 28111}
-MOST_WORDS = 30341
+OUTSIDE = {"scripts": 2897, "tests": 28129}
+MOST_WORDS = 30424
 
 
 def _lines(files):

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 import short_pilots
+from mitsuba_bdpt.host import llvm
 from mitsuba_bdpt.planning import budget
 from mitsuba_bdpt.run.rendering import Render
 from mitsuba_bdpt.scene.prepared import PreparedScene
@@ -148,6 +149,20 @@ def test_an_edit_of_a_small_render_asks_no_pilot(monkeypatch, more, least):
     for spp, asked in ((least - 1, False), (least, True)):
         render = Render(scene, scene.sensors()[0], integrator.settings, 0, spp)
         assert render.planner.begin() == asked
+
+
+def test_registers_of_the_image(monkeypatch):
+    """The first image of unsampled light's mean is rendered by the image's kernel, which Dr.Jit keeps.
+    Expected: registers are allocated quickly for the estimate of that light, as usual for both images."""
+    options, seen, traced = [], [], Render._pass
+    monkeypatch.setattr(llvm, "_set_options", lambda *given: options.append(given))
+    monkeypatch.setattr(Render, "_pass", lambda *given: (seen.append(options[-1]), traced(*given)))
+    ball = GLASS | {"radius": 0.4}
+    scene = mi.cornell_box() | {"ball": ball, "lamp": {"type": "point", "position": [0, 0.7, 0]}}
+    scene["sensor"]["film"] |= {"width": 16, "height": 16}
+    mi.load_dict({"type": "bdpt"}).render(mi.load_dict(scene), spp=1)
+    assert len(seen) == 2 and b"-optimize-regalloc=false" in options[0]
+    assert all(b"-optimize-regalloc=true" in given for given in seen)
 
 
 LAMPS = {f"lamp{i}": {"type": "point", "position": [0.1 * i, 0, 0]} for i in range(budget.MANY_EMITTERS)}

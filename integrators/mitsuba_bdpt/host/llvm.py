@@ -42,9 +42,8 @@ class Choice:
     version: int | None = None
 
     def __str__(self) -> str:
-        if self.version is None:
-            return self.why
-        return f"LLVM {self.version}, {self.path or 'without known path'} ({self.why})"
+        named = f"LLVM {self.version}, {self.path or 'without known path'} ({self.why})"
+        return self.why if self.version is None else named
 
 
 def prepare() -> Choice:
@@ -125,17 +124,19 @@ def finish_installation() -> None:
 
 
 @contextlib.contextmanager
-def quick_compilation():
+def quick_compilation(once: bool = True):
     """Compile kernels without LLVM's optional passes: for kernels that run only briefly.
 
-    Results are the same; for times see experiments, "First images". Holds for the whole process, and Dr.Jit
-    caches kernels as if they were compiled as usual. No effect with untested versions of LLVM.
+    ``once``: nor with its optimizing register allocator. Results are the same; for times see experiments,
+    "First images". Holds for the whole process, and Dr.Jit caches kernels as if they were compiled as usual.
+    No effect with untested versions of LLVM.
     """
-    _set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0")
+    allocator = b"-optimize-regalloc=false" if once else b"-optimize-regalloc=true"
+    _set_options(b"-opt-bisect-verbose=false", b"-opt-bisect-limit=0", allocator)
     try:
         yield
-    finally:
-        _set_options(b"-opt-bisect-limit=%d" % (2**31 - 1))  # limits nothing
+    finally:  # limits nothing
+        _set_options(b"-opt-bisect-limit=%d" % (2**31 - 1), b"-optimize-regalloc=true")
 
 
 def _set_options(*options: bytes) -> bool:
@@ -153,11 +154,9 @@ def _set_options(*options: bytes) -> bool:
 
 def cuda_driver() -> bool:
     """Whether a driver of CUDA can be loaded; slow."""
-    try:
-        ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
-    except OSError:
-        return False
-    return True
+    with contextlib.suppress(OSError):
+        return bool(ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1"))
+    return False
 
 
 def remedy() -> str:

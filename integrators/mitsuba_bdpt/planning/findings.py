@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import mitsuba as mi
 
-from ..host.llvm import quick_compilation
 from ..host.notices import State, cached
 from ..scene.prepared import PreparedScene
 
@@ -25,12 +24,11 @@ class SceneCache:
         self._state: tuple[State, int] | None = None
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
-        """Return the result of ``look()``, whose kernels run once, and whether it was cached for ``key``."""
+        """Return the result of ``look()``, and whether it was cached for ``key``."""
         if self._state is None:  # detects edits
-            state = State.of([self._prepared.scene, self._sensor])
-            self._state = state, self._prepared.camera.region.border
+            self._state = State.of([self._prepared.scene, self._sensor]), self._prepared.camera.region.border
         key = self._state, key
-        return cached(self._prepared.scene, self._sensor, kind, key, quick_compilation()(look))
+        return cached(self._prepared.scene, self._sensor, kind, key, look)
 
     def expire(self):
         """Read the parameters again before the next lookup: they may have been edited."""

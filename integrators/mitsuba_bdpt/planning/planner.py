@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from .. import components
 from ..host.jit import evaluated_mode, gc_paused
+from ..host.llvm import quick_compilation
 from ..sampling.sequences import PILOT, sequence_seed
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
@@ -102,6 +103,7 @@ class Planner:
             self.adopt(Decision.of(best.candidate, **values), left_out)
         return self.table
 
+    @quick_compilation()
     def _piloted(self) -> _Result:
         """Result of a pilot whose samples leave out the light that photons can guide.
 

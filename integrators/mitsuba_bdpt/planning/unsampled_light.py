@@ -19,6 +19,7 @@ from .. import components
 from ..errors import listed
 from ..host.introspection import all_shapes, named
 from ..host.jit import evaluated_mode, gc_paused
+from ..host.llvm import quick_compilation
 from ..host.notices import warn_once
 from ..sampling.points import Points
 from ..scene.diagnostics import NAMED
@@ -152,8 +153,7 @@ def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool
     contradictory = media is not None and media.contradiction  # light subpaths would see another scene
     if plan.merging or components.why_absent("merging") or not prepared.emitters.traced or contradictory:
         return False
-    beams = prepared.emitters.beams and not plan.splat
-    never = not plan.arrival and (_has_sds_paths(prepared) or beams)
+    never = not plan.arrival and (_has_sds_paths(prepared) or (prepared.emitters.beams and not plan.splat))
     return never or is_undersampling_possible(prepared, plan, settings)
 
 
@@ -169,6 +169,7 @@ def _has_sds_paths(prepared: PreparedScene) -> bool:
     return prepared.delta and prepared.emitters.unhittable
 
 
+@quick_compilation()
 def estimate(
     prepared: PreparedScene, plan: Plan, settings: Settings, samples: int = PREVIEW
 ) -> UnsampledLight:
@@ -205,11 +206,10 @@ def estimate(
 
 def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, fewest: int) -> GuidableLight:
     """SDS light that photons can guide s = 0 to find; ``fewest``: `FEWEST_HITS`, or 0."""
-    names = components.merging.GUIDABLE
     rarest = fewest / int(prepared.camera.region.size.prod())
     policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)
     _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, policy)
-    return GuidableLight(*np.array(policy.sums).reshape(-1, len(names)).T / lanes)
+    return GuidableLight(*np.array(policy.sums).reshape(-1, len(components.merging.GUIDABLE)).T / lanes)
 
 
 def _merged(

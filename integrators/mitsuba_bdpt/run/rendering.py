@@ -18,6 +18,7 @@ from ..emitters.light_groups import LightGroups
 from ..errors import UnsupportedError, UsageError, behind
 from ..host.introspection import number
 from ..host.jit import evaluated_mode, gc_paused
+from ..host.llvm import quick_compilation
 from ..host.notices import warn_once
 from ..image.accumulator import Accumulator, Parts
 from ..image.features import FeatureLayers, feature_names
@@ -104,9 +105,7 @@ class Render:
             raise UnsupportedError(f"{why}; leave out merging")
         self.findings = like.findings if like else SceneCache(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings, self._is_open)
-        if not isinstance(seed, mi.UInt32):
-            seed = integer(seed, "seed", 0)
-        seed = mi.UInt32(seed)
+        seed = mi.UInt32(seed if isinstance(seed, mi.UInt32) else integer(seed, "seed", 0))
         dr.make_opaque(seed)
         self.points = PassPoints(settings, seed)
         aims = self.plan.merging or self.plan.guidable
@@ -300,6 +299,7 @@ class Render:
         self.meter.launched(counts)
         return photons
 
+    @quick_compilation()
     def _guide(self) -> Guide | None:
         """Return the photon guide, traced before the first pass; None without photons."""
         if self._guides is None:
@@ -401,11 +401,11 @@ class Render:
             shares = unsampled.shares(self.findings.find("mean", self.settings, self._first_mean)[0])
         return unsampled_light.missing(self.prepared, self.plan, unsampled, shares, self._samples())
 
+    @quick_compilation(once=False)
     def _first_mean(self) -> float:
         """Mean of an image of one sample per pixel, or of `LEAST_OF_MEAN` samples."""
-        spp = -(-LEAST_OF_MEAN // self._pixels)
-        other = self._like(self.settings, 0, spp)
-        other._pass(Step(0, 0, spp, spp))
+        other = self._like(self.settings, 0, -(-LEAST_OF_MEAN // self._pixels))
+        other._pass(Step(0, 0, other.spp, other.spp))
         return number(other.accumulator.mean())
 
     def _samples(self) -> int:
