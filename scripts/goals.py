@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import repository
+import scale
 from mitsuba_bdpt.files.texts import read_toml
 from mitsuba_bdpt.measure.analysis import (
     MEDIA_RIVALS,
@@ -175,6 +176,16 @@ def floor(results: Results) -> Measured:
     return Measured(text, [one.median for one in found.values()])
 
 
+def scaled(rows: list[dict], kind: str, size: int | str, figure: str, method: str) -> Measured:
+    """A figure of scale.py."""
+    own = [row for row in rows if row["kind"] == kind]
+    for row in own:
+        if row["size"] == size:
+            value = scale.FIGURES[figure](own, row, method)
+            return Measured(f"{value:.3g}", [value])
+    raise Unavailable("not measured")
+
+
 @dataclass(frozen=True)
 class Goal:
     """``what`` must reach ``bounds``; fields as in goals.toml."""
@@ -187,7 +198,7 @@ class Goal:
     text: str = "{:g}x"
     at_most: bool = False
 
-    def row(self, results: Results) -> list[str]:
+    def row(self, results: Results | list[dict]) -> list[str]:
         """The goal, what was measured, and whether all numbers meet the bound; intervals do not matter."""
         try:
             found = self.measure(results, *self.scenes)
@@ -207,10 +218,19 @@ def _read(measure: str, what: str | None = None, **row) -> Goal:
     return Goal(what or f"… `{row['scenes'][0]}`", measure=globals()[measure], **row)
 
 
-GOALS = [_read(**row) for row in read_toml(Path(__file__).with_suffix(".toml"))["goals"]]
+_TABLES = read_toml(Path(__file__).with_suffix(".toml"))
+GOALS, OF_SCALE = ([_read(**row) for row in _TABLES[name]] for name in ("goals", "scale"))
+
+
+def _table(goals: list[Goal], results: Results | list[dict]) -> str:
+    return table(["what", "bound", "aim", "measured", "met"], [goal.row(results) for goal in goals])
 
 
 def goals_table(results: Results) -> str:
     """Goals and measurements, and whether they are met, at the default budget of comparisons."""
-    results = replace(results, compared=None)
-    return table(["what", "bound", "aim", "measured", "met"], [goal.row(results) for goal in GOALS])
+    return _table(GOALS, replace(results, compared=None))
+
+
+def scale_table(record: dict) -> str:
+    """The same for a record of scale.py."""
+    return _table(OF_SCALE, record["rows"])

@@ -26,17 +26,9 @@ SPOT_AXIS = np.array((0.070, -0.432, 0.899))  # the way its wall spot points
 SPOT_CENTRE = np.array((-2.659, 4.911, -3.368))
 SPOT_RADIUS, SPOT_LENGTH = 0.298, 0.98
 
-# The cut-glass lamp of lamp_behind_glass: (height, radius) of its edges around the lamp's middle.
+# The cut-glass lamp of lamp_behind_glass: heights and radii of its edges around the lamp's middle.
 CUT_GLASS = np.array(
-    [
-        (-0.28, 0.0),
-        (-0.21, 0.12),
-        (-0.09, 0.205),
-        (0.04, 0.215),
-        (0.15, 0.15),
-        (0.21, 0.08),
-        (0.225, 0.0),
-    ]
+    [(-0.28, -0.21, -0.09, 0.04, 0.15, 0.21, 0.225), (0.0, 0.12, 0.205, 0.215, 0.15, 0.08, 0.0)]
 )
 CUT_GLASS_SIDES = 12
 
@@ -162,7 +154,7 @@ def spot_cap():
 
 def cut_glass():
     """Body with flat facets: no normals, so that refraction follows the geometry exactly."""
-    height, radius = CUT_GLASS[::-1].T
+    height, radius = CUT_GLASS[:, ::-1]
     nothing = np.zeros(len(height))
     vertices, _, faces = revolve(height, radius, nothing, nothing, sides=CUT_GLASS_SIDES)
     return vertices, None, faces

@@ -76,7 +76,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "goals": lambda: goals.goals_table(benchmark().results),
     "benchmark": lambda: benchmark().text().partition("\n")[2],  # the page has the title
     "scale": partial(_recorded, "scale", scale.tables),
-    "scale goals": partial(_recorded, "scale", scale.goals),
+    "scale goals": partial(_recorded, "scale", goals.scale_table),
     "stress": partial(_recorded, "stress", stress.summary),
     "cases": partial(_recorded, "stress", stress.tables),
     "peers": partial(_recorded, "peers", peers.tables),

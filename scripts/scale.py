@@ -268,17 +268,6 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class Goal:
-    """A ratio over `path` that a row should not exceed: ``method`` of `METHODS`, ``figure`` of `FIGURES`."""
-
-    kind: str
-    size: int | str
-    figure: str
-    most: float
-    method: str = "bdpt"
-
-
 def over_path(row: dict, figure: str, method: str) -> float:
     """A time (``first``, ``warm``) of a method over that of `path`."""
     return row[method][figure] / row["path"][figure]
@@ -297,37 +286,14 @@ def slope(rows: list[dict], row: dict, method: str) -> float:
     return (extra[1] - extra[0]) / (row["size"] - last["size"])
 
 
-FIGURES = {
-    "warm": ("warm render", lambda rows, row, method: over_path(row, "warm", method)),
-    "first": ("first image", lambda rows, row, method: over_path(row, "first", method)),
-    "slope": ("ms an object", slope),
-    "memory": ("memory in GiB", lambda rows, row, method: row[method]["memory"] / 2**30),
-    "over box": (
-        "ratio over that of the box filter",
-        lambda rows, row, method: over_path(row, "warm", method) / over_path(rows[0], "warm", method),
-    ),
+FIGURES: dict[str, Callable[[list[dict], dict, str], float]] = {
+    "warm": lambda rows, row, method: over_path(row, "warm", method),
+    "first": lambda rows, row, method: over_path(row, "first", method),
+    "slope": slope,
+    "memory": lambda rows, row, method: row[method]["memory"] / 2**30,
+    "over box": lambda rows, row, method: over_path(row, "warm", method) / over_path(rows[0], "warm", method),
 }
-"""Figures of a row, given the rows of its kind: in words, and the function."""
-
-GOALS = (
-    Goal("previews", 8, "first", 4),
-    Goal("film", 4096, "memory", 1.5),
-    Goal("samples", 10**6, "warm", 2),
-    Goal("meter", 10**6, "warm", 2),
-    Goal("lamp mesh", 10**6, "warm", 1.5),
-    Goal("materials", 300, "warm", 2),
-    Goal("lamps", 1000, "warm", 1.5),
-    Goal("lamps", 1000, "slope", 0.2),
-    Goal("textured lamps", 128, "warm", 2),
-    Goal("instances", 100, "warm", 1.3),
-    Goal("instances", 300, "first", 2),
-    Goal("edits", "lamp", "warm", 2),
-    Goal("edits", "texture", "warm", 2),
-    Goal("edits", "vertices", "warm", 2),
-    Goal("edits", "lamp", "warm", 1.1, "alone"),
-    Goal("filters", "gaussian", "over box", 1.1),
-    Goal("filters", "lanczos", "over box", 1.2),
-)
+"""Figures for goals.toml, given the rows of a kind, one of them and a method."""
 
 
 def taken(kind: Kind, size: int | str, scene: mi.Scene, integrator: mi.Integrator, seed: int) -> dict:
@@ -455,23 +421,6 @@ def tables(record: dict) -> str:
         )
         parts.append(f"**{name}**: {kind.what}.{note}\n\n" + table(HEAD, [cells(rows, row) for row in rows]))
     return "\n".join(parts)
-
-
-def goals(record: dict) -> str:
-    """What was aimed at and what was measured, as Markdown."""
-    lines = []
-    for goal in GOALS:
-        rows = [row for row in record["rows"] if row["kind"] == goal.kind]
-        found = next((row for row in rows if row["size"] == goal.size), None)
-        words, figure = FIGURES[goal.figure]
-        size = f"{goal.size:,}" if isinstance(goal.size, int) else goal.size
-        what = f"{goal.kind}, {size}, {words}" + (", path tracing alone" if goal.method == "alone" else "")
-        value = figure(rows, found, goal.method) if found else None
-        measured, met = "not measured", "–"
-        if value is not None:
-            measured, met = f"{value:.3g}", "yes" if value <= goal.most else "**no**"
-        lines.append([what, f"{goal.most:g}", measured, met])
-    return table(["what", "at most", "measured", "met"], lines)
 
 
 def main(arguments=None) -> int:

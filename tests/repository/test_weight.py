@@ -29,7 +29,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2897, "tests": 28129}
+OUTSIDE = {"scripts": 2858, "tests": 28129}
 MOST_WORDS = 30424
 
 
