@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2858, "tests": 28129}
-MOST_WORDS = 30424
+OUTSIDE = {"scripts": 2851, "tests": 28129}
+MOST_WORDS = 30379
 
 
 def _lines(files):
