@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2851, "tests": 28129}
-MOST_WORDS = 30379
+MOST_WORDS = 30692
 
 
 def _lines(files):
