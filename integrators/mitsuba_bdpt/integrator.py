@@ -131,7 +131,7 @@ class BDPTIntegrator(metaclass=ABCMeta):
         render = self._new_render(scene, sensor, seed, spp, start)
         if start is not None:
             render.resume(start)
-        messages.warn_of_scene(render.prepared, render.sensor, self.settings)
+        messages.warn_of_scene(render.prepared, render.findings, self.settings)
         try:
             self._cancelled = False
             if not render.passes:

@@ -156,12 +156,12 @@ def test_channels_of_a_film_are_those_of_its_sums(monkeypatch):
     narrow, wide = {"type": "gaussian"}, {"type": "gaussian", "stddev": 1}
     for rfilter, most, of_a_pixel in ((narrow, GIB, 192), (wide, GIB, 192 + copies), (wide, 1, 192)):
         monkeypatch.setattr(film_limits, "COPIES_MEMORY", most)
-        film = mi.load_dict({"type": "hdrfilm", "width": 64, "height": 64, "filter": rfilter})
-        memory.set_limit(of_a_pixel * 64 * 64)
+        film = mi.load_dict({"type": "hdrfilm", "width": 1024, "height": 1024, "filter": rfilter})
+        memory.set_limit(of_a_pixel * 1024 * 1024)
         try:
             film_limits.check_film(film, Channels(3, 0, 0), False)
-            memory.set_limit(of_a_pixel * 64 * 64 - 1)
-            with pytest.raises(ValueError, match="64 x 64 pixels"):
+            memory.set_limit(of_a_pixel * 1024 * 1024 - 1)
+            with pytest.raises(ValueError, match="1024 x 1024 pixels"):
                 film_limits.check_film(film, Channels(3, 0, 0), False)
         finally:
             memory.set_limit(None)

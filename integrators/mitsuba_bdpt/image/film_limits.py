@@ -14,6 +14,9 @@ from .taps import is_wide
 # Of one array.
 MOST_NUMBERS = 1 << 32
 
+# Bytes that are not compared with the machine's: Mitsuba alone takes more, and to find these takes 1 ms.
+SMALL = 1 << 26
+
 # Bytes that strategy images may take.
 STRATEGY_MEMORY = 2 << 30
 
@@ -35,13 +38,14 @@ def check_film(film, channels: Channels, variance: bool):
     if variance:  # and the sums at the last replicate
         of_film += channels.colours
         per_pixel += DOUBLE * (channels.camera + light + OF_VARIANCE * channels.colours)
-    needed, there = width * height * (per_pixel + SINGLE * of_film), memory.available()
+    needed = width * height * (per_pixel + SINGLE * of_film)
     wide = is_wide(film.rfilter())
     copied = [channels.camera * SINGLE] if channels.partitions or wide else []
     copied += [light * DOUBLE] if wide else []
     copies = (width * height * per_copy * dr.thread_count() for per_copy in copied)
     needed += sum(size for size in copies if size <= COPIES_MEMORY)  # others are not made: `reduce_mode`
-    if needed > there.bytes and not (mi.variant() or "").startswith("cuda"):  # a GPU's memory is not known
+    on_gpu = (mi.variant() or "").startswith("cuda")  # whose memory is not known
+    if needed > SMALL and not on_gpu and needed > (there := memory.available()).bytes:
         raise UsageError(
             f"the film of {width} x {height} pixels takes about {needed / 2**30:.3g} GiB of memory; there "
             f"are {there.bytes / 2**30:.3g} GiB ({there.limit}); render a smaller film, or crop windows "

@@ -26,9 +26,10 @@ def log(statistics: dict):
         )
 
 
-def warn_of_scene(prepared, sensor, settings):
+def warn_of_scene(prepared, findings, settings):
     """Warn once about parameters that spoil images, and media that are ignored or contradictory."""
-    texts, media = list(spoilt(prepared, settings)), prepared.light_media
+    found, _ = findings.find("flaws", settings, lambda: spoilt(prepared, settings))
+    texts, media = list(found), prepared.light_media
     if media is not None:
         texts += [p.strange for p in prepared.space.media.properties]
         if media.contradiction:
