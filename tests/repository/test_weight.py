@@ -16,21 +16,21 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 5102,
     "transport merging guided_emission": 5730,
-    "planning": 1738,
+    "planning": 1743,
     "emitters": 2201,
     "cli": 1472,
     "media": 1347,
     "geometry": 1435,
-    "image": 1304,
+    "image": 1321,
     "files": 868,
-    "run": 1100,
+    "run": 1182,
     "scene sampling": 825,
-    "host": 808,
+    "host": 814,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2851, "tests": 28129}
-MOST_WORDS = 30692
+OUTSIDE = {"scripts": 2851, "tests": 28271}
+MOST_WORDS = 30806
 
 
 def _lines(files):

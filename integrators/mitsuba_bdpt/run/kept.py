@@ -1,8 +1,8 @@
 """Launches as Dr.Jit has recorded them (``dr.freeze``), which later renders of an unchanged scene replay.
 
-A replay repeats the recorded kernels with the data that its arrays have now; its key is all else that recording
-reads. Dr.Jit raises an error for arrays that it does not reach from the arguments (phase functions ``hg`` have
-one): such launches are recorded anew by each render.
+A replay repeats the recorded kernels with the data that its arrays have now; its key is all else that
+recording reads. Dr.Jit raises an error for arrays that it does not reach from the arguments (phase functions
+``hg`` have one): such launches are recorded anew by each render.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Kept:
         self._frozen, self._refused = dr.freeze(_launch, limit=1), False
 
     def run(self, launch: Callable[[], Any], film, scene: mi.Scene, sensor: mi.Sensor, held) -> Any:
-        """Return ``launch()``, the first to add to ``film``; ``held``: objects that hold the arrays it uses."""
+        """Return ``launch()``, the first to add to ``film``; ``held``: objects with the arrays it uses."""
         if not self._refused:
             arrays: list = []
             _collect((film, held), arrays, {})

@@ -43,7 +43,7 @@ def warn_of_scene(prepared, findings, settings):
                 "arrives through it; put a shape with a null BSDF around it"
             )
     for text in filter(None, texts):
-        warn_once(prepared.scene, sensor, f"bdpt: {text}")
+        warn_once(prepared.scene, prepared.sensor, f"bdpt: {text}")
 
 
 def warn_of_unsampled_light(prepared, plan, missing: Missing | None):
