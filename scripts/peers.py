@@ -193,7 +193,7 @@ def measured(name: str, renders: Renders, wanted: list[str]) -> list[dict]:
         own = method.startswith("BIDIR") and name != "ajar_door"  # there they are too noisy
         reference, difference = renders.reference(name, own)
         row = {"scene": name, "renderer": renderer, "method": method} | figures
-        row["mean"] = float(image.mean() / reference.mean())
+        row["mean"] = float(image.mean() / renders.reference(name, own=False)[0].mean())
         for key, trim in (("trimmed", TRIM), ("raw", 0.0)):
             row[key] = rel_mse(image, reference, trim) - reference_rel_mse(difference, image, reference, trim)
         rows.append(row)

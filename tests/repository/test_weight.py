@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2851, "tests": 28271}
-MOST_WORDS = 30806
+MOST_WORDS = 30813
 
 
 def _lines(files):
