@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2851, "tests": 28271}
-MOST_WORDS = 30813
+MOST_WORDS = 30942
 
 
 def _lines(files):
