@@ -51,7 +51,7 @@ METHODS = {
         "PATHCPU, light tracing": {"renderengine.type": "PATHCPU", "path.hybridbackforward.enable": 1},
         "PATHCPU, caustic cache": {"renderengine.type": "PATHCPU", "path.photongi.caustic.enabled": 1}
         | {"path.photongi.photon.maxcount": 1_000_000, "path.photongi.caustic.updatespp": 0},
-        "BIDIRCPU": {"renderengine.type": "BIDIRCPU"},
+        "BIDIRCPU": {"renderengine.type": "BIDIRCPU", "path.russianroulette.depth": 100},
         "BIDIRVMCPU": {"renderengine.type": "BIDIRVMCPU"},
     },
     "smallvcm": {name: {"type": name.lower()} for name in ("VCM", "BPT", "PPM")},
@@ -170,11 +170,10 @@ class Renders:
             figures.write_text(re.findall("^ANSWER (.*)$", said, re.MULTILINE)[-1])
         return np.load(image), json.loads(figures.read_text())
 
-    def reference(self, name: str, own: bool) -> tuple[np.ndarray, np.ndarray]:
-        """A reference and half the difference of its halves: ours, or ``own`` of LuxCore's BIDIRCPU."""
-        if own or self.changed:
-            made_by = ("luxcore", "BIDIRCPU") if own else ("mitsuba", "bdpt")
-            a, b = (self(*made_by, seed, HALVES.get(name, 2))[0] for seed in (2, 3))
+    def reference(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """A reference and half the difference of its halves."""
+        if self.changed:
+            a, b = (self("mitsuba", "bdpt", seed, HALVES[name])[0] for seed in (2, 3))
             return (a + b) / 2, (a - b) / 2
         stored = repository.load_reference(name, SIZE, self.depth)
         return stored.image, stored.difference
@@ -190,10 +189,9 @@ def measured(name: str, renders: Renders, wanted: list[str]) -> list[dict]:
         if NEEDS.get(method, renders.kinds).isdisjoint(renders.kinds):
             continue
         image, figures = renders(renderer, method)
-        own = method.startswith("BIDIR") and name != "ajar_door"  # there they are too noisy
-        reference, difference = renders.reference(name, own)
+        reference, difference = renders.reference(name)
         row = {"scene": name, "renderer": renderer, "method": method} | figures
-        row["mean"] = float(image.mean() / renders.reference(name, own=False)[0].mean())
+        row["mean"] = float(image.mean() / reference.mean())
         for key, trim in (("trimmed", TRIM), ("raw", 0.0)):
             row[key] = rel_mse(image, reference, trim) - reference_rel_mse(difference, image, reference, trim)
         rows.append(row)

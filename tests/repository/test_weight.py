@@ -29,7 +29,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2851, "tests": 28271}
+OUTSIDE = {"scripts": 2849, "tests": 28271}
 MOST_WORDS = 30942
 
 
