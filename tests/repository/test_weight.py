@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2849, "tests": 28271}
-MOST_WORDS = 30942
+OUTSIDE = {"scripts": 2849, "tests": 28275}
+MOST_WORDS = 30970
 
 
 def _lines(files):

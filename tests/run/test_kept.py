@@ -75,6 +75,8 @@ def known(parameters, name):
 
 def changed(value):
     """Another value of a parameter, or None."""
+    if isinstance(value, float):
+        return value * 0.9
     if value is not None and dr.is_float_v(value):
         return value * 0.9 if dr.width(value) else None
     if "Transform4f" in type(value).__name__:
@@ -84,7 +86,8 @@ def changed(value):
 
 @pytest.mark.parametrize("sensor", LAMPS)
 def test_every_parameter_may_be_edited(sensor, kept):
-    """Every parameter that ``mi.traverse`` shows, of all plugins. Expected: after an edit the image that is
+    """Rationale: numbers of C++ objects that are no arrays are part of a recording (``eta`` of ``plastic``).
+    Every parameter that ``mi.traverse`` shows, of all plugins. Expected: after an edit the image that is
     rendered when nothing is kept, to the bit, by the render that records and by the one that replays."""
     lamps = {f"lamp{i}": EMITTERS[name]() for i, name in enumerate(LAMPS[sensor])}
     first = list(LAMPS).index(sensor)
@@ -93,9 +96,10 @@ def test_every_parameter_may_be_edited(sensor, kept):
     scene = mi.load_dict({"type": "scene", **part, **lamps, **balls})
     parameters = mi.traverse(scene)
     names = [name for name in parameters.keys() if changed(known(parameters, name)) is not None]
-    dr.make_opaque([parameters[name] for name in names])  # else each edit compiles a kernel
+    arrays = [parameters[name] for name in names if not isinstance(parameters[name], float)]
+    dr.make_opaque(arrays)  # else each edit compiles a kernel
     parameters.update()
-    for name in names:
+    for name in sorted(names, key=lambda name: "sampling_weight" in name):  # unequal ones are not kept
         new = changed(parameters[name])
         dr.make_opaque(new)
         parameters[name] = new
@@ -105,7 +109,7 @@ def test_every_parameter_may_be_edited(sensor, kept):
         kept.on = True
         for number in range(2):
             np.testing.assert_array_equal(image(scene), expected, err_msg=f"{name}, {number}")
-    assert kept.count > 10
+    assert kept.count > len(names)
 
 
 def test_seeds_parameters_and_other_scenes(kept):
