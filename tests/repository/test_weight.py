@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2849, "tests": 28275}
-MOST_WORDS = 30970
+OUTSIDE = {"scripts": 2961, "tests": 28275}
+MOST_WORDS = 31319
 
 
 def _lines(files):

@@ -150,8 +150,8 @@ class Planner:
             table = [row for row in table if row.candidate.guided] or table
         left_out = choice.left_out(table, "merging" if full.merging else "guided s=0")
         if full.guidable and not full.guided and (rare or guidable is None):
-            why = "with so many BSDFs the render is too short to predict its gain"
-            why = "rays hardly ever hit the emitters of a part of the light" if rare else why
+            short = "with so many BSDFs the render is too short to predict its gain"
+            why = "rays hardly ever hit the emitters of a part of the light" if rare else short
             left_out.append(not_worth("guided s=0", why))
         if learnt and table and table[0].candidate.emission is None:
             left_out += components.guided_emission.left_out(learnt)
