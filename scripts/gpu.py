@@ -1,22 +1,22 @@
 """The benchmark's scenes on a GPU: errors and times of `bdpt` and `path` in a variant of CUDA.
 
-    python scripts/gpu.py --output docs/reports/cuda.json            # all scenes of the benchmark
-    python scripts/gpu.py --output docs/reports/cuda.json --report   # the page of the file that is there
+    python scripts/gpu.py --device "NVIDIA H200"    # all of them; writes docs/reports/cuda.json
 
-Every scene has a process of its own, twelve at a time. First they render all methods once, side by side,
-which compiles their kernels; then they take turns, so that nothing else runs on the GPU while one is timed.
-(Thirty side by side run out of memory: each keeps stacks for all threads of the GPU.) 128^2 pixels, as many
-samples per pixel for every method; `path` (`volpath` in media) with the sampler `multijitter`. An error is
-the median relMSE over seeds against the reference that is committed, raw and without the worst pixels; the
-ratio over `path` that of errors times seconds. Bias: `compare_means` of the renders against the reference.
+Every scene first renders once by each method in a process of its own, twelve at a time, which compiles its
+kernels (thirty run out of memory: each keeps stacks for all threads of the GPU), then, alone, in another one
+that is timed. 128^2 pixels, as many samples per pixel for every method; `path` (`volpath` in media) with the
+sampler `multijitter`. An error is the median relMSE over seeds against the reference that is committed, raw
+and without the worst pixels. Bias: `compare_means` of the renders against the reference.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import multiprocessing
-import time
-from functools import partial
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from pathlib import Path
 
 import command_line
@@ -32,6 +32,7 @@ from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import ratio, table
 from mitsuba_bdpt.measure.timing import Timed, alternating, timed
 
+RECORD = repository.ROOT / "docs" / "reports" / "cuda.json"
 SPP, SEEDS = 256, 8
 METHODS = {
     "bdpt": ({"type": "bdpt"}, "independent"),
@@ -40,20 +41,7 @@ METHODS = {
 }
 BESIDE = 12
 """Processes at a time."""
-PATIENCE = 130
-"""Seconds after which a scene no longer waits until all others have compiled."""
-
-
-def subject(name: str) -> tuple[dict, int]:
-    """What renders a scene, {method: (scene, integrator)}, and its ``max_depth``."""
-    file, depth = repository.PROJECT.scene(name), repository.benchmark_depth(name)
-    loaded = {sampler: file.load(repository.RESOLUTION, sampler) for _, sampler in METHODS.values()}
-    made = {}
-    for method, (parameters, sampler) in METHODS.items():
-        if method == "path":
-            parameters = parameters | {"type": path_tracers(file.has_media)[0]}
-        made[method] = loaded[sampler], integrator_of(parameters, depth)
-    return made, depth
+HEAD = "scene|ms|`path` ms|relMSE, trimmed|over `path`, trimmed|raw|over `skip=none`|first render, s|bias"
 
 
 def row(name: str, reference, method: str, found: list[Timed]) -> dict:
@@ -75,65 +63,29 @@ def row(name: str, reference, method: str, found: list[Timed]) -> dict:
     }
 
 
-def measure(name: str, variant: str, compiled, turn, results) -> None:
-    """Put the rows of a scene, or the error that it ended with, into the queue ``results``."""
-    mi.set_variant(variant)
-    try:
-        methods, depth = subject(name)
-        renders = [partial(timed, *made, SPP) for made in methods.values()]
-        first = [render(0).seconds for render in renders]
-        wait(compiled)
-        reference = repository.load_reference(name, repository.RESOLUTION, depth)
-        with turn:
-            turns = list(alternating(renders, SEEDS, is_warm=True))
-        rows = [
-            row(name, reference, method, list(found)) | {"first_seconds": seconds}
-            for method, found, seconds in zip(methods, zip(*turns, strict=True), first, strict=True)
-        ]
-        results.put((name, rows, versions()))
-    except Exception as error:  # the others go on; it is in the file
-        results.put((name, f"{type(error).__name__}: {error}", versions()))
-        wait(compiled)
+def here(name: str, seeds: int) -> list:
+    """The rows of a scene; without ``seeds`` the seconds of the first renders."""
+    file, depth = repository.PROJECT.scene(name), repository.benchmark_depth(name)
+    renders, load = [], cache(partial(file.load, repository.RESOLUTION))
+    for method, (parameters, sampler) in METHODS.items():
+        if method == "path":
+            parameters = parameters | {"type": path_tracers(file.has_media)[0]}
+        renders.append(partial(timed, load(sampler), integrator_of(parameters, depth), SPP))
+    first = [render(0).seconds for render in renders]
+    if not seeds:
+        return first
+    reference = repository.load_reference(name, repository.RESOLUTION, depth)
+    turns = zip(*alternating(renders, seeds, is_warm=True), strict=True)
+    return [row(name, reference, *found) for found in zip(METHODS, turns, strict=True)]
 
 
-def wait(compiled) -> None:
-    """Until all processes have come so far, or `PATIENCE` is at an end for one of them."""
-    if not compiled.broken:
-        try:
-            compiled.wait(PATIENCE)
-        except Exception:  # threading.BrokenBarrierError, of a class that depends on the platform
-            return
-
-
-def collect(names: list[str], variant: str) -> tuple[list[dict], dict, dict]:
-    """Rows of scenes that are rendered side by side, errors of those that failed, and versions."""
-    context = multiprocessing.get_context("spawn")
-    compiled, turn, results = context.Barrier(len(names)), context.Lock(), context.Queue()
-    processes = [
-        context.Process(target=measure, args=(name, variant, compiled, turn, results), daemon=True)
-        for name in names
-    ]
-    for process in processes:
-        process.start()
-    rows, failed, software, waiting = [], {}, {}, set(names)
-    while waiting and any(process.is_alive() for process in processes):
-        if results.empty():
-            time.sleep(0.05)
-            continue
-        name, found, software = results.get()
-        waiting.discard(name)
-        if isinstance(found, str):
-            failed[name] = found
-        else:
-            rows += found
-        print(name, found if isinstance(found, str) else "done", flush=True)
-    failed |= dict.fromkeys(waiting, "its process ended without a word")
-    return rows, failed, software
-
-
-def batched(names: list[str], size: int) -> list[list[str]]:
-    """``names`` in lists of ``size`` (`itertools.batched` is not in Python 3.11)."""
-    return [names[i : i + size] for i in range(0, len(names), size)]
+def apart(variant: str, seeds: int, name: str) -> list | str:
+    """What `here` returns in a new process, or the last line of its error."""
+    command = [sys.executable, __file__, "--here", name, str(seeds), "--variant", variant]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1]
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def speedup(ours: dict, theirs: dict, error: str) -> float:
@@ -142,52 +94,50 @@ def speedup(ours: dict, theirs: dict, error: str) -> float:
 
 
 def page(found: dict) -> str:
-    """The table of a file's figures, as Markdown."""
+    """The table of a record, as Markdown."""
     by_scene: dict[str, dict] = {}
     for one in found["rows"]:
         by_scene.setdefault(one["scene"], {})[one["method"]] = one
     lines = []
     for name, methods in sorted(by_scene.items()):
         ours, path, none = methods["bdpt"], methods["path"], methods["bdpt skip=none"]
-        bias = (
-            "too few renders" if ours["bias"] is None else "none found" if ours["bias"]["passed"] else "found"
-        )
+        judged = {None: "too few renders", True: "none found", False: "found"}
         lines.append(
-            [
-                name,
-                f"{1e3 * ours['seconds']:.0f}",
-                f"{1e3 * path['seconds']:.0f}",
-                f"{ours['trimmed']:.3g}",
-                *(ratio(speedup(ours, path, which)) for which in ("trimmed", "rel_mse")),
-                ratio(speedup(ours, none, "trimmed")),
-                f"{ours['first_seconds']:.0f}",
-                bias,
-            ]
+            [name, *(f"{1e3 * one['seconds']:.0f}" for one in (ours, path)), f"{ours['trimmed']:.3g}"]
         )
-    head = [
-        "scene", "ms", "`path` ms", "relMSE, trimmed", "over `path`, trimmed", "raw", "over `skip=none`",
-        "first render, s", "bias",
-    ]  # fmt: skip
-    return table(head, lines)
+        lines[-1] += [ratio(speedup(ours, path, error)) for error in ("trimmed", "rel_mse")]
+        lines[-1] += [ratio(speedup(ours, none, "trimmed")), f"{ours['first_seconds']:.0f}"]
+        lines[-1] += [judged[ours["bias"] and ours["bias"]["passed"]]]
+    return table(HEAD.split("|"), lines)
 
 
 def main(arguments=None) -> None:
-    """Measure, or print the table of an earlier measurement."""
+    """Measure."""
     parser = command_line.parser(__doc__)
     parser.add_argument("scenes", nargs="*", help="names; by default those of the benchmark")
     parser.add_argument("--variant", default="cuda_ad_rgb")
     parser.add_argument("--device", default="", help="name of the GPU, for the file")
-    parser.add_argument("--output", type=Path, required=True, metavar="FILE.json")
-    parser.add_argument("--report", action="store_true", help="print the table of the file")
+    parser.add_argument("--output", type=Path, default=RECORD, metavar="FILE.json")
+    parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
-    if not options.report:
-        found = {"variant": options.variant, "device": options.device, "spp": SPP, "rows": [], "failed": {}}
-        for names in batched(options.scenes or repository.benchmark_scenes(), BESIDE):
-            rows, failed, found["software"] = collect(names, options.variant)
-            found["rows"] += rows
-            found["failed"] |= failed
-            options.output.write_text(json.dumps(found, indent=1) + "\n")
-    print(page(json.loads(options.output.read_text())))
+    mi.set_variant(options.variant)
+    if options.here:
+        print(json.dumps(here(options.here[0], int(options.here[1]))))
+        return
+    names = options.scenes or repository.benchmark_scenes()
+    found = {"variant": options.variant, "device": options.device, "spp": SPP, "rows": [], "failed": {}}
+    found["software"] = versions()
+    with ThreadPoolExecutor(BESIDE) as pool:
+        first = list(pool.map(partial(apart, options.variant, 0), names))
+    for name, compiled in zip(names, first, strict=True):
+        rows = compiled if isinstance(compiled, str) else apart(options.variant, SEEDS, name)
+        if isinstance(rows, str):
+            found["failed"][name] = rows
+        else:
+            found["rows"] += [one | {"first_seconds": s} for one, s in zip(rows, compiled, strict=True)]
+        print(name, found["failed"].get(name, "done"), flush=True)
+        options.output.write_text(json.dumps(found, indent=1) + "\n")
+    print(page(found))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import choices
 import goals
+import gpu
 import numpy as np
 import pandas as pd
 import peers
@@ -80,6 +81,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "stress": partial(_recorded, "stress", stress.summary),
     "cases": partial(_recorded, "stress", stress.tables),
     "peers": partial(_recorded, "peers", peers.tables),
+    "cuda": partial(_recorded, "cuda", gpu.page),
     "choices": partial(_recorded, "choices", choices.choices_table),
 }
 

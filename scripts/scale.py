@@ -2,7 +2,6 @@
 
     python scripts/scale.py                          # all rows; writes docs/reports/scale.json
     python scripts/scale.py lamps film               # rows of these kinds, printed
-    python scripts/scale.py lamps --sizes 300 1000
 
 A row is a kind of object (lamps, materials, ...; or pixels, samples, edits, film filters) and a size: how
 many there are, or which. It has a process of its own with an empty kernel cache, which has rendered something
@@ -39,8 +38,8 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
-from mitsuba_bdpt.measure.options import WHOLE
 from mitsuba_bdpt.measure.tables import ratio, table
+from mitsuba_bdpt.measure.timing import alternating
 
 import scenes
 
@@ -330,14 +329,13 @@ def here(kind: Kind, size: int | str) -> dict:
         before = forget_peak()
         first = renders[name](0)["seconds"]
         found[name] = {"first": first, "memory": (memory.peak() or 0) - before}
-    warm: dict[str, list[dict]] = {name: [] for name in METHODS}
-    started, seed = time.perf_counter(), 0
+    warm, started = [], time.perf_counter()
     most = SECONDS_OF_NOISE if kind.one_pixel else WARM_SECONDS
-    while seed < ROUNDS[0] or (seed < ROUNDS[1] and time.perf_counter() - started < most):
-        seed += 1
-        for name in list(METHODS)[:: 1 if seed % 2 else -1]:
-            warm[name].append(renders[name](seed))
-    for name, times in warm.items():
+    for turn in alternating(list(renders.values()), ROUNDS[1], is_warm=True):
+        warm.append(turn)
+        if len(warm) >= ROUNDS[0] and time.perf_counter() - started >= most:
+            break
+    for name, times in zip(renders, zip(*warm, strict=True), strict=True):
         found[name]["warm"] = statistics.median(one["seconds"] for one in times)
         if kind.one_pixel and len(times) >= ROUNDS_OF_NOISE:
             means = [one["mean"] for one in times]
@@ -350,7 +348,7 @@ def apart(name: str, size: int | str) -> dict:
     started = time.perf_counter()
     with tempfile.TemporaryDirectory() as empty:
         done = subprocess.run(
-            [sys.executable, __file__, "--here", name, str(size)],
+            [sys.executable, __file__, "--here", name, json.dumps(size)],
             env=os.environ | {"DRJIT_CACHE_DIR": empty, "HOME": empty},
             capture_output=True,
             text=True,
@@ -427,40 +425,24 @@ def main(arguments=None) -> int:
     """Run the command line."""
     parser = command_line.parser(__doc__)
     parser.add_argument("kinds", nargs="*", help="kinds of rows; default: all, and the record is written")
-    parser.add_argument("--sizes", nargs="+", help="sizes of these kinds, instead of those of the table")
     parser.add_argument("--here", nargs=2, help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     if asked.here:
         name, size = asked.here
-        print(json.dumps(here(KINDS[name], parsed(KINDS[name], size))))
+        print(json.dumps(here(KINDS[name], json.loads(size))))
         return 0
     for name in asked.kinds:
         if name not in KINDS:
             raise CommandError(f"kind={name!r} is not known; use some of {', '.join(KINDS)}")
-    if asked.sizes and not asked.kinds:
-        raise CommandError("--sizes needs kinds")
     rows = []
     for name in asked.kinds or KINDS:
-        kind = KINDS[name]
         print(f"{name}: {' | '.join(HEAD)}")
-        rows += rows_of(name, [parsed(kind, size) for size in asked.sizes or kind.sizes])
+        rows += rows_of(name, KINDS[name].sizes)
     if not asked.kinds:
         record = {"versions": versions(), "rows": rows}
         write_text(RECORD, json.dumps(record, indent=1) + "\n")
     return 0
-
-
-def parsed(kind: Kind, size: int | str) -> int | str:
-    """A size as the kind has them; raises ``CommandError`` if it cannot have it."""
-    if isinstance(kind.sizes[0], str):
-        if size not in kind.sizes:
-            raise CommandError(f"size={size!r} is not known; use some of {', '.join(map(str, kind.sizes))}")
-        return size
-    try:
-        return int(WHOLE(str(size)))
-    except argparse.ArgumentTypeError as error:
-        raise CommandError(f"size={size!r}: {error}") from None
 
 
 if __name__ == "__main__":

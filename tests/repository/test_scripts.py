@@ -67,7 +67,6 @@ def by_user(monkeypatch, command, *arguments):
         ("equal-time words.toml --reference flat.exr", "Parsing of XML"),
         ("equal-time room.xml --reference flat.exr -i 'bdpt skip=some'", "bdpt: skip='some' is not known"),
         ("scale.py nothing", "kind='nothing' is not known; use some of spheres, "),
-        ("scale.py edits --sizes room", "size='room' is not known; use some of nothing, lamp, "),
         ("planted_bugs.py nowhere", "no planted bug has 'nowhere' in its name"),
         ("page . -o a.pdf", "output='a.pdf' must end in .html"),
         ("page . -o words.toml/a.html", "words.toml"),

@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2961, "tests": 28275}
-MOST_WORDS = 31319
+OUTSIDE = {"scripts": 2895, "tests": 28274}
+MOST_WORDS = 31327
 
 
 def _lines(files):
