@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2895, "tests": 28274}
-MOST_WORDS = 31353
+MOST_WORDS = 31367
 
 
 def _lines(files):
