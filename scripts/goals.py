@@ -70,11 +70,6 @@ def over_path(results: Results, scene: str, error: Error = "rel_mse_trimmed") ->
     return Measured(f"{found}" + f"; {lacks}" * bool(lacks), [found.median])
 
 
-def over_path_raw(results: Results, scene: str) -> Measured:
-    """`over_path` by the raw error."""
-    return over_path(results, scene, "rel_mse")
-
-
 def _near(found: Summary) -> str:
     middle = f"{found.bound} {found.median:.3f}x".lstrip()
     what = "interval" if found.count >= FEWEST_WITH_INTERVAL else "range"

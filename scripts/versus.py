@@ -7,10 +7,9 @@
 
 Each checkout renders in a process of its own, in turns, the scenes of this one at 128^2, warm. For each
 scene: the largest difference of two values of the same seed, over the image's mean (sums of floats in another
-order: below 1e-4); time, error (trimmed of the worst 0.1 %) and raw error of this checkout over the other's,
-medians over pairs of seeds for time and ratios of means for errors; their products; what the other one
-decided, and this one. The exit status is 1 with ``--same`` if an image differs by more than 1e-4 of its mean
-or a decision does.
+order: below 1e-4); time, errors and efficiency of this checkout over the other's, as `mitsuba-bdpt compare`
+shows them; what the other one decided, and this one. The exit status is 1 with ``--same`` if an image differs
+by more than 1e-4 of its mean or a decision does.
 """
 
 from __future__ import annotations
@@ -27,14 +26,16 @@ from pathlib import Path
 import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
+import pandas as pd
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.cli.values import property_
 from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.loading import in_proportion
-from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
+from mitsuba_bdpt.measure import compare
 from mitsuba_bdpt.measure.options import WHOLE
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.results import rel_mse_columns
+from mitsuba_bdpt.measure.tables import markdown
 from mitsuba_bdpt.measure.timing import Timed, alternating
 
 import mitsuba as mi  # isort: skip
@@ -114,25 +115,23 @@ class Checkout:
         self._process.communicate()
 
 
-def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: int) -> tuple[list[str], bool]:
+def line(name: str, sides: list[Checkout], parameters: dict, spp: int, pairs: int) -> tuple[dict, bool]:
     """A scene's line of the table, and whether both checkouts made the same."""
     depth = repository.benchmark_depth(name)
-    expected = repository.load_reference(name, repository.RESOLUTION, depth).image
+    expected = repository.load_reference(name, repository.RESOLUTION, depth)
     for side in sides:
         side.load(name, {"type": "bdpt", "max_depth": depth} | parameters)
-    apart, rows, same = 0.0, [], True
-    for old, new in alternating([partial(side.render, spp) for side in sides], pairs):
-        apart = max(apart, np.abs(new.image - old.image).max() / old.image.mean())
+    apart, same, rows = 0.0, True, ([], [])
+    for turn in alternating([partial(side.render, spp) for side in sides], pairs):
+        old, new = (one.image for one in turn)
+        apart = max(apart, np.abs(new - old).max() / old.mean())
         same &= sides[0].decisions == sides[1].decisions
-        errors = [rel_mse(found.image, expected, trim) for trim in (TRIM, 0.0) for found in (old, new)]
-        rows.append([new.seconds / old.seconds, *errors])
-    rows = np.array(rows)
-    time, (old, new, old_raw, new_raw) = np.median(rows[:, 0]), rows[:, 1:].mean(axis=0)
-    figures = [time, new / old, new_raw / old_raw, time * new / old, time * new_raw / old_raw]
-    decided = " → ".join(_named(side.decisions) for side in sides)
-    return [f"`{name}`", f"{apart:.1g}", *(f"{x:.3g}" for x in figures), decided], bool(
-        same and apart < ROUNDING
-    )
+        for own, one in zip(rows, turn, strict=True):
+            own.append({"seconds": one.seconds} | rel_mse_columns(one.image, expected))
+    old, new = map(pd.DataFrame, rows)
+    cells = {"scene": f"`{name}`", "apart": f"{apart:.1g}"} | compare.line(new, old)
+    cells["decided"] = " → ".join(_named(side.decisions) for side in sides)
+    return cells, bool(same and apart < ROUNDING)
 
 
 def _named(decisions: list) -> str:
@@ -158,7 +157,6 @@ def main(arguments=None) -> int:
     names = options.scenes or repository.benchmark_scenes()
     for name in names:
         repository.benchmark_depth(name)  # known before anything is rendered
-    head = ["scene", "apart", "time", "error", "raw error", "time · error", "time · raw error", "decided"]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         sides = [
             stack.enter_context(closing(Checkout(checkout, Path(folder))))
@@ -167,8 +165,8 @@ def main(arguments=None) -> int:
         lines = []
         for name in names:
             lines.append(line(name, sides, parameters, options.spp, options.pairs))
-            print("  ".join(lines[-1][0]), file=sys.stderr, flush=True)
-    print(table(head, [cells for cells, _ in lines]))
+            print("  ".join(lines[-1][0].values()), file=sys.stderr, flush=True)
+    print(markdown(pd.DataFrame([cells for cells, _ in lines])))
     return int(options.same and not all(same for _, same in lines))
 
 

@@ -176,18 +176,16 @@ def test_bugs_can_be_planted(bug, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("status", "output", "bug", "fault"),
+    ("status", "output", "fault"),
     [
-        (0, "1 passed", True, "does not see the bug"),
-        (1, "E   NameError: name 'x'", True, "fails by something else"),
-        (1, "E       AssertionError: ", True, ""),
-        (4, "no such test", True, "not run"),
-        (0, "1 passed", False, ""),
-        (1, "E       assert 1 == 2", False, "fails without the bug"),
+        (0, "1 passed", "does not see the bug"),
+        (1, "E   NameError: name 'x'", "fails by something else"),
+        (1, "E       AssertionError: ", ""),
+        (4, "no such test", "not run"),
     ],
 )
-def test_outcomes_of_planted_bugs_are_judged(status, output, bug, fault):
-    judged = planted_bugs.judged(status, output, bug)
+def test_outcomes_of_planted_bugs_are_judged(status, output, fault):
+    judged = planted_bugs.judged(status, output)
     assert judged.startswith(fault) and bool(judged) == bool(fault)
 
 

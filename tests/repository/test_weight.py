@@ -29,8 +29,8 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2895, "tests": 28274}
-MOST_WORDS = 31367
+OUTSIDE = {"scripts": 2880, "tests": 28272}
+MOST_WORDS = 31360
 
 
 def _lines(files):
