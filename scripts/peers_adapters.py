@@ -10,12 +10,12 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import command_line
 import numpy as np
 
 SIZE = 128
@@ -201,7 +201,11 @@ def smallvcm(scene: dict, method: dict) -> Render:
 
 def main() -> None:
     """Render the job: first a few samples, then as many as take its processor seconds."""
-    stored, job = np.load(sys.argv[1]), json.loads(sys.argv[2])
+    parser = command_line.parser(__doc__)
+    for name, kind in (("scene", np.load), ("job", json.loads), ("output", Path)):
+        parser.add_argument(name, type=kind)
+    options = parser.parse_args()
+    stored, job = options.scene, options.job
     scene = json.loads(str(stored["scene"])) | {"program": job["program"]}
     for i, shape in enumerate(scene["shapes"]):
         shape |= {name: stored[f"{name}{i}"] for name in ARRAYS}
@@ -217,7 +221,7 @@ def main() -> None:
         started, wall = processor(), time.perf_counter()
         image = render(n, seed)
         taken, wall = processor() - started, time.perf_counter() - wall
-    np.save(sys.argv[3], image.astype(np.float32))
+    np.save(options.output, image.astype(np.float32))
     figures = {"spp": n, "cpu": taken, "wall": wall, "first": first, "prepared": prepared - began}
     print("ANSWER", json.dumps(figures), flush=True)
     os._exit(0)  # LuxCore's threads abort when Python ends

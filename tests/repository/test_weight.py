@@ -29,7 +29,7 @@ MOST = {
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2880, "tests": 28272}
+OUTSIDE = {"scripts": 2884, "tests": 28272}
 MOST_WORDS = 31360
 
 
