@@ -30,7 +30,7 @@ MOST = {
     "": 1282,  # top files
 }
 OUTSIDE = {"scripts": 2884, "tests": 28272}
-MOST_WORDS = 31360
+MOST_WORDS = 31364
 
 
 def _lines(files):
