@@ -80,41 +80,30 @@ def egg_profile(rows):
     return middle + distance * cos, radius, normal_r / length, normal_y / length
 
 
-def revolve(height, radius, normal_r, normal_y, sides):
-    """Surface around the y axis. The profile runs from top to bottom for outward faces.
+def revolve(height, radius, normal_r, normal_y, sides, axis=(0.0, 0.0)):
+    """Surface around the ``axis`` (x, z) along y. The profile runs from top to bottom for outward faces.
 
     Returns vertices, normals (both (n, 3)) and triangles; a profile end on the axis becomes a fan.
     """
     turn = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     ring = np.stack([np.sin(turn), np.zeros(sides), np.cos(turn)], axis=1)
     up = np.array((0.0, 1.0, 0.0))
-    vertices, normals, first = [], [], []
+    vertices, normals, rows = [], [], []
     for y, r, n_r, n_y in zip(height, radius, normal_r, normal_y, strict=True):
-        first.append(len(vertices))
         around = ring[:1] if r == 0.0 and abs(n_r) < 1e-9 else ring  # a pole needs one vertex only
+        rows.append(np.resize(np.arange(len(around)), sides) + len(vertices))
         vertices.extend(r * around + y * up)
         normals.extend(n_r * around + n_y * up)
-    first.append(len(vertices))
-
     faces = []
-    for row in range(len(height) - 1):
-        upper, lower = first[row], first[row + 1]
-        upper_step = 1 if lower - upper > 1 else 0
-        lower_step = 1 if first[row + 2] - lower > 1 else 0
-        for i in range(sides):
-            j = (i + 1) % sides
-            a, b = upper + upper_step * i, upper + upper_step * j
-            c, d = lower + lower_step * i, lower + lower_step * j
-            if lower_step and radius[row + 1] > 0.0:
-                faces.append((a, c, d))
-            if upper_step and radius[row] > 0.0:
-                faces.append((a, d, b))
-    return np.array(vertices), np.array(normals), np.array(faces, dtype=np.int32)
+    for upper, lower, above, below in zip(rows, rows[1:], radius, radius[1:], strict=False):
+        for a, b, c, d in zip(upper, np.roll(upper, -1), lower, np.roll(lower, -1), strict=True):
+            faces += [(a, c, d)] * bool(c != d and below > 0.0) + [(a, d, b)] * bool(a != b and above > 0.0)
+    vertices = np.array(vertices) + (axis[0], 0.0, axis[1])
+    return vertices, np.array(normals), np.array(faces, dtype=np.int32)
 
 
 def egg():
-    vertices, normals, faces = revolve(*egg_profile(rows=40), sides=64)
-    return vertices + (EGG_AXIS[0], 0.0, EGG_AXIS[1]), normals, faces
+    return revolve(*egg_profile(rows=40), sides=64, axis=EGG_AXIS)
 
 
 def lamp_base():
@@ -124,8 +113,7 @@ def lamp_base():
     angle = np.linspace(0.0, np.arcsin(radius / sphere), 9)
     sin, cos = np.sin(angle), np.cos(angle)
     y = sphere * cos - (sphere - height)
-    vertices, normals, faces = revolve(y, sphere * sin, sin, cos, sides=48)
-    return vertices + (LAMP_AXIS[0], 0.0, LAMP_AXIS[1]), normals, faces
+    return revolve(y, sphere * sin, sin, cos, sides=48, axis=LAMP_AXIS)
 
 
 def lamp_head():
@@ -135,8 +123,7 @@ def lamp_head():
     slant = np.hypot(top - bottom, rim)
     normal_r, normal_y = np.full(4, (top - bottom) / slant), np.full(4, -rim / slant)
     y, radius = bottom + part * (top - bottom), part * rim
-    vertices, normals, faces = revolve(y, radius, normal_r, normal_y, sides=64)
-    return vertices + (LAMP_AXIS[0], 0.0, LAMP_AXIS[1]), normals, faces
+    return revolve(y, radius, normal_r, normal_y, sides=64, axis=LAMP_AXIS)
 
 
 def spot_cap():
