@@ -3,21 +3,18 @@
     python scripts/choices.py small_casters/point_cube cornell_box
     python scripts/choices.py --all -o results/choices.json    # every scene; goes on after an interruption
 
-For each scene those of the pilot's candidates that are possible there are rendered by hand (internal
-``decisions``, with the tables of emission and the guided samples that the default has): first once with a
-seed of its own; those which are then among the best, or which pilots of `PILOT_SEEDS` seeds choose, with
-`SEEDS` seeds, as the default is, in turns, 128^2 (small_casters: their own film), 64 samples per pixel. A
-time is that of the processor; the default's is without the pilot, which later renders of a scene remember.
-Errors are relMSE, raw and trimmed of the worst 0.1 %.
+For each scene the pilot's candidates are rendered by hand (internal ``decisions``, with the tables of
+emission and the guided samples of the default): first once; those which are then among the best, or which
+pilots of `PILOT_SEEDS` seeds choose, with `SEEDS` seeds, in turns with the default, 128^2 (small_casters:
+their own film), 64 samples per pixel, in processor time without the pilot. Errors are relMSE, raw and trimmed
+of the worst 0.1 %.
 
-The table shows, raw and trimmed: the default's time times error (means over the seeds) over the least of the
-fixed choices, with the interval of nine in ten resamplings of the seeds (the same for both sides), and the
-same of what the worst of the pilots chose; the least, over the fixed choices, of the larger of its two
-ratios; the pilot's predicted time to an error over the measured one (trimmed), the largest ratio of two
-candidates; and what was chosen. The least of several noisy products is below the true one: figures are on the
-safe side. References of 8,192 samples per pixel are made for scenes of small_casters; in others some
-references have light that the default merges and no fixed choice samples. A scene in OUTPUT is measured again
-if the pilot's candidates have changed.
+The table shows the default's time times error (means over the seeds) over the least of the fixed choices,
+with the interval of nine in ten resamplings of the seeds, and the same of what the worst of the pilots chose;
+the least, over the fixed choices, of the larger of both ratios; the pilot's predicted time to an error over
+the measured one (trimmed), the largest ratio of two candidates; and what was chosen. The least of several
+noisy products is below the true one: figures are on the safe side. Scenes of small_casters get references of
+8,192 samples per pixel; those of others may have light that the default merges and no fixed choice samples.
 """
 
 from __future__ import annotations
@@ -31,11 +28,12 @@ from pathlib import Path
 import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
+import pandas as pd
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.files.texts import write_json
 from mitsuba_bdpt.measure.metrics import TRIM, rel_mse
-from mitsuba_bdpt.measure.tables import table
+from mitsuba_bdpt.measure.tables import markdown
 from mitsuba_bdpt.measure.timing import timed
 from mitsuba_bdpt.planning.choice import Prediction
 from mitsuba_bdpt.planning.configuration import CANDIDATES, Configuration, Decision
@@ -160,36 +158,28 @@ def ratios(row: dict, seeds=slice(None)) -> dict:
     }
 
 
-def shown(row: dict) -> list[str]:
-    """A row as the cells of the table."""
+def shown(row: dict) -> dict[str, str]:
+    """A row as a line of the table, by columns."""
     found = ratios(row)
     default = found.pop("default")
     worst = np.max([found[name] for name in row["chosen"]] or [default], axis=0)
     random = np.random.default_rng(SEEDS)
     drawn = (ratios(row, random.integers(0, SEEDS, SEEDS))["default"] for _ in range(RESAMPLINGS))
     low, high = np.quantile(list(drawn), INTERVAL, axis=0)
-    cells = [
-        f"{m:.2f} ({a:.2f}–{b:.2f}), {w:.2f}" for m, a, b, w in zip(default, low, high, worst, strict=True)
-    ]
+    cells = {"scene": f"`{row['scene']}`"}
+    for kind, m, a, b, w in zip(("raw", "trimmed"), default, low, high, worst, strict=True):
+        cells[f"{kind}: default, worst pilot"] = f"{m:.2f} ({a:.2f}–{b:.2f}), {w:.2f}"
     wrong = [time / found[name][1] for name, time in row["predicted"].items()]
-    counts = ", ".join(f"{name} ({n})" for name, n in row["chosen"].items())
-    best = f"{min(map(max, found.values())):.2f}"
-    return [f"`{row['scene']}`", *cells, best, f"{max(wrong) / min(wrong):.2g}", counts]
-
-
-HEAD = (
-    "scene",
-    "raw: default, worst pilot",
-    "trimmed: default, worst pilot",
-    "best by both",
-    "predicted / measured",
-    "chosen (pilots)",
-)
+    return cells | {
+        "best by both": f"{min(map(max, found.values())):.2f}",
+        "predicted / measured": f"{max(wrong) / min(wrong):.2g}",
+        "chosen (pilots)": ", ".join(f"{name} ({n})" for name, n in row["chosen"].items()),
+    }
 
 
 def choices_table(record: list[dict]) -> str:
     """The table of a record, as Markdown."""
-    return table(HEAD, map(shown, record))
+    return markdown(pd.DataFrame(map(shown, record)))
 
 
 def main(arguments=None) -> int:
@@ -212,7 +202,7 @@ def main(arguments=None) -> int:
     for name in names:
         if name not in rows or rows[name].get("candidates") != CANDIDATE_NAMES:
             rows[name] = measure(name)
-            print("  ".join(shown(rows[name])), file=sys.stderr, flush=True)
+            print("  ".join(shown(rows[name]).values()), file=sys.stderr, flush=True)
         if options.output:
             write_json(options.output, list(rows.values()))
     print(choices_table([rows[name] for name in names]))

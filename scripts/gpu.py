@@ -24,12 +24,13 @@ import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 
 import mitsuba as mi  # isort: skip
 import numpy as np
+import pandas as pd
 import repository
 from mitsuba_bdpt.host.introspection import versions
 from mitsuba_bdpt.measure.agreement import Means, compare_means, tile_columns
 from mitsuba_bdpt.measure.results import rel_mse_columns
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
-from mitsuba_bdpt.measure.tables import ratio, table
+from mitsuba_bdpt.measure.tables import markdown, ratio
 from mitsuba_bdpt.measure.timing import Timed, alternating, timed
 
 RECORD = repository.ROOT / "docs" / "reports" / "cuda.json"
@@ -41,7 +42,6 @@ METHODS = {
 }
 BESIDE = 12
 """Processes at a time."""
-HEAD = "scene|ms|`path` ms|relMSE, trimmed|over `path`, trimmed|raw|over `skip=none`|first render, s|bias"
 
 
 def row(name: str, reference, method: str, found: list[Timed]) -> dict:
@@ -103,12 +103,19 @@ def page(found: dict) -> str:
         ours, path, none = methods["bdpt"], methods["path"], methods["bdpt skip=none"]
         judged = {None: "too few renders", True: "none found", False: "found"}
         lines.append(
-            [name, *(f"{1e3 * one['seconds']:.0f}" for one in (ours, path)), f"{ours['trimmed']:.3g}"]
+            {
+                "scene": name,
+                "ms": f"{1e3 * ours['seconds']:.0f}",
+                "`path` ms": f"{1e3 * path['seconds']:.0f}",
+                "relMSE, trimmed": f"{ours['trimmed']:.3g}",
+                "over `path`, trimmed": ratio(speedup(ours, path, "trimmed")),
+                "raw": ratio(speedup(ours, path, "rel_mse")),
+                "over `skip=none`": ratio(speedup(ours, none, "trimmed")),
+                "first render, s": f"{ours['first_seconds']:.0f}",
+                "bias": judged[ours["bias"] and ours["bias"]["passed"]],
+            }
         )
-        lines[-1] += [ratio(speedup(ours, path, error)) for error in ("trimmed", "rel_mse")]
-        lines[-1] += [ratio(speedup(ours, none, "trimmed")), f"{ours['first_seconds']:.0f}"]
-        lines[-1] += [judged[ours["bias"] and ours["bias"]["passed"]]]
-    return table(HEAD.split("|"), lines)
+    return markdown(pd.DataFrame(lines))
 
 
 def main(arguments=None) -> None:

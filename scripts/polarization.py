@@ -36,17 +36,18 @@ def pictures(folder: Path, spp: int) -> None:
     degree = np.hypot(s1, s2) / np.maximum(s0, 1e-6)
     angle = np.degrees(np.arctan2(s2, s1)) / 2 % 180
     figure, axes = plt.subplots(1, 3, figsize=(14.4, 3.3), layout="constrained")
-    axes[0].imshow(exposed)
-    axes[0].set_title("intensity S0")
-    drawn = axes[1].imshow(degree, vmin=0, vmax=1, cmap="magma")
-    axes[1].set_title("degree of linear polarization")
-    figure.colorbar(drawn, ax=axes[1])
     hue = np.where(degree > 0.03, angle, np.nan)
-    drawn = axes[2].imshow(hue, vmin=0, vmax=180, cmap="twilight")
-    axes[2].set_title("its angle in degrees (0: horizontal)")
-    figure.colorbar(drawn, ax=axes[2])
-    for axis in axes:
+    panels = {
+        "intensity S0": (exposed, {}),
+        "degree of linear polarization": (degree, {"vmin": 0, "vmax": 1, "cmap": "magma"}),
+        "its angle in degrees (0: horizontal)": (hue, {"vmin": 0, "vmax": 180, "cmap": "twilight"}),
+    }
+    for axis, (title, (values, look)) in zip(axes, panels.items(), strict=True):
+        drawn = axis.imshow(values, **look)
+        axis.set(title=title)
         axis.set_axis_off()
+        if look:
+            figure.colorbar(drawn, ax=axis)
     file = folder / "polarization.png"
     figure.savefig(file, dpi=90, metadata={"Software": None})
     print(file)

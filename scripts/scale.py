@@ -31,6 +31,7 @@ from pathlib import Path
 import command_line
 import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
+import pandas as pd
 import repository
 import room
 from mitsuba_bdpt.cli.mistakes import answered
@@ -38,7 +39,7 @@ from mitsuba_bdpt.errors import CommandError
 from mitsuba_bdpt.files.texts import write_text
 from mitsuba_bdpt.host import memory
 from mitsuba_bdpt.host.introspection import versions
-from mitsuba_bdpt.measure.tables import ratio, table
+from mitsuba_bdpt.measure.tables import markdown, ratio
 from mitsuba_bdpt.measure.timing import alternating
 
 import scenes
@@ -368,44 +369,30 @@ def rows_of(name: str, sizes: Iterable[int | str]) -> list[dict]:
             print(f"{name} {size}: not tried, the last took {rows[-1]['seconds']} s", flush=True)
             continue
         rows.append(apart(name, size))
-        print(" | ".join(cells(rows, rows[-1])), f"({rows[-1]['seconds']} s)", flush=True)
+        found = cells(rows, rows[-1])
+        print(name, *(f"{head}: {cell}" for head, cell in found.items()), sep="\n    ", flush=True)
     return rows
 
 
-HEAD = (
-    "size",
-    "first image: `path`, s",
-    "`bdpt`",
-    "path tracing alone",
-    "warm: `path`, ms",
-    "`bdpt`",
-    "path tracing alone",
-    "an object, ms beyond `path`: `bdpt`",
-    "path tracing alone",
-    "memory, GiB: `path`",
-    "`bdpt`",
-    "one pixel, time × variance: `bdpt`",
-    "path tracing alone",
-)
-
-
-def cells(rows: list[dict], row: dict) -> list[str]:
-    """A line of a table: columns `HEAD` after the first, which is kind and size."""
-    path = row["path"]
-    counted = row is not rows[0] and isinstance(row["size"], int) and KINDS[row["kind"]].has_slope
-    warm = 1e3 * path["warm"]
-    slopes = [f"{slope(rows, row, method):.3g}" if counted else "–" for method in ("bdpt", "alone")]
-    efforts = [effort(row, method) for method in ("bdpt", "alone")]
-    return [
-        f"{row['size']:,}" if isinstance(row["size"], int) else row["size"],
-        f"{path['first']:.2g}",
-        *(ratio(over_path(row, "first", method)) for method in ("bdpt", "alone")),
-        f"{warm:.3g}" if warm < 1000 else f"{warm:,.0f}",
-        *(ratio(over_path(row, "warm", method)) for method in ("bdpt", "alone")),
-        *slopes,
-        *(f"{row[method]['memory'] / 2**30:.2f}" for method in ("path", "bdpt")),
-        *("–" if one is None else ratio(one) for one in efforts),
-    ]
+def cells(rows: list[dict], row: dict) -> dict[str, str]:
+    """A line of a table, by columns."""
+    warm, size = 1e3 * row["path"]["warm"], row["size"]
+    counted = row is not rows[0] and isinstance(size, int) and KINDS[row["kind"]].has_slope
+    found = {
+        "size": f"{size:,}" if isinstance(size, int) else size,
+        "first image: `path`, s": f"{row['path']['first']:.2g}",
+        "warm: `path`, ms": f"{warm:.3g}" if warm < 1000 else f"{warm:,.0f}",
+    }
+    for method, name in (("bdpt", "`bdpt`"), ("alone", "path tracing alone")):
+        noise = effort(row, method)
+        found |= {
+            f"first image: {name}": ratio(over_path(row, "first", method)),
+            f"warm: {name}": ratio(over_path(row, "warm", method)),
+            f"an object, ms beyond `path`: {name}": f"{slope(rows, row, method):.3g}" if counted else "–",
+            f"one pixel, time × variance: {name}": "–" if noise is None else ratio(noise),
+        }
+    memory = {f"memory, GiB: `{of}`": f"{row[of]['memory'] / 2**30:.2f}" for of in ("path", "bdpt")}
+    return found | memory
 
 
 def tables(record: dict) -> str:
@@ -417,7 +404,9 @@ def tables(record: dict) -> str:
         note = (
             f" Not tried, as the row before takes over {PATIENCE:.0f} s: {', '.join(left)}." if left else ""
         )
-        parts.append(f"**{name}**: {kind.what}.{note}\n\n" + table(HEAD, [cells(rows, row) for row in rows]))
+        parts.append(
+            f"**{name}**: {kind.what}.{note}\n\n" + markdown(pd.DataFrame([cells(rows, row) for row in rows]))
+        )
     return "\n".join(parts)
 
 
@@ -437,7 +426,6 @@ def main(arguments=None) -> int:
             raise CommandError(f"kind={name!r} is not known; use some of {', '.join(KINDS)}")
     rows = []
     for name in asked.kinds or KINDS:
-        print(f"{name}: {' | '.join(HEAD)}")
         rows += rows_of(name, KINDS[name].sizes)
     if not asked.kinds:
         record = {"versions": versions(), "rows": rows}

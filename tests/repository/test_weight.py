@@ -14,22 +14,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5102,
+    "measure": 5111,
     "transport merging guided_emission": 5730,
     "planning": 1743,
     "emitters": 2201,
-    "cli": 1472,
+    "cli": 1462,
     "media": 1347,
     "geometry": 1435,
     "image": 1321,
-    "files": 868,
+    "files": 853,
     "run": 1182,
     "scene sampling": 825,
     "host": 814,
     "sensors": 883,
     "": 1282,  # top files
 }
-OUTSIDE = {"scripts": 2884, "tests": 28272}
+OUTSIDE = {"scripts": 2857, "tests": 28272}
 MOST_WORDS = 31364
 
 

@@ -81,18 +81,8 @@ COMMANDS: dict[str, tuple] = {
         options.Sweep,
         ("preset", {"help": "TOML file, or a name in PROJECT/presets: what is rendered"}),
     ),
-    "report": (
-        "tables and plots of a sweep, as Markdown",
-        "report",
-        options.Report,
-        _FOLDER,
-    ),
-    "figure": (
-        "a figure of a sweep for a paper, as PDF, SVG or PNG",
-        "figures",
-        options.Figure,
-        _FOLDER,
-    ),
+    "report": ("tables and plots of a sweep, as Markdown", "report", options.Report, _FOLDER),
+    "figure": ("a figure of a sweep for a paper, as PDF, SVG or PNG", "figures", options.Figure, _FOLDER),
     "page": (
         "a sweep as one HTML file, with images to compare",
         "page",

@@ -6,7 +6,7 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from ..errors import CommandError
 from .whole import replacing
@@ -26,21 +26,6 @@ def read_json(path: Path, remedy: str) -> Any:
         return json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise CommandError(f"{str(path)!r} is damaged ({error}); {remedy}") from error
-
-
-def list_of(path: Path, key: str, value: Any, kind: type, what: str) -> list[Any]:
-    """Return ``value`` if it is a non-empty list of ``kind``, called ``what``."""
-    found = cast(list[Any], value) if isinstance(value, list) else []
-    if not found or not all(isinstance(entry, kind) for entry in found):
-        raise CommandError(f"{path}: {key}={value!r} must be a list with at least one entry, all {what}")
-    return found
-
-
-def text_of(path: Path, key: str, value: Any) -> str:
-    """Return ``value`` if it is a non-empty text, else raise ``CommandError``."""
-    if not isinstance(value, str) or not value:
-        raise CommandError(f"{path}: {key}={value!r} must be a text in quotes that is not empty")
-    return value
 
 
 def write_text(path: Path, text: str) -> None:

@@ -60,6 +60,15 @@ def _of_plugin(value: Any) -> Any:
     return value
 
 
+class Notes(Model):
+    """Explanations of a sweep, by scene; ``aside``: integrators whose efficiencies are not compared."""
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Text]
+
+    aside: tuple[Text, ...] = ()
+
+
 class Method(Model):
     """An integrator of a preset.
 

@@ -16,9 +16,10 @@ import pyarrow as pa
 
 from ..errors import CommandError
 from ..files.images import read_layers, write_layers
-from ..files.texts import list_of, read_json, read_toml, text_of, write_json
+from ..files.texts import read_json, read_toml, write_json
 from ..files.whole import replacing
 from . import agreement, analysis, metrics
+from .models import Notes, checked
 from .preset import FIRST_SEED, Cell, Cells
 from .project import Project
 from .reference import Reference, read_reference, reference_path
@@ -225,11 +226,10 @@ def load(project: Project, folder: Path) -> tuple[analysis.Results, dict[str, Re
             )
     means = {scene: kept.means for scene, kept in made.items() if kept.means is not None}
     notes = folder / "notes.toml"
-    given = read_toml(notes) if notes.exists() else {}
-    aside = list_of(notes, "aside", given.pop("aside"), str, "texts in quotes") if "aside" in given else []
-    found = analysis.Results(table, means, aside)
-    if unknown := [name for name in aside if name not in found.methods]:
+    given = checked(Notes, read_toml(notes) if notes.exists() else {}, notes)
+    found = analysis.Results(table, means, given.aside)
+    if unknown := [name for name in given.aside if name not in found.methods]:
         raise CommandError(
             f"{notes}: {unknown[0]!r} of aside is not in the sweep: {', '.join(found.methods)}"
         )
-    return found, made, {scene: text_of(notes, scene, text) for scene, text in given.items()}
+    return found, made, given.model_extra or {}
