@@ -40,8 +40,7 @@ METHODS = {
     "bdpt skip=none": ({"type": "bdpt", "skip": "none"}, "independent"),
     "path": ({"type": "path"}, "multijitter"),
 }
-BESIDE = 12
-"""Processes at a time."""
+BESIDE = 12  # processes at a time
 
 
 def row(name: str, reference, method: str, found: list[Timed]) -> dict:

@@ -55,8 +55,7 @@ METHODS = {
     "alone": {"type": "bdpt", "light_paths": 0},
 }
 """Integrators by their names in the record; ``alone``: path tracing alone."""
-PATIENCE = 60.0
-"""Seconds of a row after which a kind has no larger one."""
+PATIENCE = 60.0  # seconds of a row after which a kind has no larger one
 WARM_SECONDS, ROUNDS = 4.0, (3, 15)
 """Of the warm renders of a row: how long they may take, and the least and the most rounds."""
 ROUNDS_OF_NOISE, SECONDS_OF_NOISE = 10, 20.0

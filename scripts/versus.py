@@ -42,8 +42,7 @@ import mitsuba as mi  # isort: skip
 
 HERE = Path(__file__).resolve().parents[1]
 
-# Of an image's mean: what sums of floats differ by in another order.
-ROUNDING = 1e-4
+ROUNDING = 1e-4  # of an image's mean: what sums of floats differ by in another order
 
 # What each process runs: it answers each line of its input with one.
 CHILD = """

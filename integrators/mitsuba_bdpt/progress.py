@@ -157,8 +157,7 @@ class Lines(Display):
 
 
 _DISPLAYS: dict[str, type[Display]] = {"bar": Bar, "lines": Lines, "none": Display}
-KINDS = ("auto", *_DISPLAYS)
-"""Names of displays on the command line."""
+KINDS = ("auto", *_DISPLAYS)  # names of displays on the command line
 
 
 def display(kind: str, limit: float | None = None, open_ended: bool = False) -> Display:

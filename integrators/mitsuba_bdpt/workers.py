@@ -9,8 +9,7 @@ from contextlib import contextmanager
 
 from .errors import CommandError, FailureError
 
-ANSWERS_WITHIN = 3.0
-"""Seconds that a scheduler may take to answer."""
+ANSWERS_WITHIN = 3.0  # seconds that a scheduler may take to answer
 
 one_at_a_time = threading.Lock()
 """Held by a call that takes all cores of a worker, whose threads would otherwise make several at once."""

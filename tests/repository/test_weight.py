@@ -14,22 +14,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5111,
+    "measure": 5105,
     "transport merging guided_emission": 5730,
     "planning": 1743,
-    "emitters": 2201,
-    "cli": 1462,
-    "media": 1347,
-    "geometry": 1435,
-    "image": 1321,
-    "files": 853,
+    "emitters": 2182,
+    "cli": 1451,
+    "media": 1337,
+    "geometry": 1429,
+    "image": 1310,
+    "files": 844,
     "run": 1182,
-    "scene sampling": 825,
+    "scene sampling": 819,
     "host": 814,
-    "sensors": 883,
-    "": 1282,  # top files
+    "sensors": 882,
+    "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2857, "tests": 28272}
+OUTSIDE = {"scripts": 2854, "tests": 28273}
 MOST_WORDS = 31364
 
 

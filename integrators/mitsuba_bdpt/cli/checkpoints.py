@@ -16,8 +16,7 @@ from ..files.loading import named_files, parsed_anyway, searching, spectra
 from ..files.whole import replacing
 from ..run.snapshot import Snapshot, read
 
-BEGIN_ANEW = "begin anew by --resume never"
-"""What to do about a checkpoint that is of no use."""
+BEGIN_ANEW = "begin anew by --resume never"  # what to do about a checkpoint that is of no use
 
 
 def path_of(output: Path) -> Path:

@@ -26,14 +26,12 @@ from ..run.snapshot import Snapshot
 from ..run.statistics import RAYS
 from ..workers import connected, one_at_a_time, results, worker_count
 
-# Bounds the wait for the last part to a quarter of a worker's work.
-PARTS_PER_WORKER = 4
+PARTS_PER_WORKER = 4  # bounds the wait for the last part to a quarter of a worker's work
 
 # Minimum samples per pixel of a part: short point sequences converge slower, and `variance` needs 8.
 LEAST_SPP = 16
 
-# Stride of the parts' seeds, 2^32 / golden ratio: renders with adjacent seeds share none.
-STRIDE = 0x9E3779B9
+STRIDE = 0x9E3779B9  # stride of the parts' seeds, 2^32 / golden ratio: renders with adjacent seeds share none
 
 
 def check_settings(settings) -> None:

@@ -23,8 +23,7 @@ import mitsuba_bdpt
 from ..host import llvm
 
 PACKAGES = ("mitsuba", "drjit", "numpy", "OpenEXR", llvm.WHEEL)
-TIME_LIMIT = 300
-"""Seconds for the test image: a cold start takes two or three, a busy machine longer."""
+TIME_LIMIT = 300  # seconds for the test image: a cold start takes two or three, a busy machine longer
 
 PROBE = """
 import json, sys

@@ -12,8 +12,7 @@ import mitsuba as mi
 LEVELS = {level: level.name.lower() for level in (mi.LogLevel.Trace, mi.LogLevel.Debug, mi.LogLevel.Info)}
 LEVELS |= {mi.LogLevel.Warn: "warning", mi.LogLevel.Error: "error"}
 
-# `mi.Log` prepends the name of the calling function.
-CALLER = re.compile(r"[\w<>]+(\(\))?: (?=bdpt: )")
+CALLER = re.compile(r"[\w<>]+(\(\))?: (?=bdpt: )")  # `mi.Log` prepends the name of the calling function
 
 
 class _Lines(mi.Appender):

@@ -30,11 +30,8 @@ from dataclasses import dataclass
 from ..errors import FailureError, UnsupportedError, UsageError, behind, chain, message
 from ..host import signals
 
-FAILURE = 1
-"""The exit status after a failure."""
-
-USAGE = 2
-"""The exit status after a usage error, as argparse's."""
+FAILURE = 1  # the exit status after a failure
+USAGE = 2  # the exit status after a usage error, as argparse's
 
 INTERRUPTED = signals.STATUSES[signal.SIGINT]
 TERMINATED = signals.STATUSES[signal.SIGTERM]

@@ -31,11 +31,8 @@ from ..run.rendering import PassReport
 from . import checkpoints, cluster
 from .mistakes import INTERRUPTED, USAGE, Ending, answered, in_words, status_of, terminable
 
-UNLIMITED_SPP = 1 << 16
-"""Samples per pixel where only the time limits them."""
-
-PASS_SPP = 16
-"""Samples per pixel between two looks at the clock, for integrators that do not look themselves."""
+UNLIMITED_SPP = 1 << 16  # samples per pixel where only the time limits them
+PASS_SPP = 16  # samples per pixel between two looks at the clock, for integrators that do not look themselves
 
 STOPPING = "interrupted; stopping after this pass"
 

@@ -44,11 +44,8 @@ class _Sphere:
         return _Sphere(sphere.center, sphere.inner_radius, sphere.radius if is_small(sphere, extent) else 0.0)
 
 
-# Share of a curved light's directions sampled by the cosine where emission is guided.
-PLAIN = 0.25
-
-# Lower bound of the cosine that a density is divided by.
-_LEAST_COS = 1e-3
+PLAIN = 0.25  # share of a curved light's directions sampled by the cosine where emission is guided
+_LEAST_COS = 1e-3  # lower bound of the cosine that a density is divided by
 
 
 @dataclass

@@ -17,8 +17,7 @@ import numpy as np
 from ..geometry.boxes import asked_anew, boxes
 from .records import Factor
 
-# Longest side of a detail's bounding box, relative to the scene's.
-DETAIL = 0.25
+DETAIL = 0.25  # longest side of a detail's bounding box, relative to the scene's
 
 # Largest radius of the details' bounding sphere relative to the scene's; above there is little to gain.
 LOCAL = 0.5
@@ -27,11 +26,8 @@ LOCAL = 0.5
 # rounding is 6e-8.
 TINY = 1e-4
 
-# Relative enlargement of bounding spheres, so that surfaces on them are not missed.
-MARGIN = 1e-4
-
-# Share of the light subpaths aimed at details; the rest of the scene loses at most this share.
-AIMED = 0.5
+MARGIN = 1e-4  # relative enlargement of bounding spheres, so that surfaces on them are not missed
+AIMED = 0.5  # share of the light subpaths aimed at details; the rest of the scene loses at most this share
 
 
 @dataclass

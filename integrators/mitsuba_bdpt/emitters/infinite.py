@@ -16,11 +16,8 @@ from .group import Context, Group, emitting_point, weight_over
 from .records import Chosen, Direct, Emission, Factor, Place
 from .tables import Mask, cell_at, rows
 
-# Bins per dimension of an environment's directions, each with a square of points on a disk.
-SKY_BINS = 4
-
-# Largest environment map (values) whose contrast is computed.
-_QUICKLY_READ = 1 << 20
+SKY_BINS = 4  # bins per dimension of an environment's directions, each with a square of points on a disk
+_QUICKLY_READ = 1 << 20  # largest environment map (values) whose contrast is computed
 
 
 class InfiniteEmitters(Group):

@@ -17,14 +17,9 @@ from .tables import in_order
 # Value of the parameter that gives each emitter a group, up to this number of emitters.
 AUTO, MOST_OWN = "auto", 8
 
-# Most groups that a user can define: each costs three channels of the film.
-MOST_GROUPS = 16
-
-# Group of the emitters that are in no other.
-REST = "rest"
-
-# What is said of a group without emitters.
-NO_LAMP = "no emitter (black)"
+MOST_GROUPS = 16  # most groups that a user can define: each costs three channels of the film
+REST = "rest"  # group of the emitters that are in no other
+NO_LAMP = "no emitter (black)"  # what is said of a group without emitters
 
 _EXAMPLE = "write it like 'key: lamp1, lamp2; sky: envmap'"
 _SEPARATORS = "for , and ; in an id write ?"

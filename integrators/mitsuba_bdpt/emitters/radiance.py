@@ -15,11 +15,8 @@ _FACTORS = ("radiance", "intensity", "irradiance", "texture")
 # Classes of textures whose `mean` is 0 where they are black.
 _KNOWN = ("SRGBReflectanceSpectrum", "UniformSpectrum", "BitmapTexture", "BlackBodySpectrum")
 
-# Values that are read of a picture.
-_QUICKLY_READ = 1 << 16
-
-# Largest array that is copied from a GPU.
-_QUICKLY_COPIED = 1 << 20
+_QUICKLY_READ = 1 << 16  # values that are read of a picture
+_QUICKLY_COPIED = 1 << 20  # largest array that is copied from a GPU
 
 
 class BlackEmitters(HitOnlyEmitters):

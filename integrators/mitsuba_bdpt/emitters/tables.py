@@ -13,8 +13,7 @@ import numpy as np
 
 Record = TypeVar("Record")
 
-# Largest float below 1.
-BELOW_ONE = 1 - 2**-24
+BELOW_ONE = 1 - 2**-24  # largest float below 1
 
 
 def in_order(scene: mi.Scene) -> list[mi.Emitter]:

@@ -31,8 +31,7 @@ def check_channels(film: mi.Film, layers: list[str]) -> None:
         )
 
 
-STATISTICS = "bdptStatistics"
-"""Attribute of an EXR's header: the statistics of its render, as JSON."""
+STATISTICS = "bdptStatistics"  # attribute of an EXR's header: the statistics of its render, as JSON
 
 
 def attribute(path: Path, name: str) -> str | None:

@@ -19,8 +19,7 @@ from .whole import from_utf8, utf8
 
 _Made = TypeVar("_Made")
 
-SCENES_OWN = "scene"
-"""What ``--integrator`` calls the integrator of the scene file."""
+SCENES_OWN = "scene"  # what ``--integrator`` calls the integrator of the scene file
 
 KEPT = ("max_depth", "rr_depth", "hide_emitters", "timeout")
 """What an integrator that replaces the scene's takes over: the same paths, in the same time."""
@@ -30,17 +29,13 @@ _ADJOINT = ("prb", "prb_basic", "prb_projective", "prbvolpath")
 DEPTHS = {"direct": 2, "direct_projective": 2} | dict.fromkeys(_ADJOINT, 6)
 """``max_depth`` of integrators whose paths end as early where the scene file gives them none."""
 
-CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
-"""Parameters of a film's crop window."""
+CROP = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")  # parameters of a film's crop window
 
 METERS = {"irradiancemeter": "IrradianceMeter", "radiancemeter": "RadianceMeter"}
 """Sensors whose films `--size` and `--crop` leave alone: plugins and classes."""
 
-AROUND = ("aov", "stokes", "moment")
-"""Mitsuba's integrators around another one."""
-
-LISTED = 8
-"""Names that a message lists, at most."""
+AROUND = ("aov", "stokes", "moment")  # Mitsuba's integrators around another one
+LISTED = 8  # names that a message lists, at most
 
 
 @contextmanager

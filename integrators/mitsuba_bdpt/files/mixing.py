@@ -17,11 +17,8 @@ from .images import STATISTICS, read_exr
 
 Weight = float | Sequence[float]
 
-# Attribute of the header of a mixed EXR: its weights by layer, as JSON.
-WEIGHTS = "bdptMix"
-
-# Largest weight: images have single precision.
-MOST = 1e20
+WEIGHTS = "bdptMix"  # attribute of the header of a mixed EXR: its weights by layer, as JSON
+MOST = 1e20  # largest weight: images have single precision
 
 
 def mix(image: mi.Bitmap | Path | str, weights: Mapping[str, Weight]) -> mi.Bitmap:

@@ -16,8 +16,7 @@ from .rounding import offset_at
 # Most triangles of a mesh that are inspected; share of rims above which it is one of panes (2/3 in a box).
 _INSPECTED, _RIMS = 1 << 16, 0.25
 
-# Largest ratio of the edges of a rim's triangle, the shortest over the next.
-_SLENDER = 1 / 16
+_SLENDER = 1 / 16  # largest ratio of the edges of a rim's triangle, the shortest over the next
 
 _FLAT = (mi.ShapeType.Rectangle.value, mi.ShapeType.Disk.value)
 

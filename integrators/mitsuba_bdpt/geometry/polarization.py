@@ -19,8 +19,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-# Bound of the rounding error of unit directions, times ten.
-_ROUNDING = 1e-6
+_ROUNDING = 1e-6  # bound of the rounding error of unit directions, times ten
 
 
 def in_world(si: mi.SurfaceInteraction3f, value: mi.Spectrum, arriving, leaving) -> mi.Spectrum:

@@ -20,8 +20,7 @@ NARROW_SIN2 = 1e-3
 # As in ``Sphere::sample_direction``, which samples by area from up to radius (1 + RAY_EPSILON).
 RAY_EPSILON = 1500 * 2.0**-24
 
-# Spheres and cylinders.
-ROUND = {mi.ShapeType.Sphere.value, mi.ShapeType.Cylinder.value}
+ROUND = {mi.ShapeType.Sphere.value, mi.ShapeType.Cylinder.value}  # spheres and cylinders
 
 
 @dataclass

@@ -55,8 +55,7 @@ def surface_anchor(si: mi.SurfaceInteraction3f, ray: mi.Ray3f, shape_errors: Sha
     return Anchor(mi.Point3f(si.p), mi.Normal3f(si.n), offset, errors.ends)
 
 
-# Lower bound of the cosine that divides an anchor's offset.
-_STEEPEST = 0.05
+_STEEPEST = 0.05  # lower bound of the cosine that divides an anchor's offset
 
 
 def passed(ray: mi.Ray3f, si: mi.SurfaceInteraction3f, shape_errors: ShapeErrors) -> mi.Float:

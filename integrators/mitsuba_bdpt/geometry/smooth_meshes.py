@@ -16,8 +16,7 @@ from ..errors import UsageError
 from ..host.introspection import named, own_parameters
 from .mitsubas_choices import spread_points
 
-# Points that are checked; largest share that may differ by rounding.
-_CHECKED, _OFF = 4096, 0.05
+_CHECKED, _OFF = 4096, 0.05  # points that are checked; largest share that may differ by rounding
 
 
 class SmoothMeshes:

@@ -19,8 +19,7 @@ _TOLERANCE = 1e-3
 # is off by 0.023.
 _OF_REFLECTORS = 0.04
 
-# Condition number above which a single-precision inverse cannot be judged.
-_FLAT = 1e5
+_FLAT = 1e5  # condition number above which a single-precision inverse cannot be judged
 
 
 def check_to_world(shape, owner: str):

@@ -109,11 +109,8 @@ def even(count: int) -> int:
     return count + count % 2
 
 
-# Most channels that Dr.Jit adds as one packet.
-PACKET = 8
-
-# Bytes that copies of the sums for each thread may take, see `reduce_mode`.
-COPIES_MEMORY = 1 << 30
+PACKET = 8  # most channels that Dr.Jit adds as one packet
+COPIES_MEMORY = 1 << 30  # bytes that copies of the sums for each thread may take, see `reduce_mode`
 
 
 def reduce_mode(numbers: int, samples: int, additions: int = 16, otherwise=dr.ReduceMode.Local):
@@ -196,8 +193,7 @@ class Parts:
     light_groups: tuple[str, ...] = ()
 
 
-# Names of the blocks in `Snapshot.arrays`.
-_NAMES = ("camera", "light", "strategies")
+_NAMES = ("camera", "light", "strategies")  # names of the blocks in `Snapshot.arrays`
 
 
 class Accumulator:

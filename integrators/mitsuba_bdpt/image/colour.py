@@ -15,8 +15,7 @@ from ..errors import UnsupportedError
 from ..geometry.polarization import basis
 from ..host.introspection import children, named
 
-# Wavelengths at which a film's response to a spectrum of 1 is evaluated.
-RESPONSE_SAMPLES = 4096
+RESPONSE_SAMPLES = 4096  # wavelengths at which a film's response to a spectrum of 1 is evaluated
 
 
 def film_colours(sensor, stokes: bool = False):
@@ -93,8 +92,7 @@ class Bands:
         return [*colours, *layers, weight]
 
 
-STOKES_NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")
-"""Of the layers."""
+STOKES_NAMES = tuple(f"S{i}.{channel}" for i in range(4) for channel in "RGB")  # of the layers
 
 POLARIZED = 9
 """Numbers of a sample besides its colours, which are the intensity S0: S1, S2 and S3 in linear sRGB."""

@@ -11,14 +11,12 @@ from .accumulator import COPIES_MEMORY, Channels
 from .layers import image_count
 from .taps import is_wide
 
-# Of one array.
-MOST_NUMBERS = 1 << 32
+MOST_NUMBERS = 1 << 32  # of one array
 
 # Bytes that are not compared with the machine's: Mitsuba alone takes more, and to find these takes 1 ms.
 SMALL = 1 << 26
 
-# Bytes that strategy images may take.
-STRATEGY_MEMORY = 2 << 30
+STRATEGY_MEMORY = 2 << 30  # bytes that strategy images may take
 
 # Bytes per number in the sums of a pass (single, double), and in the total (double, held twice while adding).
 SINGLE, DOUBLE, ALL = 4, 8, 2 * 8

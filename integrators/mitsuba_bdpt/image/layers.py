@@ -9,8 +9,7 @@ from ..transport.path_layers import NAMES
 from .colour import STOKES_NAMES
 from .features import feature_names
 
-# Layers of the denoised image.
-DENOISED = ("denoised.R", "denoised.G", "denoised.B")
+DENOISED = ("denoised.R", "denoised.G", "denoised.B")  # layers of the denoised image
 
 # Prefixes of the layers of light groups and of paths: the two partitions of an image.
 GROUP, PATH = "groups.", "path."

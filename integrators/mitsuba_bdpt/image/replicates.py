@@ -50,8 +50,7 @@ class Spread:
         return self.squares / (self.spp * (self.count - 1))
 
 
-# Prefix of the names of the sums after the last image, in a snapshot.
-LAST = "replicates.last."
+LAST = "replicates.last."  # prefix of the names of the sums after the last image, in a snapshot
 
 
 def stored(halves: tuple[Spread, ...]) -> dict[str, np.ndarray]:

@@ -16,8 +16,7 @@ from math import ceil
 import drjit as dr
 import mitsuba as mi
 
-# Of the lattice of draws.
-_GOLDEN = (5**0.5 - 1) / 2
+_GOLDEN = (5**0.5 - 1) / 2  # of the lattice of draws
 
 SIDE = 2  # of the square of inner pixels
 

@@ -16,14 +16,9 @@ from typing import Any, cast
 
 from ..errors import CommandError, UsageTypeError
 
-VARIANT = "llvm_ad_rgb"
-"""Mitsuba's variant in which all measurements render."""
-
-RESOLUTION = 128
-"""Width of references, and of what is judged by them, unless said."""
-
-REFERENCE_SECONDS = 600.0
-"""Seconds that making a reference may take, unless said."""
+VARIANT = "llvm_ad_rgb"  # Mitsuba's variant in which all measurements render
+RESOLUTION = 128  # width of references, and of what is judged by them, unless said
+REFERENCE_SECONDS = 600.0  # seconds that making a reference may take, unless said
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,7 @@ def amount(text: str, total: float) -> Generator[Callable[[float], None]]:
         yield lambda done: shown.update(task, completed=min(round(done), round(total)))
 
 
-EVERY, SHARE = 30.0, 0.02
-"""Least time between two lines: seconds, and share of the time so far."""
+EVERY, SHARE = 30.0, 0.02  # least time between two lines: seconds, and share of the time so far
 
 
 class Renders:

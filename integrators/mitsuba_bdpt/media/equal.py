@@ -17,8 +17,7 @@ from ..host.introspection import children, own_parameters
 if TYPE_CHECKING:
     from .media import MediumProperties
 
-# Relative difference due to rounding (sigma_t 0.4 with scale 2, and 0.8).
-_ROUNDING = 1e-5
+_ROUNDING = 1e-5  # relative difference due to rounding (sigma_t 0.4 with scale 2, and 0.8)
 
 
 def representatives(media: list[MediumProperties]) -> list[int]:

@@ -29,17 +29,10 @@ _AROUND, _LINES, _CAMERA_RAYS = 64, 1 << 12, 1 << 12
 # Emissions per emitter, and of all, that find emitters in several media; fewest that settle one.
 _EMISSIONS, _ALL_EMISSIONS, _FEWEST = 1 << 12, 1 << 20, 32
 
-# Most shapes that bound media at which lines aim.
-_MOST_SHAPES = 1024
-
-# Largest share of rays around the sensor that may disagree with it (rounding, edges).
-_TOLERATED = 0.01
-
-# Largest mean relative difference of sigma_t rho and its reverse due to rounding.
-_SYMMETRIC = 1e-3
-
-# Most reflections at opaque surfaces; among walls without a boundary a ray would never end.
-_REFLECTIONS = 64
+_MOST_SHAPES = 1024  # most shapes that bound media at which lines aim
+_TOLERATED = 0.01  # largest share of rays around the sensor that may disagree with it (rounding, edges)
+_SYMMETRIC = 1e-3  # largest mean relative difference of sigma_t rho and its reverse due to rounding
+_REFLECTIONS = 64  # most reflections at opaque surfaces; among walls without a boundary a ray would never end
 
 
 class LightMedia:

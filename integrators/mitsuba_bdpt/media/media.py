@@ -23,8 +23,7 @@ DEEPEST = 32.0
 
 _LEAST = math.exp(-DEEPEST)
 
-# Sample points and directions at which a medium's properties are evaluated.
-_PROBES = 4096
+_PROBES = 4096  # sample points and directions at which a medium's properties are evaluated
 
 
 class Media:

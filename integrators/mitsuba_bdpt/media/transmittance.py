@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from ..transport.walk import Vertex, Walk
     from .space import Space
 
-# Relative rounding error of distances.
-_ROUNDING = 1e-4
+_ROUNDING = 1e-4  # relative rounding error of distances
 
 
 @dataclass

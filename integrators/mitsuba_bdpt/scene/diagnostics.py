@@ -28,11 +28,8 @@ if TYPE_CHECKING:
     from ..settings import Settings
     from .prepared import PreparedScene
 
-# Most emitters whose radiance is inspected.
-_INSPECTED = 100
-
-# Largest number of causes that a message lists.
-NAMED = 5
+_INSPECTED = 100  # most emitters whose radiance is inspected
+NAMED = 5  # largest number of causes that a message lists
 
 # Suffixes of the names of BSDF textures that scale scattered light.
 _SCALES = ("reflectance", "transmittance", "base_color")
@@ -40,8 +37,7 @@ _SCALES = ("reflectance", "transmittance", "base_color")
 # Largest reflectance not above 1 by more than rounding (8 bits per colour, half precision).
 _MORE_THAN_ALL = 1 + 1e-3
 
-# Single-precision step below 1, the range of cosines of narrow cones.
-_STEP = 2.0**-24
+_STEP = 2.0**-24  # single-precision step below 1, the range of cosines of narrow cones
 
 # Largest step relative to 1 - cos of the cutoff angle (0.2 degrees): bounds the relative error of the light.
 _COARSE = 1e-2
@@ -49,8 +45,7 @@ _COARSE = 1e-2
 # Least width of a face over the size of its shape, through which more than a little of its light passes.
 _OF_PANE = 0.05
 
-# Most bitmap values that are read, of all bitmaps together.
-_QUICKLY_READ = 1 << 17
+_QUICKLY_READ = 1 << 17  # most bitmap values that are read, of all bitmaps together
 
 
 def spoilt(prepared: PreparedScene, settings: Settings) -> list[str]:

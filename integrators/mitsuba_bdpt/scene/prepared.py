@@ -34,8 +34,7 @@ from ..transport.photons.aim import EVEN_SKY
 # hits it, of 64 that are scattered diffusely.
 SMALL = 0.005
 
-# Most cached facts about lobes of BSDFs that follow from samples.
-_LOBES = 1024
+_LOBES = 1024  # most cached facts about lobes of BSDFs that follow from samples
 
 
 class PreparedScene:

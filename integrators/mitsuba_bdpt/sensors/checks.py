@@ -25,8 +25,7 @@ _NAMES = {
     "BatchSensor": "batch sensor",
 }
 
-# Test rays of sensors for which only Mitsuba generates rays.
-_TRIED = 64
+_TRIED = 64  # test rays of sensors for which only Mitsuba generates rays
 
 
 def called(sensor: mi.Sensor) -> str:
