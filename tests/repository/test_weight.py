@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5105,
-    "transport merging guided_emission": 5730,
+    "transport merging guided_emission": 5693,
     "planning": 1743,
     "emitters": 2182,
     "cli": 1451,
@@ -29,7 +29,7 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2854, "tests": 28273}
+OUTSIDE = {"scripts": 2854, "tests": 28272}
 MOST_WORDS = 31364
 
 

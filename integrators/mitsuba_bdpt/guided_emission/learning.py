@@ -18,8 +18,7 @@ import numpy as np
 from ..emitters.records import Cell
 from .tables import EmissionTables
 
-# Halves of a pilot, and classes of l / (1 - l), a factor of four apart.
-HALVES, CLASSES = 2, 8
+HALVES, CLASSES = 2, 8  # halves of a pilot, and classes of l / (1 - l), a factor of four apart
 
 # Columns of a cell: the classes, then the second moments without tables, times l and whole.
 BEFORE = 2
@@ -35,8 +34,7 @@ LEAST = (0.5, 0.25)
 # Most that may remain of second moments (times l): geometric mean of all cells and of all but `WORST`.
 PAYS = 0.93
 
-# Share of cells left out of the second judgement: outliers.
-WORST = 0.02
+WORST = 0.02  # share of cells left out of the second judgement: outliers
 
 # Emitters with less than this share of the total gain get no tables: lookups cost time at each vertex.
 PART = 0.01
@@ -45,8 +43,7 @@ PART = 0.01
 # judging tables of the other prefers smoother tables than the whole pilot does.
 BLURS = {24: (1, 3), 16: (1, 2), 8: (1,), 4: (1,)}
 
-# Iterations of the fixed point.
-_STEPS = 16
+_STEPS = 16  # iterations of the fixed point
 
 
 class EmissionStatistics:

@@ -19,8 +19,7 @@ from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coeffici
 from .radius import Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
-# Camera samples of a pass per photon subpath (experiments, "Which paths are merged").
-SAMPLES_PER_PHOTON = 8
+SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Which paths are merged")
 
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
@@ -32,8 +31,7 @@ _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 # Without pixels (meters): least photon subpaths of a pass, and pixels of a film with as small a radius.
 _METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
 
-# Bits of the edges and of the subpath's index in the sort key of photons.
-_EDGES_BITS, _LANE_BITS = 12, 32
+_EDGES_BITS, _LANE_BITS = 12, 32  # bits of the edges and of the subpath's index in the sort key of photons
 
 
 def why_not(sensor: mi.Sensor, media: bool) -> str:

@@ -13,8 +13,7 @@ from ..geometry.boxes import scene_box
 from ..geometry.rounding import OFFSET_ULPS, offset_at
 from ..host.introspection import world_matrix
 
-# Columns and rows of camera rays that measure the size of pixels in the scene.
-_PROBES = 64
+_PROBES = 64  # columns and rows of camera rays that measure the size of pixels in the scene
 
 # Bounds of the radius in multiples of its median over the first hits of camera rays.
 _LOWEST, _HIGHEST = 1 / 8, 8

@@ -19,8 +19,7 @@ from ..transport.walk import Vertex
 from .merging import Merging, Sample
 from .unsampled import Unsampled
 
-# Expected samples per pixel below which light is undersampled.
-FEWEST = 0.1
+FEWEST = 0.1  # expected samples per pixel below which light is undersampled
 
 # Bounds of kinds of light by expected samples per pixel: none, undersampled, few (which a pilot takes for
 # outliers).

@@ -29,8 +29,7 @@ from .passes import sort
 from .radius import Footprints, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
-# Merging radius in distances between camera samples (of a set of wavelengths) on the film.
-RADIUS = 1.5
+RADIUS = 1.5  # merging radius in distances between camera samples (of a set of wavelengths) on the film
 
 
 @dataclass

@@ -11,17 +11,13 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-# Bits of a set's index.
-SET_BITS = 3
+SET_BITS = 3  # bits of a set's index
 
 # Sets of a pass: fewer tint the image, more leave fewer photons in each; see experiments, "Vertex merging".
 SETS = 1 << SET_BITS
 
-# Sample values in [0, 1) that differ by this give the same wavelengths in another order.
-_TURN = 0.25
-
-# Fractional part of the golden ratio: its multiples modulo 1 are stratified.
-_GOLDEN = 0.6180339887498949
+_TURN = 0.25  # sample values in [0, 1) that differ by this give the same wavelengths in another order
+_GOLDEN = 0.6180339887498949  # fractional part of the golden ratio: its multiples modulo 1 are stratified
 
 
 @dataclass

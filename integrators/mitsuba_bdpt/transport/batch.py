@@ -95,8 +95,7 @@ class Places:
 # Most pixels of a run, a power of two; runs of one pixel are 4 to 8 % slower with one sample per pass.
 LONGEST_RUN = 16
 
-# Parts of fewer runs use runs of one pixel: few runs would meet at few distances.
-LEAST_RUNS = 256
+LEAST_RUNS = 256  # parts of fewer runs use runs of one pixel: few runs would meet at few distances
 
 # Words that derive seeds from that of a pass: the points use 1 and 2 (`Points.stream`), parts later ones.
 _WORDS_OF_POINTS = 2

@@ -24,8 +24,7 @@ from .draws import needs_full_pdf, nested
 from .near_specular import spread_interactions
 from .spectra import brightest, is_finite, is_zero
 
-# Two points of one plane are connected under a cosine that is rounding.
-_LEAST_COS = 1e-18
+_LEAST_COS = 1e-18  # two points of one plane are connected under a cosine that is rounding
 
 
 @dataclass
@@ -127,8 +126,7 @@ MANY = 10
 # calls are used. Recorded in C++, a call of a simple BSDF costs a quarter of one through Python.
 _UNHIT = 0.25
 
-# Largest number of kinds (`molds`), relative to the BSDFs, up to which one is called for each.
-_MOLDS = 0.25
+_MOLDS = 0.25  # largest number of kinds (`molds`), relative to the BSDFs, up to which one is called for each
 
 
 class BSDFDispatch:

@@ -116,11 +116,8 @@ def connect_one(kernel: TraceContext, z: Vertex, path: LightPath, stream: Stream
     return c if sides is None else drop_non_finite(c)  # only now with its weight
 
 
-# Probability of a uniform draw, so that connections of approximate size 0 are drawn too.
-EVENLY = 0.005
-
-# Index of the series of hashed numbers of draws by approximation; merges use the first.
-_OF_GUESSES = 2
+EVENLY = 0.005  # probability of a uniform draw, so that connections of approximate size 0 are drawn too
+_OF_GUESSES = 2  # index of the series of hashed numbers of draws by approximation; merges use the first
 
 
 @dataclass

@@ -13,8 +13,7 @@ from . import spectra
 from .inputs import TraceContext
 from .vacuum import ShadowRay
 
-# Least survival probability of roulette: random numbers are multiples of 2^-24.
-LEAST_SURVIVAL = 2.0**-20
+LEAST_SURVIVAL = 2.0**-20  # least survival probability of roulette: random numbers are multiples of 2^-24
 
 
 @dataclass
@@ -70,11 +69,8 @@ class Counters:
         return total
 
 
-# Counters of edges in media.
-MEDIA = ("segments", "collisions")
-
-# Counters of merging besides rays.
-MERGING = ("photons", "merges")
+MEDIA = ("segments", "collisions")  # counters of edges in media
+MERGING = ("photons", "merges")  # counters of merging besides rays
 
 COUNTERS = tuple(field.name for field in fields(Counters))
 

@@ -23,11 +23,8 @@ _SAMPLED_PDF_IS_PDF = frozenset(
     "TwoSidedBRDF MaskBSDF BumpMap NormalMap Null".split()
 )
 
-# Plugins that change the frame of nested BSDFs.
-MAPS = "BumpMap", "NormalMap"
-
-# Plugins that are sampled here if they contain a blend.
-_BY_PARTS = "BlendBSDF", "TwoSidedBRDF", "MaskBSDF"
+MAPS = "BumpMap", "NormalMap"  # plugins that change the frame of nested BSDFs
+_BY_PARTS = "BlendBSDF", "TwoSidedBRDF", "MaskBSDF"  # plugins that are sampled here if they contain a blend
 
 
 @dataclass

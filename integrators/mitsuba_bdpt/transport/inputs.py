@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 # Sizes of the lanes' local memory: irrelevant to the speed of CPUs; few sizes give few kernels.
 STORE_SIZES = (64, 256, MAX_STORED)
 
-# Most stored vertices of a light subpath in scenes with media, see `light_path.Thinning`.
-KEPT = 64
+KEPT = 64  # most stored vertices of a light subpath in scenes with media, see `light_path.Thinning`
 
 
 @dataclass

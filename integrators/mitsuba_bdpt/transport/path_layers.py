@@ -29,8 +29,7 @@ from .near_specular import is_narrow
 NAMES = ("emission", "direct", "indirect", "caustic")
 EMISSION, DIRECT, INDIRECT, CAUSTIC = range(len(NAMES))
 
-# Of light subpaths: specular events alone, one at least.
-_SPECULAR = len(NAMES)
+_SPECULAR = len(NAMES)  # of light subpaths: specular events alone, one at least
 
 
 def sampled(layer: mi.UInt32 | None, step: Step, adjoint: bool) -> mi.UInt32 | None:

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-# Numbers of light subpaths with which a camera subpath can be connected.
-JOINED = (1, 4)
-
-# Guided samples per vertex where s = 0 is guided.
-GUIDED_SAMPLES = 4
+JOINED = (1, 4)  # numbers of light subpaths with which a camera subpath can be connected
+GUIDED_SAMPLES = 4  # guided samples per vertex where s = 0 is guided
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from .alternatives import newest_coefficient
 # Factor of an approximation on a side to which the BSDF does not scatter: shading normals and bumps may.
 WRONG_SIDE = 0.0002
 
-# Least cosine by which densities over area are divided.
-_LEAST_COS = 0.01
+_LEAST_COS = 0.01  # least cosine by which densities over area are divided
 
 # Least brightness of a light vertex, among which black ones are drawn by their other factors.
 _LEAST_SIZE = 1e-30

@@ -16,8 +16,7 @@ import mitsuba as mi
 from . import mis
 from .near_specular import SPECULAR, is_narrow
 
-# Edges of the shortest guided path: no photon directly from the emitter guides.
-FEWEST_EDGES = 3
+FEWEST_EDGES = 3  # edges of the shortest guided path: no photon directly from the emitter guides
 
 
 @dataclass

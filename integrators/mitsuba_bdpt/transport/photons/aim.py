@@ -20,15 +20,13 @@ from ...emitters.records import Emission
 from ...geometry.boxes import box_of
 from ...host.introspection import grouped_shapes, is_instance
 
-# Most spheres; a scene with more shapes has one around all of them.
-MOST_SPHERES = 8
+MOST_SPHERES = 8  # most spheres; a scene with more shapes has one around all of them
 
 # Largest ratio of maximum to mean radiance of an environment that emits no photons: light that s = 0 does not
 # find by itself must be brighter. (`budget.EVEN` is of light subpaths, `configuration.UNIFORM` of weights.)
 EVEN_SKY = 16
 
-# Relative enlargement of the spheres, for rounding.
-_MARGIN = 1e-3
+_MARGIN = 1e-3  # relative enlargement of the spheres, for rounding
 
 
 @dataclass

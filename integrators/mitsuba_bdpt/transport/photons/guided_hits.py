@@ -27,8 +27,7 @@ from ..sds import Advice, PhotonStrategy, State, begun_near_specular, is_specula
 from ..walk import Side, Vertex, Walk, not_finite, random_walk
 from . import photon_guide
 
-# Seed that separates random numbers of guided subpaths from those of their camera subpath.
-_SEED = 0x5BD1E995
+_SEED = 0x5BD1E995  # seed that separates random numbers of guided subpaths from those of their camera subpath
 
 
 class Guiding(PhotonStrategy):

@@ -19,8 +19,7 @@ from .photon import Photon
 WINDOW = (-60, -12, *range(-4, 4), 12, 60)
 LOBES = (*WINDOW, *range(-2, 2))
 
-# Density of a photon's direction under the others of its window (1 / sr) below which it is rare.
-_RARE = 4.0
+_RARE = 4.0  # density of a photon's direction under the others of its window (1 / sr) below which it is rare
 
 # Bits of each coordinate of a place on the curve, and of a subpath's index: 64 together.
 _BITS, _LANE_BITS = 15, 19
