@@ -26,7 +26,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import command_line
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import pandas as pd
 import repository

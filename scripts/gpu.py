@@ -20,9 +20,6 @@ from functools import cache, partial
 from pathlib import Path
 
 import command_line
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
-
-import mitsuba as mi  # isort: skip
 import numpy as np
 import pandas as pd
 import repository
@@ -32,6 +29,8 @@ from mitsuba_bdpt.measure.results import rel_mse_columns
 from mitsuba_bdpt.measure.scenes import integrator_of, path_tracers
 from mitsuba_bdpt.measure.tables import markdown, ratio
 from mitsuba_bdpt.measure.timing import Timed, alternating, timed
+
+import mitsuba as mi  # isort: skip
 
 RECORD = repository.ROOT / "docs" / "reports" / "cuda.json"
 SPP, SEEDS = 256, 8

@@ -16,7 +16,6 @@ import subprocess
 import sys
 
 import command_line
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import repository
 from mitsuba_bdpt.files.texts import write_text

@@ -9,13 +9,12 @@ import sys
 from pathlib import Path
 
 import command_line
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
-
-import mitsuba as mi  # isort: skip
 import numpy as np
 import repository
 from mitsuba_bdpt.cli.mistakes import answered
 from mitsuba_bdpt.measure.options import WHOLE
+
+import mitsuba as mi  # isort: skip
 
 TABLE = Path(__file__).with_suffix(".xml")
 

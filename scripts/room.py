@@ -6,7 +6,6 @@ print(measure.compare_integrators(room, "bdpt", {"type": "path", "sampler": "mul
 
 from __future__ import annotations
 
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import repository  # noqa: F401 (puts the folder of `scenes` on the path)
 

@@ -24,7 +24,6 @@ from functools import partial
 from pathlib import Path
 
 import command_line
-import mitsuba_bdpt  # noqa: F401 (before mitsuba: it chooses the LLVM library)
 import numpy as np
 import pandas as pd
 import repository

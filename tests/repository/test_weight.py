@@ -18,7 +18,7 @@ MOST = {
     "transport merging guided_emission": 5693,
     "planning": 1743,
     "emitters": 2182,
-    "cli": 1451,
+    "cli": 1448,
     "media": 1337,
     "geometry": 1429,
     "image": 1310,
@@ -29,7 +29,7 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2854, "tests": 28272}
+OUTSIDE = {"scripts": 2847, "tests": 28272}
 MOST_WORDS = 31364
 
 

@@ -60,8 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int | None:
 class Parser(argparse.ArgumentParser):
     """A parser without abbreviations, which suggests commands and options."""
 
-    known: ClassVar[dict[str, None]] = {}
-    """Names of commands and options of all parsers, each once."""
+    known: ClassVar[dict[str, None]] = {}  # names of commands and options of all parsers, each once
 
     def __init__(self, **settings):
         # An abbreviation may become ambiguous in the next version.

@@ -45,10 +45,8 @@ class Outcome:
     spp: int
     interrupted: bool = False
     statistics: dict = field(default_factory=dict)
-    error: Exception | None = None
-    """What has ended it before its end, if something else than a signal has."""
-    written: Callable[[], object] = lambda: None
-    """To be called when the image is written."""
+    error: Exception | None = None  # what has ended it before its end, if something else than a signal has
+    written: Callable[[], object] = lambda: None  # to be called when the image is written
 
 
 def run(options: Namespace) -> int | None:
