@@ -16,16 +16,16 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 MOST = {
     "measure": 5105,
     "transport merging guided_emission": 5693,
-    "planning": 1743,
+    "planning": 1732,
     "emitters": 2182,
     "cli": 1448,
     "media": 1337,
     "geometry": 1429,
     "image": 1310,
     "files": 844,
-    "run": 1182,
-    "scene sampling": 819,
-    "host": 814,
+    "run": 1179,
+    "scene sampling": 817,
+    "host": 809,
     "sensors": 882,
     "": 1280,  # top files
 }

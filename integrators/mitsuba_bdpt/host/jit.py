@@ -11,8 +11,7 @@ import mitsuba as mi
 
 from .introspection import own_parameters
 
-# Consecutive unused registry indices that end the search; indices of freed emitters are reused.
-_GAP = 64
+_GAP = 64  # consecutive unused registry indices that end the search; indices of freed emitters are reused
 
 # Numbers of threads before each of the calls that are within `two_threads`.
 _before, _lock = [], threading.Lock()

@@ -23,8 +23,7 @@ from pathlib import Path
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 NAMED = f"named by {VARIABLE}"
 WHEEL = "karellen-llvm-core"
-KNOWN_GOOD = (19, 22, 23)
-"""Major versions that passed this package's tests."""
+KNOWN_GOOD = (19, 22, 23)  # major versions that passed this package's tests
 
 _LIBRARY = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.(so|dylib)(\.\d+)*")
 

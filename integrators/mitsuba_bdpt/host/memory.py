@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path("/")
-"""Where the files of the system are."""
+ROOT = Path("/")  # where the files of the system are
 
 _limit_set: list[float] = []
 """The limit of `set_limit`, if there is one."""

@@ -16,8 +16,7 @@ import numpy as np
 
 from .introspection import all_parameters, own_parameters
 
-# Maximum number of cached results of one kind per scene; the oldest are dropped.
-FINDINGS = 16
+FINDINGS = 16  # maximum number of cached results of one kind per scene; the oldest are dropped
 
 _scenes: dict[int, tuple] = {}
 
@@ -78,8 +77,7 @@ def warn_once(scene: mi.Scene, sensor: mi.Sensor, text: str, about: Hashable = N
         mi.Log(mi.LogLevel.Warn, text)
 
 
-# Largest array (entries) that is kept alive: its index stays unique, without holding gigabytes.
-KEPT = 64
+KEPT = 64  # largest array (entries) that is kept alive: its index stays unique, without holding gigabytes
 
 
 @dataclass(frozen=True)

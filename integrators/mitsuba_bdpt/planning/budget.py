@@ -25,8 +25,7 @@ SAMPLES_PER_KIND, SAMPLES_PER_BSDF = 1 << 15, 1 << 11
 # takes three kernels instead of one; see experiments, "Choice of strategies".
 GUIDING_TIMES = 4
 
-# Assumed samples of a render of unknown length, see `expected_samples`.
-PROVISIONAL_SAMPLES = 1 << 20
+PROVISIONAL_SAMPLES = 1 << 20  # assumed samples of a render of unknown length, see `expected_samples`
 
 # Largest ratio of maximum to mean radiance of an environment that s = 0 samples well by itself (a clear sky
 # without its sun has about ten): light subpaths and guided samples do not pay, but in long renders. Tighter

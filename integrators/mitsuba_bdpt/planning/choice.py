@@ -64,8 +64,7 @@ TABLES_ALONE = 0.7
 # `confidence` counts resamplings in which the chosen candidate takes at most this multiple of the best time.
 NEAR = 1.15
 
-# Bootstrap resamplings of a pilot's groups, see `confidence`.
-RESAMPLINGS = 100
+RESAMPLINGS = 100  # bootstrap resamplings of a pilot's groups, see `confidence`
 
 # relMSE per sample below which noise is invisible, and differences of candidates are the pilot's noise.
 LEAST_VARIANCE = 1e-4

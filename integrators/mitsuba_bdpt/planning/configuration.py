@@ -91,8 +91,7 @@ CANDIDATES = (
 )
 
 
-# Level of ``statistics["skipped"]`` of strategies that do not pay.
-NOT_WORTH = "not worth its cost here"
+NOT_WORTH = "not worth its cost here"  # level of ``statistics["skipped"]`` of strategies that do not pay
 
 
 def not_worth(name: str, why: str) -> dict[str, str]:

@@ -55,21 +55,15 @@ def split(rows: np.ndarray, parts: dict[str, int]) -> Rows:
 # it is noisy. (A caustic and its shadow are smaller than the larger tiles.)
 FINE, TILES = 32, 8
 
-# The same for emission statistics.
-EMISSION_TILES = 4
-
-# Independent parts of the pilot, for resampling.
-GROUPS = 16
-
-# Least number of camera samples per pixel; their products estimate the squared mean.
-PER_PIXEL = 2
+EMISSION_TILES = 4  # the same for emission statistics
+GROUPS = 16  # independent parts of the pilot, for resampling
+PER_PIXEL = 2  # least number of camera samples per pixel; their products estimate the squared mean
 
 # Share of the pixels of a render whose errors the trimmed error leaves out. Contributions that fewer pixels
 # receive are not in the variance of a typical render, but their light is missing from it.
 TRIMMED = 1e-3
 
-# Candidates of a larger relative variance are ruled out, see `pilot.LOST`.
-RULED_OUT = 1e15
+RULED_OUT = 1e15  # candidates of a larger relative variance are ruled out, see `pilot.LOST`
 
 
 @dataclass(frozen=True)

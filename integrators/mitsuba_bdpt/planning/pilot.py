@@ -56,8 +56,7 @@ LIGHT_TIMES = 4
 # they stratify few dimensions well. See experiments, "Choice of strategies".
 DIRECT = 1 / 64
 
-# Lanes that run a loop together.
-PACKET = 16
+PACKET = 16  # lanes that run a loop together
 
 
 @dataclass

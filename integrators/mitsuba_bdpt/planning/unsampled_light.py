@@ -41,8 +41,7 @@ if TYPE_CHECKING:
 # photons from infinity meet a small glass: of 2^13, none did for three of eight seeds.
 SUBPATHS, MOST_SUBPATHS, SAMPLES_OF_ONE = 1 << 13, 1 << 18, 64
 
-# Share of an image's light from which on a warning is given.
-WARN_SHARE = 0.01
+WARN_SHARE = 0.01  # share of an image's light from which on a warning is given
 
 # Least density of a lobe (solid angle) that may leave light undersampled; the estimate is dear beside a short
 # render (see experiments, "Near-specular lobes").

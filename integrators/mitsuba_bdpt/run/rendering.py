@@ -57,8 +57,7 @@ if TYPE_CHECKING:
 # ones recording a second pass takes longer than what roulette saves; fewer than `FEW_PIXELS` give no mean.
 TWO_PASSES = 1 << 18
 
-# Samples that estimate the image's mean, at least.
-LEAST_OF_MEAN = 1 << 10
+LEAST_OF_MEAN = 1 << 10  # samples that estimate the image's mean, at least
 
 
 @dataclass(frozen=True)

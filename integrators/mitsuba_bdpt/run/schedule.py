@@ -23,8 +23,7 @@ LAUNCH_SAMPLES_CUDA = 1 << 24
 # Independent images for the variance. Few, since each has its own, shorter sequence of points.
 REPLICATES = 8
 
-# Samples per pixel of each of the first `REPLICATES` images under ``target_error``.
-FIRST_REPLICATE = 4
+FIRST_REPLICATE = 4  # samples per pixel of each of the first `REPLICATES` images under ``target_error``
 
 
 def _most_samples() -> int:

@@ -54,8 +54,7 @@ class Progress:
         return cls(**values)
 
 
-# Version of the stored format; increase with every change.
-FORMAT = 13
+FORMAT = 13  # version of the stored format; increase with every change
 
 
 def identity(settings: Settings, accumulator: Accumulator, seed: int, spp: int, part: int) -> dict:

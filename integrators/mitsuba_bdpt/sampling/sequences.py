@@ -5,15 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-# Numbers from 1 are the replicates of `variance`; a pilot uses `PILOT`.
-PILOT = 1 << 16
+PILOT = 1 << 16  # numbers from 1 are the replicates of `variance`; a pilot uses `PILOT`
 
 # Photons use `PHOTONS` plus the number of finished passes, or a sequence derived from it; wavelengths of
 # passes with merging use numbers from `WAVELENGTHS`.
 PHOTONS, WAVELENGTHS = 1 << 18, 1 << 30
 
-# The guide of photon-guided BSDF sampling.
-GUIDE = 1 << 19
+GUIDE = 1 << 19  # the guide of photon-guided BSDF sampling
 
 
 def sequence_seed(seed, number: int):
