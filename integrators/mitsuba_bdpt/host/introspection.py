@@ -99,18 +99,15 @@ def _value(value, cpptype, owner):
 
 
 def all_parameters(owners):
-    """Yield class name and parameters of ``owners`` and their descendants but integrators, each once.
-
-    Of plugins in Python, whose attributes need not be parameters, the class itself.
-    """
+    """Yield class name and parameters of ``owners`` and their descendants, each once."""
     collector = _collector(mi.variant())()
     left, seen = list(owners), {}
     while left:
         owner = left.pop()
-        if id(owner) in seen or isinstance(owner, mi.Integrator):
+        if id(owner) in seen:
             continue
         seen[id(owner)] = owner  # kept alive: ids are reused
-        yield type(owner) if hasattr(owner, "__dict__") else owner.class_name()
+        yield owner.class_name()
         for name, value in collector.of(owner).items():
             if isinstance(value, mi.Object):
                 left.append(value)

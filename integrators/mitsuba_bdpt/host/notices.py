@@ -85,21 +85,18 @@ class State:
     """Fingerprint of the parameters of Mitsuba's objects; equal if nothing was edited.
 
     ``marks``: JIT indices of small arrays, checksums of larger arrays, text of all other values. ``kept``:
-    the small arrays, so that Dr.Jit does not reuse their indices. ``complete``: no plugin is in Python.
+    the small arrays, so that Dr.Jit does not reuse their indices.
     """
 
     marks: tuple[Any, ...]
     kept: tuple[Any, ...] = field(compare=False, repr=False)
-    complete: bool = True
 
     @classmethod
     def of(cls, owners: Iterable[mi.Object], deep: bool = True) -> State:
         """Return the present state of ``owners``, and of their children if ``deep``."""
         marks, kept = [], []
         own = (own_parameters(owner).values() for owner in owners)
-        complete = True
         for value in all_parameters(owners) if deep else chain.from_iterable(own):
-            complete &= not isinstance(value, type)
             indices = dr.detail.collect_indices(value)
             if not indices:
                 marks.append(repr(value))
@@ -108,7 +105,7 @@ class State:
                 kept.append(dr.copy(value))
             else:
                 marks.append(_checksum(value))
-        return cls(tuple(marks), tuple(kept), complete)
+        return cls(tuple(marks), tuple(kept))
 
 
 def _checksum(value) -> tuple:

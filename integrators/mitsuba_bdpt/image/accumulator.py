@@ -274,17 +274,7 @@ class Accumulator:
 
     def evaluate(self, *others):
         """Evaluate what was recorded since the last call, and ``others``, in one kernel."""
-        dr.eval(self.sums, *others)
-
-    @property
-    def sums(self) -> list:
-        """The arrays of the blocks' sums."""
-        return [b.data for b in self._blocks()]
-
-    @sums.setter
-    def sums(self, sums: list):
-        for block, data in zip(self._blocks(), sums, strict=True):
-            block.data = data
+        dr.eval([b.data for b in self._blocks()], *others)
 
     def _blocks(self):
         return [b for b in (self.camera, self.light, self.strategies) if b is not None]
@@ -296,7 +286,8 @@ class Accumulator:
 
     def close_pass(self, spp: int):
         """Add the sums of a pass of ``spp`` samples per pixel to the total."""
-        sums = self.sums
+        blocks = self._blocks()
+        sums = [b.data for b in blocks]
         if self._strips > 1:
             sums[0] = self.camera.totals(self._stride, self.size[1])
         if self.layers:
@@ -306,11 +297,7 @@ class Accumulator:
             sums = [mi.Float64(a) + mi.Float64(b) for a, b in zip(before, sums, strict=True)]
         dr.eval(sums)
         self._done = (sums, (*passes, spp))  # one assignment: Ctrl-C may come between any two steps
-        self.clear()
-
-    def clear(self):
-        """Drop the sums that no pass has closed."""
-        for b in self._blocks():
+        for b in blocks:
             b.clear()
 
     def store(self) -> tuple[tuple[int, ...], dict]:

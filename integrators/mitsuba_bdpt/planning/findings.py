@@ -23,16 +23,11 @@ class SceneCache:
         self._prepared, self._sensor = prepared, sensor
         self._state: State | None = None
 
-    @property
-    def state(self) -> State:
-        """The present parameters of scene and sensor."""
-        if self._state is None:
-            self._state = State.of([self._prepared.scene, self._sensor])
-        return self._state
-
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
         """Return the result of ``look()``, and whether it was cached for ``key``."""
-        key = self.state, self._prepared.camera.region.border, key  # detects edits
+        if self._state is None:  # detects edits
+            self._state = State.of([self._prepared.scene, self._sensor])
+        key = self._state, self._prepared.camera.region.border, key
         return cached(self._prepared.scene, self._sensor, kind, key, look)
 
     def expire(self):

@@ -35,7 +35,7 @@ from ..properties import check_film, check_not_frozen, check_variant, integer
 from ..scene.prepared import PreparedScene
 from ..settings import Settings
 from ..transport import mis
-from ..transport.batch import Batch, strip_count
+from ..transport.batch import strip_count
 from ..transport.inputs import TraceContext
 from ..transport.kernel import trace
 from ..transport.photons import photon_pass
@@ -45,7 +45,6 @@ from ..transport.photons.photon_guide import Guide
 from ..transport.plan import Plan
 from ..transport.sds import PhotonStrategy
 from . import messages
-from .kept import Kept
 from .schedule import REPLICATES, PassPoints, Step, batches, longest_pass, passes_since, schedule
 from .snapshot import Progress, Snapshot, identity
 from .statistics import Meter, rays
@@ -124,8 +123,6 @@ class Render:
         parts = Parts(channels, strip_count(longest), min(longest, spp), names)
         self.accumulator = Accumulator(sensor.film(), colour, border, settings, features, parts)
         self.kernel = self._kernel()
-        # Whether passes are reported: then the scene may be edited between them.
-        self._watched = False
         # Result of `_guide`.
         self._guides: tuple[Guide | None] | None = None
         # Whether the first pass has one sample per pixel. It gives the mean of the image, for roulette.
@@ -152,7 +149,8 @@ class Render:
         Ends early at ``timeout``, ``target_error``, when ``cancelled()`` after a pass, or by an interruption.
         ``on_pass`` is called with a `PassReport` after each pass.
         """
-        timeout, self._watched = self.settings.timeout, on_pass is not None
+        timeout = self.settings.timeout
+        watched = on_pass is not None or timeout >= 0
         with self._finished():
             for number, step in enumerate(self._steps()):
                 if not number:
@@ -162,7 +160,7 @@ class Render:
                     messages.warn_of_missing_direct(self.prepared, self.plan, self.settings)
                 self._pass(step)
                 # Records the second pass while the first, a short one, runs.
-                if self._watched or timeout >= 0 or number > 0:
+                if watched or number > 0:
                     self.meter.wait()
                 if step.last and self.settings.variance:
                     self.accumulator.close_replicate()
@@ -278,32 +276,13 @@ class Render:
         for launch, batch in enumerate(batches(self.prepared.camera, step.done, step.size, self.settings)):
             if launch:
                 self.meter.wait()
+            drawn = self.points.of(step)
             with gc_paused(), dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-                counts = self._launch(batch, step)
+                with evaluated_mode(self.prepared.emitters.evaluated):
+                    counts = trace(self.kernel, Image(self.accumulator), batch, drawn, step.of)
+                self.accumulator.evaluate(counts)
             self.meter.launched(counts)
         self.accumulator.close_pass(step.size)
-
-    def _launch(self, batch: Batch, step: Step) -> mi.UInt64:
-        """Trace one batch; from the second render of an unchanged scene on, as it was recorded (`Kept`)."""
-        film, drawn, plan, prepared = self.accumulator, self.points.of(step), self.plan, self.prepared
-
-        def launch():
-            with evaluated_mode(prepared.emitters.evaluated):
-                counts = trace(self.kernel, Image(film), batch, drawn, step.of)
-            film.evaluate(counts)
-            return counts, film.sums
-
-        varies = self._watched or plan.guided or plan.merging or prepared.emitters.evaluated
-        whole = batch.pixels == prepared.camera.region.size.prod()  # others take long
-        on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM  # GPUs: not tried
-        if varies or not (whole and on_cpu and self.findings.state.complete):
-            return launch()[0]
-        key = self.settings, replace(plan, skipped=()), self.spp, batch, step.of
-        kept, is_known = self.findings.find("launches", key, Kept)
-        held = self.kernel, drawn
-        found = kept.run(launch, film, prepared.scene, self.sensor, held) if is_known else launch()
-        counts, film.sums = found
-        return counts
 
     def _plays_roulette(self) -> bool:
         """Return whether contributions of strategies in use may play roulette."""
