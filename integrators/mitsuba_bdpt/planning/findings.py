@@ -21,13 +21,13 @@ class SceneCache:
 
     def __init__(self, prepared: PreparedScene, sensor: mi.Sensor):
         self._prepared, self._sensor = prepared, sensor
-        self._state: State | None = None
+        self._state: tuple[State, int] | None = None
 
     def find(self, kind: str, key: Hashable, look: Callable[[], Found]) -> tuple[Found, bool]:
         """Return the result of ``look()``, and whether it was cached for ``key``."""
         if self._state is None:  # detects edits
-            self._state = State.of([self._prepared.scene, self._sensor])
-        key = self._state, self._prepared.camera.region.border, key
+            self._state = State.of([self._prepared.scene, self._sensor]), self._prepared.camera.region.border
+        key = self._state, key
         return cached(self._prepared.scene, self._sensor, kind, key, look)
 
     def expire(self):
