@@ -139,6 +139,21 @@ def test_each_entry_counts(kind, entries):
     assert len(found) == 5 and _checksum(made(values)) in found
 
 
+def test_exchanged_bsdfs_are_seen():
+    """Rationale: a shape that is given a BSDF which another has too changes no parameter."""
+    ball = {"type": "sphere", "bsdf": {"type": "ref", "id": "first"}}
+    bsdfs = {"first": {"type": "diffuse", "id": "first"}, "second": {"type": "conductor", "id": "second"}}
+    other = ball | {"bsdf": {"type": "ref", "id": "second"}}
+    scene = mi.load_dict({"type": "scene", **bsdfs, "a": ball, "b": other, "c": ball, "d": other})
+    states = {State.of([scene])}
+    held = [shape.bsdf() for shape in scene.shapes()]
+    for shape, bsdf in zip(scene.shapes(), held, strict=True):
+        shape.set_bsdf(next(one for one in held if one is not bsdf))
+        states.add(State.of([scene]))
+        shape.set_bsdf(bsdf)
+    assert len(states) == 5 and State.of([scene]) in states
+
+
 def test_edits_in_place_are_seen():
     mesh = bumpy()
     parameters, before = mi.traverse(mesh), State.of([mesh])

@@ -99,14 +99,15 @@ def _value(value, cpptype, owner):
 
 
 def all_parameters(owners):
-    """Yield class name and parameters of ``owners`` and their descendants, each once."""
+    """Yield class name and parameters of ``owners`` and their descendants, each once, then its number."""
     collector = _collector(mi.variant())()
     left, seen = list(owners), {}
     while left:
         owner = left.pop()
         if id(owner) in seen:
+            yield seen[id(owner)][0]
             continue
-        seen[id(owner)] = owner  # kept alive: ids are reused
+        seen[id(owner)] = len(seen), owner  # kept alive: ids are reused
         yield owner.class_name()
         for name, value in collector.of(owner).items():
             if isinstance(value, mi.Object):

@@ -140,15 +140,13 @@ def quick_compilation(once: bool = True):
 
 def _set_options(*options: bytes) -> bool:
     """Set options of the LLVM library in use; False, without effect, for an untested version."""
-    if sys.modules["drjit"].detail.llvm_version()[0] not in KNOWN_GOOD:
-        return False
-    try:
-        parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
-    except (OSError, AttributeError):
-        return False
-    arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
-    parse(len(arguments), arguments, b"")
-    return True
+    if sys.modules["drjit"].detail.llvm_version()[0] in KNOWN_GOOD:
+        with contextlib.suppress(OSError, AttributeError):
+            parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
+            arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
+            parse(len(arguments), arguments, b"")
+            return True
+    return False
 
 
 def cuda_driver() -> bool:

@@ -247,12 +247,10 @@ class Render:
         if self._small_first is None:
             long = self._pixels >= FEW_PIXELS and self.spp * self._pixels >= TWO_PASSES
             self._small_first = long and self.planner.threshold is None and self._plays_roulette()
-        steps = schedule(self.spp, self._longest, self.settings, self._small_first)
         earlier = sum(self.passes)
-        for step in steps:
-            done, end = step.done, step.done + step.size
+        for step in schedule(self.spp, self._longest, self.settings, self._small_first):
             skipped = min(earlier, step.size)
-            done, earlier = done + skipped, earlier - skipped
+            done, end, earlier = step.done + skipped, step.done + step.size, earlier - skipped
             while done < end:
                 size = min(end - done, self._affordable(step.size))
                 yield replace(step, done=done, size=size)
@@ -262,8 +260,7 @@ class Render:
         """Return the samples per pixel of a pass of ``size`` that fit into ``timeout``."""
         if not 0 <= self.settings.timeout < math.inf:
             return size
-        rate = self.meter.rate(sum(self.passes))
-        return max(1, int(min(rate * 0.1 * self.settings.timeout, size)))
+        return max(1, int(min(self.meter.rate(sum(self.passes)) * 0.1 * self.settings.timeout, size)))
 
     def _pass(self, step: Step):
         """Trace one pass, with a launch for each batch."""
@@ -368,8 +365,7 @@ class Render:
         missing = self.missing() if self.passes else None
         messages.warn_of_unsampled_light(self.prepared, self.plan, missing)
         emitters, of_scene = self.prepared.emitters.objects, self.prepared.scene.emitters()
-        shares = missing.shares if missing else {}
-        return {of_scene.index(emitters[i]): share for i, share in shares.items()}
+        return {of_scene.index(emitters[i]): x for i, x in (missing.shares if missing else {}).items()}
 
     def _unsampled(self) -> UnsampledLight | None:
         """Unsampled light transport, estimated once per scene and plan until an edit; None if none."""

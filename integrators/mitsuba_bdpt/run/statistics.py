@@ -156,8 +156,7 @@ def rays(render) -> dict[str, int]:
     if render.plan.guided:
         found["guided"] = counts["guided"]
     if render.accumulator.features is not None:  # one per camera sample
-        pixels = int(render.prepared.camera.region.size.prod())
-        found["features"] = sum(render.accumulator.passes) * pixels
+        found["features"] = sum(render.accumulator.passes) * int(render.prepared.camera.region.size.prod())
     return found
 
 
