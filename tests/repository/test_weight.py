@@ -24,7 +24,7 @@ MOST = {
     "image": 1297,
     "files": 844,
     "run": 1093,
-    "scene sampling": 817,
+    "scene sampling": 822,
     "host": 802,
     "sensors": 882,
     "": 1280,  # top files

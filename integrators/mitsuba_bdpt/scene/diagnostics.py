@@ -220,8 +220,13 @@ def glass_in_planes(scene) -> list[str]:
     through = [i for i, shape in enumerate(shapes) if id(shape) in through]
     found = []
     for axis in range(3):
-        flat = np.flatnonzero(high[:, axis] - low[:, axis] <= near)
-        for i, side in product(through if len(flat) else (), (low, high)):
+        planes = np.flatnonzero(high[:, axis] - low[:, axis] <= near)
+        planes = planes[np.argsort(low[planes, axis], kind="stable")]
+        places, reach = low[planes, axis], 2 * near.max(initial=0)
+        for i, side in product(through if len(planes) else (), (low, high)):
+            flat = planes[slice(*places.searchsorted((side[i, axis] - reach, side[i, axis] + reach)))]
+            if not len(flat):
+                continue
             common = np.minimum(high[flat], high[i]) - np.maximum(low[flat], low[i])
             least, at = max(near[i], _OF_PANE * (high[i] - low[i]).max()), side[i, axis]
             touching = (flat != i) & (np.abs(low[flat, axis] - at) <= np.maximum(near[flat], near[i]))
