@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2847, "tests": 28141}
-MOST_WORDS = 31229
+MOST_WORDS = 31245
 
 
 def _lines(files):
