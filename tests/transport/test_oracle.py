@@ -451,7 +451,7 @@ class Flat:
 class Directly:
     """`bsdf.BSDFDispatch` without virtual calls: stand-ins answer themselves."""
 
-    many = shared = False
+    apart = shared = False
 
     def __call__(self, plugin, question, *args):
         return question(plugin, *args)
