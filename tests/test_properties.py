@@ -599,6 +599,7 @@ def test_gradients_of_any_scene_do_not_matter(parameters):
 def test_layers_count_among_what_a_film_takes(monkeypatch):
     """Expected: on a machine that has memory for the film alone, features and `variance` raise an error."""
     monkeypatch.setattr(memory, "available", lambda: memory.Available(300 * 64 * 64, "the machine's memory"))
+    monkeypatch.setattr("mitsuba_bdpt.image.film_limits.SMALL", 0)
     scene = glowing_sphere(size=64)
     assert image(integrator(), scene, spp=8).shape == (64, 64, 3)
     for more in ({"layers": "variance"}, {"aovs": "a:albedo,n:sh_normal,p:position,x:dp_du,y:dp_dv"}):
