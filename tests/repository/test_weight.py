@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2847, "tests": 28142}
-MOST_WORDS = 31245
+MOST_WORDS = 31271
 
 
 def _lines(files):
