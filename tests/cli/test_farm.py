@@ -334,6 +334,17 @@ def test_a_png_that_cannot_be_written_does_not_cost_the_exr(monkeypatch, capsys,
     assert rendered.image("a.exr", "RGB")[1]["spp"] == 8 and not Path("a.checkpoint.npz").exists()
 
 
+def test_ctrl_c_while_the_png_is_written_is_no_failure_of_it(monkeypatch, capsys):
+    """Rationale: Mitsuba wraps Ctrl-C as a ``RuntimeError``. Expected: the status of an interruption."""
+
+    def interrupted(*arguments):
+        raise RuntimeError("wrapped") from KeyboardInterrupt()
+
+    monkeypatch.setattr(images, "write_png", interrupted)
+    assert main([*SMALL, "--spp", "8", "-o", "a.exr"]) == 130
+    assert "could not be written" not in capsys.readouterr().err
+
+
 def test_a_signal_is_answered_while_a_call_runs(monkeypatch):
     """Rationale: handlers of Python run after a call of Mitsuba's, and Ctrl-C waited for a pass without a
     word. Expected: a thread answers while this one takes no signal."""

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 
-from ..errors import CommandError
+from ..errors import CommandError, behind
 from ..host.jit import two_threads
 from ..image.layers import DENOISED
 from .whole import MAGIC, check_format, check_writable, replacing, utf8
@@ -58,6 +58,8 @@ def write_images(film: mi.Film, output: Path, attributes: Mapping[str, str], exp
     try:
         write_png(film, film.bitmap(), png, exposure)
     except (OSError, RuntimeError) as error:  # Mitsuba's for an image that is too large for a PNG
+        if behind(error, KeyboardInterrupt):
+            raise
         why = getattr(error, "strerror", None) or error
         return f"{str(png)!r} could not be written: {why}; the image is {str(output)!r}"
     return ""

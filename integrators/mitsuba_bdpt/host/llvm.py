@@ -41,8 +41,9 @@ class Choice:
     version: int | None = None
 
     def __str__(self) -> str:
-        named = f"LLVM {self.version}, {self.path or 'without known path'} ({self.why})"
-        return self.why if self.version is None else named
+        if self.version is None:
+            return self.why
+        return f"LLVM {self.version}, {self.path or 'without known path'} ({self.why})"
 
 
 def prepare() -> Choice:
@@ -140,20 +141,24 @@ def quick_compilation(once: bool = True):
 
 def _set_options(*options: bytes) -> bool:
     """Set options of the LLVM library in use; False, without effect, for an untested version."""
-    if sys.modules["drjit"].detail.llvm_version()[0] in KNOWN_GOOD:
-        with contextlib.suppress(OSError, AttributeError):
-            parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
-            arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
-            parse(len(arguments), arguments, b"")
-            return True
-    return False
+    if sys.modules["drjit"].detail.llvm_version()[0] not in KNOWN_GOOD:
+        return False
+    try:
+        parse = ctypes.CDLL(os.environ.get(VARIABLE, "")).LLVMParseCommandLineOptions  # Dr.Jit's copy
+    except (OSError, AttributeError):
+        return False
+    arguments = (ctypes.c_char_p * (1 + len(options)))(b"mitsuba_bdpt", *options)
+    parse(len(arguments), arguments, b"")
+    return True
 
 
 def cuda_driver() -> bool:
     """Whether a driver of CUDA can be loaded; slow."""
-    with contextlib.suppress(OSError):
-        return bool(ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1"))
-    return False
+    try:
+        ctypes.CDLL("nvcuda.dll" if platform.system() == "Windows" else "libcuda.so.1")
+    except OSError:
+        return False
+    return True
 
 
 def remedy() -> str:

@@ -242,7 +242,7 @@ def measure(
     pilot = Pilot(region, batch, max(stands_for, RAREST), direct, prepared.space is not None, emission)
     # Independent numbers in each sample: products of samples give the squared mean.
     counts = trace(kernel, pilot, batch, Points(settings.points, seed), samples)
-    guidable = guidable or GuidableLight(*np.zeros((5, moments.FINE**2)))
+    guidable = guidable or GuidableLight(*np.zeros((len(GuidableLight._fields), moments.FINE**2)))
     return pilot.moments(counts, max(stands_for * batch.size / pixels, 1), guidable)
 
 
