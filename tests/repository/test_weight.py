@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2847, "tests": 28153}
-MOST_WORDS = 29492
+MOST_WORDS = 29493
 
 
 def _lines(files):
