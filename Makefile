@@ -47,7 +47,8 @@ gallery: $(INSTALLED)
 		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
-	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal; do \
+	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal \
+			pool_water bulb_in_fog_seen ice_in_milk smoke_globe; do \
 		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done

@@ -52,6 +52,7 @@ CLOSED_ROOMS = [
     "furnished_door",
     "frosted_bulb",
 ]
+GLAZED = ["pool_water", "bulb_in_fog_seen", "ice_in_milk", "smoke_globe"]
 FOGS = ["fog_beam", "fog_beam_thick", "fog_caustic", "fog_lamp_in_glass", "fog_lamp"]
 
 
@@ -152,7 +153,7 @@ def test_textures_are_remade_exactly(tmp_path):
         np.testing.assert_array_equal(pixels, committed[name])
 
 
-@pytest.mark.parametrize("name", [*FOGS, "cloudy_ball", "skin_ball", "glass_slab", "cloud_sky"])
+@pytest.mark.parametrize("name", [*FOGS, *GLAZED, "cloudy_ball", "skin_ball", "glass_slab", "cloud_sky"])
 def test_media_are_declared_on_both_sides(name):
     """Boundaries and the sensor agree on the media between them: nothing switches off light subpaths."""
     scene = load(name)

@@ -29,7 +29,7 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2847, "tests": 28153}
+OUTSIDE = {"scripts": 2847, "tests": 28154}
 MOST_WORDS = 29493
 
 
