@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2847, "tests": 28154}
-MOST_WORDS = 29556
+MOST_WORDS = 29558
 
 
 def _lines(files):
