@@ -150,7 +150,7 @@ def foretold(make):
 @pytest.mark.parametrize(
     "make, name",
     [
-        *((make, name) for make in (cornell, lit_caustic, sky) for name in PREDICTED),
+        *((make, name) for make in (cornell, lit_caustic) for name in PREDICTED),
         *((make, "four per lane") for make in (cornell, sky)),
         (fog, "n1c1, one"),
     ],
