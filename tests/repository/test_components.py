@@ -67,8 +67,8 @@ KNOWN = {
     ),
 }
 
-# Tests of the rest that a copy has to pass: densities, sums of weights, known answers of images.
-REST = ("emitters/test_endpoints.py", "transport/test_sharing.py", "images/test_known_answers.py")
+# Tests of the rest that a copy has to pass: densities, shared light subpaths.
+REST = ("emitters/test_endpoints.py", "transport/test_sharing.py")
 
 
 def without(name: str, folder: Path) -> Path:
