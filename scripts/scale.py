@@ -416,6 +416,7 @@ def main(arguments=None) -> int:
     asked = parser.parse_args(arguments)
     mi.set_variant("llvm_ad_rgb")
     if asked.here:
+        mi.set_log_level(mi.LogLevel.Error)  # warnings would begin the line of the row
         name, size = asked.here
         print(json.dumps(here(KINDS[name], json.loads(size))))
         return 0
