@@ -13,7 +13,7 @@ from ..sampling.points import Purpose
 from ..transport.contribution import MEDIA
 from ..transport.vacuum import Vacuum
 from . import flight, transmittance
-from .media import Media, of_depth
+from .media import Media, coefficients, interaction, of_depth
 from .phase import PhaseFunctions
 
 # Largest optical depth of a connection's approximate transmittance, in the medium that it starts in:
@@ -51,6 +51,16 @@ class Space(Vacuum):
             return mi.Bool(True)
         return ~vertex.volume | dr.gather(mi.Bool, self.media.lit, vertex.medium)
 
+    def before_event(self, vertex, d):
+        if self.phase is None:
+            return vertex.throughput, None
+        mei = interaction(vertex.si.p, d, vertex.si)
+        sigma_s, _ = self.media.query(vertex.medium, coefficients, mei, vertex.volume)
+        ratio = dr.select(vertex.volume, self.media.mean(vertex.medium) / sigma_s, 1)
+        ratio = mi.UnpolarizedSpectrum(dr.select(vertex.volume & (sigma_s == 0), 0, ratio))
+        number = dr.select(vertex.volume, vertex.medium, mi.UInt32(0))
+        return polarization.scaled(vertex.throughput, ratio), number
+
     def guessed(self, vertex, between):
         sigma = self.media.mean(self.media.beyond(vertex.si, between, vertex.medium))
         return dr.exp(-dr.minimum(sigma * dr.norm(between), _GUESSED_DEPTH))
@@ -64,7 +74,7 @@ class Space(Vacuum):
             word = kernel.points.series(shadow_ray.stream, Purpose.TRACKING, event, 1 + shadow_ray.number)
         ends = shadow_ray.ray, medium, c.active, shadow_ray.own
         crossing = transmittance.between(self, *ends, word, shadow_ray.hidden)
-        weight, shares = kernel.heuristic.weigh(*c.sides, of_depth(crossing.depth))
+        weight, shares = kernel.heuristic.weigh(*c.sides, tr=of_depth(crossing.depth))
         return replace(
             c,
             value=polarization.scaled(c.value, crossing.transmittance),

@@ -22,7 +22,7 @@ import mitsuba as mi
 from ..sampling import sobol
 from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
-from ..transport import bsdf, mis, path_layers, spectra
+from ..transport import mis, path_layers, scattering, spectra
 from ..transport.alternatives import newest_connection
 from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import TraceContext
@@ -55,7 +55,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
     ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
     coefficient of merges in all weights, see `coefficient`; ``photons``: `Photons`, None while they are
     traced; ``wavelengths``: `WavelengthSets` in spectral variants, where photons merge with camera subpaths
-    of the same set. Numbers are opaque ``Float``.
+    of the same set; ``balls``: radius in media that scatter, else None. Numbers are opaque ``Float``.
     """
 
     radius: Radius
@@ -63,17 +63,33 @@ class Merging(PhotonStrategy, PhotonPolicy):
     kappa: mi.Float
     photons: Any = None
     wavelengths: WavelengthSets | None = None
+    balls: Radius | None = None
 
     counters = ("merges",)
     merges = True
     only_specular = 0.0
 
-    def eta(self, p: mi.Point3f) -> mi.Float:
-        """Number of subpaths times the area of the disc at ``p`` (scene units squared)."""
-        return self.count * dr.pi * dr.square(self.radius.at(p))
+    def around(self, volume: mi.Bool) -> Radius:
+        """The radius of discs, in a ``volume`` that of balls."""
+        return self.radius if self.balls is None else dr.select(volume, self.balls, self.radius)
 
-    def kappa_eta(self, p):
-        return dr.minimum(self.kappa * self.eta(p), mis.SATURATION)
+    def eta(self, kernel: TraceContext, vertex) -> mi.Float:
+        """Number of subpaths times the area of the disc at ``vertex`` (scene units squared).
+
+        In a volume times the volume of the ball and the medium's mean extinction, see `Photon.flux`.
+        """
+        r = self.around(vertex.volume).at(vertex.si.p)
+        disc = self.count * dr.pi * dr.square(r)
+        if self.balls is None:
+            return disc
+        in_ball = 4 / 3 * r * kernel.space.media.mean(vertex.medium)
+        return disc * dr.select(vertex.volume, in_ball, 1)
+
+    def kappa_eta(self, kernel, vertex):
+        disc = self.kappa * (self.count * dr.pi * dr.square(self.radius.at(vertex.si.p)))
+        if self.balls is not None:  # as many camera vertices share its photons, or this is the only one
+            disc = dr.select(vertex.volume, dr.minimum(self.eta(kernel, vertex), disc), disc)
+        return dr.minimum(disc, mis.SATURATION)
 
     def begin_light(self, kernel, walk):
         zero = kernel.heuristic.zero()
@@ -84,10 +100,10 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def begin(self, kernel, e, walk):
         return replace(walk, sds=State(survived=mi.Float(1)))
 
-    def survival(self, state, partial, p):
+    def survival(self, kernel, state, partial, vertex):
         # Whichever is larger, since it may go on to where pixels are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
-        most = dr.maximum(self.kappa_eta(p), median)
+        most = dr.maximum(self.kappa_eta(kernel, vertex), median)
         survived = dr.minimum(state.survived, _probability(partial.d_vc, most))
         return survived / state.survived, State(survived=survived)
 
@@ -97,12 +113,12 @@ class Merging(PhotonStrategy, PhotonPolicy):
         ``connection``: c of the edge to it.
         """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
-        return possible & mis.exceeds(self.kappa_eta(vertex.si.p), connection)
+        return possible & mis.exceeds(self.kappa_eta(kernel, vertex), connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
-        return dr.minimum(_probability(d_vc, self.kappa_eta(vertex.si.p)) / survived, 1)
+        return dr.minimum(_probability(d_vc, self.kappa_eta(kernel, vertex)) / survived, 1)
 
     def stored(self, kernel, y, stream):
         keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
@@ -122,7 +138,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
-        weight = mis.weigh_merge(h, self.kappa_eta(z.si.p), light, camera, connections)
+        weight = mis.weigh_merge(h, self.kappa_eta(kernel, z), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
         of_camera = path_layers.evaluated(z.layer, f, adjoint=False)
@@ -237,10 +253,10 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
     chosen, total = _draw(merging, z, kernel.last_merged - z.edges, word, wavelength_set)
     active = z.hit & (total > 0)
     photon = merging.photons.found.at(chosen, active)
-    f = bsdf.evaluate(z.bsdf, z.si, z.si.to_local(photon.d), active, kernel.traits)
-    eta = merging.eta(z.si.p)
+    f = scattering.evaluate(kernel, z, z.si.to_local(photon.d), active)
+    eta = merging.eta(kernel, z)
     # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
-    estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * dr.abs(dr.dot(z.si.n, photon.d))))
+    estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * z.cosine(photon.d)))
     value = z.throughput * f.value * estimate
     return Sample(photon, f, value, active & ~spectra.is_zero(value), total / size_of(photon.flux))
 
@@ -248,7 +264,7 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
     """Draw a photon of at most ``most`` edges in the disc at ``z`` by flux; its index, total flux."""
-    radius, photons = merging.radius, merging.photons
+    radius, photons = merging.around(z.volume), merging.photons
     r = radius.at(z.si.p)
     lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
     corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8
@@ -288,4 +304,7 @@ def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
     # Each position may lie off its surface by the rounding error of its hit.
     beyond_rounding = dr.maximum(height - 2 * z.anchor.offset, 0)
     within = dr.squared_norm(off) - dr.square(height) + dr.square(beyond_rounding) < dr.square(r)
-    return within & (beyond_rounding < _FLAT * r) & (dr.dot(photon.n, z.si.n) > _SAME_SURFACE)
+    same = dr.dot(photon.n, z.si.n) > _SAME_SURFACE
+    if photon.medium is not None:  # in volumes normals are 0
+        same |= z.volume & (photon.medium == z.medium)
+    return within & (beyond_rounding < _FLAT * r) & same

@@ -16,7 +16,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import Footprints, after, film_pixels
+from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Which paths are merged")
@@ -34,14 +34,14 @@ _METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
 _EDGES_BITS, _LANE_BITS = 12, 32  # bits of the edges and of the subpath's index in the sort key of photons
 
 
-def why_not(sensor: mi.Sensor, media: bool) -> str:
-    """Why vertex merging is not possible, or empty; ``media``: the scene has participating media."""
+def why_not(sensor: mi.Sensor) -> str:
+    """Why vertex merging is not possible, or empty."""
     if sensor.shutter_open_time() > 0:
         return (
             f"merging while the shutter of {named(sensor)} is open is not supported: photons and camera "
             "subpaths have different times"
         )
-    return "merging in scenes with participating media is not supported" if media else ""
+    return ""
 
 
 class Passes:
@@ -75,11 +75,13 @@ class Passes:
         ``samples`` of each pixel; ``done``: earlier ones, in all parts of the image, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
+        end, scatters = done + samples, kernel.space.phase is not None
         if self._footprints.measured:
-            radius = after(self._radius, done + samples)  # in pixels
+            radius = after(self._radius, end)  # in pixels
             count = photons_of_pass(samples * self._uncropped, self._uncropped, radius)
         else:
-            radius = after(self._radius, (done + samples) * self._pixels / _METER_PIXELS)
+            end = end * self._pixels / _METER_PIXELS
+            radius = after(self._radius, end)
             count = max(photons_of_pass(samples * self._pixels, math.inf, radius), _METER_PHOTONS)
         sets, wavelengths = 1, None
         if start is not None:
@@ -89,7 +91,9 @@ class Passes:
         # Photons beyond those of the samples would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
-        merging = Merging(self._footprints.radius(radius), met, kappa, wavelengths=wavelengths)
+        balls = self._footprints.radius(after(BALLS * self._radius, end, 3)) if scatters else None
+        discs = self._footprints.radius(radius)
+        merging = Merging(discs, met, kappa, wavelengths=wavelengths, balls=balls)
         return trace(kernel, merging, self._aim, points, count)
 
 
@@ -112,7 +116,7 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     """Sort the first ``count`` photons by bucket, subpath and edge: deterministic."""
     index = dr.arange(mi.UInt32, max(count, 1))  # without photons one in no bucket
     found = photons.at(index)
-    radius = merging.radius
+    radius = merging.radius if found.medium is None else merging.around(found.medium != 0)
     sets = merging.wavelengths
     number = None if sets is None else sets.number(found.lane)
     cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)), number)

@@ -26,7 +26,7 @@ from ..transport.walk import Side, Vertex, Walk, random_walk
 from .merging import Merging, Sample
 from .merging import sample as draw
 from .passes import sort
-from .radius import Footprints, film_pixels
+from .radius import BALLS, Footprints, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 RADIUS = 1.5  # merging radius in distances between camera samples (of a set of wavelengths) on the film
@@ -95,9 +95,11 @@ def estimate(
         sets, wavelengths = SETS, WavelengthSets.of(mi.Float(0.5), 0)
     footprints = Footprints.of(kernel.scene, kernel.camera.sensor)
     of_samples = RADIUS * math.sqrt(film_pixels(kernel.camera.sensor) * sets / count)
-    discs = footprints.radius(of_samples if footprints.measured else 1.0)
+    of_samples = of_samples if footprints.measured else 1.0
+    discs = footprints.radius(of_samples)
+    balls = None if kernel.space.phase is None else footprints.radius(of_samples * BALLS)
     met = dr.opaque(mi.Float, count / sets)
-    merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths)
+    merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths, balls=balls)
     unmerged = PhotonStrategy()  # weights know of no merges
     unmerged.wavelengths = wavelengths
     kernel = kernel.replaced(sds=unmerged, last_light=kernel.max_depth)

@@ -115,7 +115,7 @@ class Planner:
         is_short = self._samples < budget.GUIDING_TIMES * budget.least_samples(prepared)
         predicts = full.merging or not (prepared.traits.dispatch.many and is_short)
         if full.guidable and predicts and not components.why_absent("merging"):
-            merges = self._is_open and not components.merging.why_not(prepared.camera.sensor, media=False)
+            merges = self._is_open and not components.merging.why_not(prepared.camera.sensor)
             fewest = unsampled_light.FEWEST_HITS if merges else 0
             spp = self._samples // self._pixels
             guidable = unsampled_light.guidable(prepared, full, self.settings, spp, fewest)

@@ -142,6 +142,8 @@ def _why_not_merging(prepared: PreparedScene, direct: bool) -> str:
     emitters = prepared.emitters
     if not emitters.traced:
         return _UNTRACED
+    if prepared.light_media is not None and prepared.light_media.contradiction:
+        return prepared.light_media.contradiction
     if emitters.contrast <= EVEN:
         return "s=0 finds a uniform environment by itself"
     if direct and not (prepared.delta or prepared.near_specular or emitters.beams):

@@ -135,7 +135,7 @@ def missing(
         f"image's light: that of {_called(lamps)}{through} ({why})"
     )
     by_hand = any(skipped["why"] == "light_paths=0" for skipped in plan.skipped)
-    mergeable = not components.merging.why_not(prepared.camera.sensor, prepared.space is not None)
+    mergeable = not components.merging.why_not(prepared.camera.sensor)
     remedies = ["leave light_paths to the integrator"] * by_hand + ["set merging=true"] * mergeable
     remedies.append(_REMEDIES.get(lamps[0].class_name(), "make the emitter larger"))
     remedies += ["make the surfaces rougher"] * undersampled

@@ -100,7 +100,7 @@ class Render:
         self.prepared = like.prepared if like else PreparedScene(scene, sensor)
         for text in self.light_groups.warnings if self.light_groups else ():
             warn_once(scene, sensor, text)
-        if settings.merging and (why := components.merging.why_not(sensor, self.prepared.space is not None)):
+        if settings.merging and (why := components.merging.why_not(sensor)):
             raise UnsupportedError(f"{why}; leave out merging")
         self.findings = like.findings if like else SceneCache(self.prepared, sensor)
         self.planner = Planner(self.prepared, settings, spp, self.findings, self._is_open)
@@ -193,8 +193,7 @@ class Render:
             lacks = f"{missing.share:.2%} of the image's light" if missing else "no light"
             level, why = NOT_WORTH, f"the other strategies lack {lacks}"
         else:
-            in_media = self.prepared.space is not None
-            level, why = "impossible", components.merging.why_not(self.sensor, in_media)
+            level, why = "impossible", components.merging.why_not(self.sensor)
             if not why and self.settings.strategy_images:
                 why = "layers=strategies shows merges with merging=true only"
         if missing is None or why:

@@ -37,8 +37,8 @@ def newest_connection(kernel: TraceContext, vertex, adjoint: bool, prime: bool =
 
 
 def has_lobe(kernel: TraceContext, vertex) -> mi.Bool:
-    """Mask: a ``vertex`` on a surface whose event is not always delta; the path may have a further edge."""
-    return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth) & ~vertex.volume
+    """Mask: a ``vertex`` whose event is not always delta; the path may have a further edge."""
+    return vertex.hit & vertex.connectible() & (vertex.edges < kernel.max_depth)
 
 
 def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
@@ -55,19 +55,19 @@ def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
     return possible if state is None else possible & state.isolated
 
 
-def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a, own: mis.Coefficient) -> tuple:
-    """Other strategies on the side of ``vertex``, which a strategy of coefficient ``own`` connects.
+def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a) -> tuple:
+    """Other strategies on the side of a connected ``vertex``.
 
-    Returns `mis.alternatives`, and the merges up to the vertex, see `mis.merges`.
+    Returns `mis.alternatives`, and with merging `mis.merges` in a tuple, which else is empty.
     """
     h, partial = kernel.heuristic, vertex.partial
     newest = newest_coefficient(kernel, vertex, adjoint)
     found = mis.alternatives(h, partial, newest, pdf_rev_w, pdf_a)
     if not kernel.sds.merges:
-        return found, 0
+        return found, ()
     kappa_prime = newest_coefficient(kernel, vertex, adjoint, prime=True)
-    kappa_eta = kernel.sds.kappa_eta(vertex.si.p)
-    return found, mis.merges(h, partial, kappa_prime, pdf_rev_w, pdf_a, own, kappa_eta)
+    kappa_eta = kernel.sds.kappa_eta(kernel, vertex)
+    return found, (mis.merges(h, partial, kappa_prime, pdf_rev_w, pdf_a, kappa_eta),)
 
 
 def merges_before_end(

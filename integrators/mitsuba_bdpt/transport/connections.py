@@ -52,13 +52,13 @@ def inner(kernel: TraceContext, z: Vertex, y: PathVertex) -> Contribution:
     own = kernel.kappa.inner
     at_y = f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
     at_z = f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
-    light_side, merges_y = side_of(kernel, y, True, *at_y, own)
-    camera_side, merges_z = side_of(kernel, z, False, *at_z, own)
+    light_side, merges_y = side_of(kernel, y, True, *at_y)
+    camera_side, merges_z = side_of(kernel, z, False, *at_z)
     if kernel.sds.near_specular:
         newest_y, newest_z = newest_coefficient(kernel, y, True), newest_coefficient(kernel, z, False)
         active &= ~connects_sds_path(k, (y.sds, f_y, newest_y), (z.sds, f_z, newest_z))
-    sides = own, light_side, camera_side
-    weight, shares = h.weigh(*sides, merges=h.combine(merges_y, merges_z))
+    sides = own, light_side, camera_side, merges_y + merges_z, own
+    weight, shares = h.weigh(*sides)
     c = Contribution(value, weight, y.edges + 1, z.edges + 1, active, shares, "inner", sides=sides)
     of_camera = path_layers.evaluated(z.layer, f_z, adjoint=False)
     of_light = path_layers.evaluated(y.layer, f_y, adjoint=True)
@@ -106,9 +106,9 @@ def connect_one(kernel: TraceContext, z: Vertex, path: LightPath, stream: Stream
     else:
         ray = rays.segment_to(z.anchor, drawn.end, z.si)
     if drawn.unweighted is not None:
-        unweighted, light_side, camera_side, size = drawn.unweighted
+        unweighted, *others, size = drawn.unweighted
         estimate = unweighted * (drawn.total / size / survival)
-        sides = kernel.kappa.inner, light_side, camera_side
+        sides = kernel.kappa.inner, *others, kernel.kappa.inner
     c = Contribution(estimate, mi.Float(1), z.edges, z.edges, active, sides=sides)
     c.light_group, c.path_layer = drawn.light_group, drawn.path_layer
     c.counted = drawn.counted + rouletted + Counters(shadow_inner=one(active))
@@ -125,7 +125,8 @@ class _Drawn:
     """A drawn inner connection: its weighted ``value``, and the ``total`` size of all.
 
     ``end`` of its shadow ray (its slot if `ShapeErrors.small`), rescaled random number ``u``. In scenes with
-    media, where the weight is known after the shadow ray, ``unweighted``: value, light and camera side, size.
+    media, where the weight is known after the shadow ray, ``unweighted``: value, light and camera side,
+    merges, size.
     """
 
     value: mi.Spectrum
@@ -150,7 +151,8 @@ def _draw(kernel: TraceContext, z: Vertex, path: LightPath, u) -> _Drawn:
         path_layer = dr.full(mi.UInt32, path_layers.INDIRECT, dr.width(candidates))
     if kernel.has_media:
         empty = kernel.heuristic.zero()
-        kept = dr.zeros(mi.Spectrum), empty, empty, mi.Float(0)
+        merges = ((empty, empty),) * 2 if kernel.sds.merges else ()
+        kept = dr.zeros(mi.Spectrum), empty, empty, merges, mi.Float(0)
     while dr.hint(
         slot < candidates, label="draw an inner connection", exclude=[kernel, z, path, candidates, small]
     ):
@@ -160,7 +162,7 @@ def _draw(kernel: TraceContext, z: Vertex, path: LightPath, u) -> _Drawn:
         size = size_of(of_this)
         total, take, u = offer(total, size, u)
         value = dr.select(take, of_this, value)
-        kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:], size), kept)
+        kept = None if kept is None else dr.select(take, (c.value, *c.sides[1:4], size), kept)
         path_layer = None if path_layer is None else dr.select(take, c.path_layer, path_layer)
         # Stores the end of the shadow ray, not the slot: a lookup by lane costs more.
         end = dr.select(take, slot if small else rays.end_point(z.anchor, y.anchor), end)

@@ -104,7 +104,7 @@ class TraceContext:
         self.has_media = prepared.space is not None
         self.space = prepared.space or Vacuum(self.scene, self.shape_errors)
         self.light_media = prepared.light_media
-        if self.light_media is not None and plan.light:
+        if self.light_media is not None and (plan.light or plan.merging):
             self.light_media.settle()
         self.sensor_medium = u32(self.space.media.sensor) if self.has_media else None
         depth = settings.max_depth

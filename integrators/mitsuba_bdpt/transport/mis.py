@@ -127,19 +127,28 @@ class Heuristic:
         coefficient: Coefficient,
         light_side: PartialSum,
         camera_side: PartialSum,
+        merges: tuple = (),
+        own: Coefficient = 0,
         tr: mi.Float | None = None,
-        merges: PartialSum = 0,
     ) -> tuple[mi.Float, mi.Vector4f | None]:
         """`weight`, and the shares of the classes (only `ByClass`, else None).
 
-        ``tr``: T~ of the connected edge, which the other strategies sample; None without media. ``merges``:
-        V, which counts where merges dominate.
+        ``merges`` at the end and at older vertices of each subpath, see `merges`, whose sum V counts where it
+        dominates; ``own``: coefficient with which those at ends are compared. ``tr``: T~ of the connected
+        edge, which the other strategies sample; None without media.
         """
         if tr is not None:
             light_side, camera_side = self.scale(light_side, tr), self.scale(camera_side, tr)
-        if not is_absent(merges):
+        v = 0
+        for at_end, older in merges:
+            if tr is not None:
+                at_end, older = self.scale(at_end, tr), self.scale(older, tr)
+            if not is_absent(at_end):
+                at_end = dr.select(exceeds(at_end, own), at_end, 0)
+            v = self.combine(v, self.combine(at_end, older))
+        if not is_absent(v):
             others = self.combine(self.combine(light_side, camera_side), coefficient)
-            camera_side = self.combine(camera_side, dr.select(exceeds(merges, others), merges, 0))
+            camera_side = self.combine(camera_side, dr.select(exceeds(v, others), v, 0))
         return self._weigh(coefficient, light_side, camera_side)
 
     def _weigh(self, coefficient: Coefficient, light_side: PartialSum, camera_side: PartialSum) -> tuple:
@@ -254,18 +263,17 @@ def merges(
     kappa_prime: Coefficient,
     pdf_rev_w: mi.Float,
     pdf_a: mi.Float,
-    own: Coefficient,
     kappa_eta: mi.Float,
-) -> PartialSum:
-    """Part of V of a connection: merges at the vertices of one subpath, whose last vertex is connected.
+) -> tuple[PartialSum, PartialSum]:
+    """Merges at the last vertex of a subpath, which is connected, and at older ones; see `Heuristic.weigh`.
 
-    ``kappa_prime`` of the edge to that vertex, ``own`` of the connection; ``pdf_rev_w``, ``pdf_a``: as in
-    `alternatives`; ``kappa_eta``: there.
+    ``kappa_prime`` of the edge to that vertex; ``pdf_rev_w``, ``pdf_a``: as in `alternatives`; ``kappa_eta``:
+    there.
     """
     connection = h.scale(partial.d_vcm, kappa_prime)
     there = h.scale(kappa_eta, pdf_a)
-    there = dr.select(exceeds(kappa_eta, connection) & exceeds(there, own), there, 0)
-    return h.combine(there, h.scale(older_merges(h, partial, connection, pdf_rev_w), pdf_a))
+    there = dr.select(exceeds(kappa_eta, connection), there, 0)
+    return there, h.scale(older_merges(h, partial, connection, pdf_rev_w), pdf_a)
 
 
 def alternatives(

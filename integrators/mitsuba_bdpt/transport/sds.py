@@ -128,14 +128,14 @@ class PhotonStrategy:
     merges = False
     near_specular = False
 
-    def kappa_eta(self, p: mi.Point3f) -> mi.Float:
-        """Partial sum of a merge at ``p``, see `mis.scattered_merges`."""
+    def kappa_eta(self, kernel, vertex) -> mi.Float:
+        """Partial sum of a merge at ``vertex``, see `mis.scattered_merges`."""
         raise NotImplementedError
 
-    def survival(self, state: State, partial: mis.Partial, p: mi.Point3f) -> tuple[mi.Float, State]:
+    def survival(self, kernel, state: State, partial: mis.Partial, vertex) -> tuple[mi.Float, State]:
         """Probability with which a photon subpath goes on, and its new ``state``.
 
-        ``partial`` after the event at ``p``.
+        ``partial`` after the event at ``vertex``.
         """
         raise NotImplementedError
 

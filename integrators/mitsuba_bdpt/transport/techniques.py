@@ -64,7 +64,7 @@ def hit_emitter(kernel: TraceContext, z: Vertex, sds: PhotonStrategy) -> Contrib
         sides, active = (0, h.combine(sides[1], guided)), sds.counts(active, on_sds_path)
     merges = merges_before_end(kernel, z.partial, newest, pdf_first * pdf_second)
     merges = mis.choose(z.edges <= kernel.last_merged, merges, 0)
-    weight, shares = h.weigh(kernel.kappa.hit, *sides, merges=merges)
+    weight, shares = h.weigh(kernel.kappa.hit, *sides, ((0, merges),))
     others = (pdf_connect, pdf_first, pdf_second) if kernel.reverse else (pdf_connect,)
     value = _known(z.throughput * radiance, *others)
     c = Contribution(value, weight, mi.UInt32(0), t, active, shares, "hit", path_layer=z.layer)
@@ -116,16 +116,16 @@ def next_event(kernel: TraceContext, z: Vertex, stream: Stream, sds: PhotonStrat
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
     densities = f.pdf_rev_w, e.emission_ratio * z.cosine(e.d)
-    camera_side, merges = side_of(kernel, z, False, *densities, kernel.kappa.direct)
-    merges = mis.choose(k <= kernel.last_merged, merges, 0)
+    camera_side, merges = side_of(kernel, z, False, *densities)
+    merges = [[mis.choose(k <= kernel.last_merged, x, 0) for x in pair] for pair in merges]
     ends = light_side, mis.choose(k <= kernel.reach, camera_side, 0)
     if sds.near_specular:
         on_sds_path = connects_sds_path(k, (z.sds, f, 0)) & ~e.delta
         guided = None if z.sds.guided is None else z.sds.guided_before_last(h)
         ends = _beside_guided(kernel, guided, on_sds_path, ends, light_side, kernel.kappa.direct)
         active = sds.counts(active, on_sds_path)
-    sides = kernel.kappa.direct, *ends
-    weight, shares = h.weigh(*sides, merges=merges)
+    sides = kernel.kappa.direct, *ends, merges, kernel.kappa.direct
+    weight, shares = h.weigh(*sides)
 
     to_infinity = rays.spawn(z.anchor, e.d, z.si)
     to_point, own = rays.shadow_ray(kernel.shape_errors, z.anchor, e.anchor, e.met, z.si)
@@ -207,12 +207,12 @@ def splat(kernel: TraceContext, y: Vertex, stream: Stream) -> Contribution:
     active = y.endpoint_active & ~spectra.is_zero(value)
 
     densities = f.pdf_rev_w, connection.pdf_w * to_area
-    light_side, merges = side_of(kernel, y, True, *densities, kernel.kappa.splat_prime)
+    light_side, merges = side_of(kernel, y, True, *densities)
     camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
-    sides = kernel.kappa.splat, light_side, camera_side
+    sides = kernel.kappa.splat, light_side, camera_side, merges, kernel.kappa.splat_prime
     if kernel.sds.near_specular:
         active &= ~connects_sds_path(y.edges + 1, (y.sds, f, 0))
-    weight, shares = h.weigh(*sides, merges=merges)
+    weight, shares = h.weigh(*sides)
 
     u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
     c = Contribution(value, weight, y.edges + 1, mi.UInt32(1), active, shares, "light", connection.position)
@@ -262,7 +262,7 @@ def hit_sensor(kernel: TraceContext, emission, y: Vertex, walk) -> Contribution:
         # Guided s = 0, of SDS paths: on these the last edge is not connectible either.
         guided = h.scale(partial.d_vm, z.pdf_w * z.pdf_a)
         light_side = h.combine(light_side, dr.select(mis.is_connectible(partial, newest), 0, guided))
-    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, merges=merges)
+    weight, shares = h.weigh(kernel.kappa.arrival, light_side, 0, ((0, merges),))
     if z.surroundings is not None and kernel.emitters.at_infinity:
         straight = active & emission.infinite & directly
         active &= ~straight | kernel.space.clear(z.surroundings, kernel.sensor_medium, straight)

@@ -64,6 +64,10 @@ class Vacuum:
         """Mask: next-event estimation is allowed at ``vertex``."""
         return mi.Bool(True)
 
+    def before_event(self, vertex, d: mi.Vector3f) -> tuple[mi.Spectrum, Any]:
+        """`Photon.flux` and `Photon.medium` of ``vertex``, reached along ``d``."""
+        return vertex.throughput, None
+
     def guessed(self, vertex, between: mi.Vector3f) -> mi.Float:
         """Approximate transmittance from ``vertex`` along ``between``, for draws."""
         return mi.Float(1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import get_type_hints
+from typing import Any, get_type_hints
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,9 @@ class Photon:
     """A stored light vertex, or arrays of many.
 
     ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
-    throughput, not divided by the number of subpaths. Partial sums, see `mis`: ``connection`` (c), its
+    throughput, not divided by the number of subpaths; in a volume times mean extinction over scattering
+    coefficient, that is as it arrives if the medium is homogeneous; ``medium``: number of that of a volume, 0
+    on surfaces, None without media. Partial sums, see `mis`: ``connection`` (c), its
     ``d_vcm`` times the coefficient of the connection of the last edge; ``d_vc``, ``d_vm``, ``d_vm_newest``.
     ``aim``: the emitter's own density of the first direction over that of `Aim`;
     ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``:
@@ -35,16 +37,19 @@ class Photon:
     lane: mi.UInt32
     emitter: mi.UInt32
     layer: mi.UInt32
+    medium: Any = None
 
     @staticmethod
-    def zeros(count: int) -> Photon:
-        """Memory for ``count`` photons."""
+    def zeros(count: int, media: bool = False) -> Photon:
+        """Memory for ``count`` photons, in scenes with ``media`` or without."""
         # Dr.Jit would keep the types of the first variant in use.
-        return Photon(**{name: dr.zeros(kind, count) for name, kind in get_type_hints(Photon).items()})
+        kinds = get_type_hints(Photon) | {"medium": mi.UInt32 if media else None}
+        return Photon(**{name: kind and dr.zeros(kind, count) for name, kind in kinds.items()})
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
         """The photons at ``index``."""
-        return replace(self, **{name: dr.gather(type(x), x, index, active) for name, x in vars(self).items()})
+        stored = {name: x for name, x in vars(self).items() if x is not None}
+        return replace(self, **{name: dr.gather(type(x), x, index, active) for name, x in stored.items()})
 
     def put(self, photon: Photon, index: mi.UInt32, active: mi.Bool):
         """Store ``photon`` at ``index``."""

@@ -92,7 +92,7 @@ def trace(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, points: Points, 
     kernel = kernel.bound(points)
     capacity = max(int(count * _CAPACITY), 1)
     while True:
-        traced = _traced(kernel, policy, aim, count, Photon.zeros(capacity))
+        traced = _traced(kernel, policy, aim, count, Photon.zeros(capacity, kernel.space.phase is not None))
         if traced.count <= capacity:
             return traced
         capacity = traced.count  # again, with more memory
@@ -115,11 +115,12 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
         keep, probability = policy.stored(kernel, y, stream)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
+        arriving, medium = kernel.space.before_event(y, walk.d)
         found = Photon(
             p=y.si.p,
             d=-walk.d,
             n=y.si.n,
-            flux=y.throughput / probability,
+            flux=arriving / probability,
             connection=present(newest_connection(kernel, y, adjoint=True)),
             d_vc=present(y.partial.d_vc),
             d_vm=present(y.partial.d_vm),
@@ -130,6 +131,7 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
             lane=lanes,
             emitter=e.index,
             layer=y.layer if kernel.path_layers else mi.UInt32(0),
+            medium=medium,
         )
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         out.put(found, place, keep & (place < most))
