@@ -5,6 +5,7 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy connects two neighbours of that path; point lamps are found by merging alone.
 """
 
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 
@@ -235,15 +236,22 @@ def test_cells_may_share_a_bucket(monkeypatch):
 
 
 def test_which_photons_are_near():
-    """Those in a flat disc, whose normals agree to 37 degrees, but for twice the rounding error of a hit."""
+    """On surfaces those in a flat disc, whose normals agree to 37 degrees, but for twice the rounding error
+    of a hit. In volumes, without normals, those in a ball of the same medium."""
     p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0, 0.99], 0, [0, 0, 0, 0.24, 0.26, 0, 0, 0.19])
     n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7, 0], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51), 1])
     photon = Photon(p, None, n, *[None] * 11)
     si = SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1))
     for offset, rounded in ((0, False), (0.1, True)):
-        z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=offset))
+        z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=offset), volume=mi.Bool(False), medium=1)
         found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
         assert found == [True, True, False, True, rounded, True, False, rounded]
+    p, n = mi.Point3f([0, 0, 0, 0, 0, 0], 0, [0.99, 1.01, 0, 0, 0, 0]), mi.Normal3f(0, 0, [0, 0, 0, 1, 0, 1])
+    photon = replace(photon, p=p, n=n, medium=mi.UInt32(1, 1, 2, 0, 1, 0))
+    si.n = mi.Normal3f(0, 0, [0, 0, 0, 0, 1, 1])
+    z.anchor.offset, z.volume = 0, si.n.z == 0
+    found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
+    assert found == [True, False, False, False, False, True]
 
 
 # -- renders -----------------------------------------------------------------------------------------------
@@ -372,19 +380,15 @@ def test_what_is_refused():
     method, default = bdpt(merging=True), bdpt()
     moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
-    fog = {"type": "homogeneous", "sigma_t": 1.0, "albedo": 0.5}
-    foggy = under_glass(point())
-    foggy["plate"]["interior"] = fog
-    for scene, words in ((moving, "shutter"), (foggy, "participating media")):
-        scene = mi.load_dict(scene)
-        with pytest.raises(NotImplementedError, match=f"{words}.*leave out merging"):
-            method.render(scene, spp=1)
-        with Warned() as warnings:
-            for _ in range(2):
-                default.render(scene, spp=1)
-        (left_out,) = (row for row in default.statistics["skipped"] if row["class"] == "merging")
-        assert left_out["level"] == "impossible" and words in left_out["why"]
-        assert len(warnings) == 1 and "set merging" not in warnings[0]
+    scene = mi.load_dict(moving)
+    with pytest.raises(NotImplementedError, match="shutter.*leave out merging"):
+        method.render(scene, spp=1)
+    with Warned() as warnings:
+        for _ in range(2):
+            default.render(scene, spp=1)
+    (left_out,) = (row for row in default.statistics["skipped"] if row["class"] == "merging")
+    assert left_out["level"] == "impossible" and "shutter" in left_out["why"]
+    assert len(warnings) == 1 and "set merging" not in warnings[0]
 
 
 # -- through near-specular lobes ---------------------------------------------------------------------------
@@ -419,7 +423,7 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
     roulette acts first; if they are not ``ended``, that of photons, and through a lens that of camera
     vertices. Tolerance: a few standard errors of the roulette."""
     if not ended:
-        never = lambda self, state, partial, p: (mi.Float(1), state)  # noqa: E731
+        never = lambda self, kernel, state, partial, vertex: (mi.Float(1), state)  # noqa: E731
         monkeypatch.setattr(merging.Merging, "survival", never)
     built, found = mi.load_dict(described()), []
     for least in (slack, 1e30):

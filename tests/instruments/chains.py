@@ -164,7 +164,7 @@ class Recursion:
             i = k - e
             arrived = mis.to_area(h, partial, x.dist2[i], x.cos_light[i], x.transmittance[i])
             if x.transmittance[i] is not None:
-                partial = mis.Partial(h.scale(partial.d_vcm, dr.rcp(x.transmittance[i])), partial.d_vc)
+                partial = replace(partial, d_vcm=h.scale(partial.d_vcm, dr.rcp(x.transmittance[i])))
             partial = dr.select(x.infinite, partial, arrived) if e == k else arrived
             found.append(partial)
             if e < k:
@@ -197,7 +197,7 @@ class Recursion:
         light_side = mis.alternatives(h, arrived, newest, x.sensor_pdf, x.lens_pdf)
         kappa_prime = kappa.endpoints if k == 1 else kappa.splat_prime
         merges = h.scale(self._before_end(arrived, kappa_prime, x.sensor_pdf), x.lens_pdf)
-        return h.weigh(kappa.arrival, light_side, mi.Float(0), merges=merges)[0]
+        return h.weigh(kappa.arrival, light_side, mi.Float(0), ((0, merges),))[0]
 
     def _before_end(self, partial, coefficient, pdf):
         """Merges at the vertices before the end of a subpath, an emitter or the sensor."""
@@ -205,11 +205,11 @@ class Recursion:
             return 0
         return mis.older_merges(self.h, partial, self.h.scale(partial.d_vcm, coefficient), pdf)
 
-    def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, own, i):
-        """Merges at the vertices of a subpath connected at x_i; coefficients of rivals."""
+    def _of_side(self, partial, coefficient, pdf_rev_w, pdf_a, i):
+        """Merges at the vertices of a subpath connected at x_i (alternatives.side_of)."""
         if self.eta is None:
-            return 0
-        return mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, own, self.h.start(self.eta[i]))
+            return ()
+        return (mis.merges(self.h, partial, coefficient, pdf_rev_w, pdf_a, self.h.start(self.eta[i])),)
 
     def merge(self, m):
         """Both subpaths up to x_m (merging.merge)."""
@@ -227,11 +227,11 @@ class Recursion:
         newest = self.kappa.endpoints * x.first if x.k == 1 else connected
         camera_side = h.combine(h.scale(last.d_vcm, newest), h.scale(last.d_vc, x.first * x.second))
         merges = self._before_end(last, newest, x.first * x.second)
-        return h.weigh(1, mi.Float(0), camera_side, merges=merges)[0]
+        return h.weigh(1, mi.Float(0), camera_side, ((0, merges),))[0]
 
-    def _joined(self, kappa, light_side, camera_side, edge, merges=0):
-        """The weight of a strategy that joins this edge (Vacuum.seen)."""
-        return self.h.weigh(kappa, light_side, camera_side, self.path.transmittance[edge], merges)[0]
+    def _joined(self, kappa, light_side, camera_side, edge, merges=(), own=0):
+        """The weight of a strategy that joins this edge (Space.seen)."""
+        return self.h.weigh(kappa, light_side, camera_side, merges, own, self.path.transmittance[edge])[0]
 
     def endpoints(self):
         """(1,1) (techniques.connect_endpoints)."""
@@ -249,9 +249,9 @@ class Recursion:
         light_side = h.start(dr.select(x.unhittable, 0, x.to_light[1] / x.direct))
         density = x.ratio * x.cos_camera[0]
         z, densities = self.camera[k - 1], (x.to_camera[1], density)
-        merges = self._of_side(z, self._kappa_prime(k - 1), *densities, 1.0, 1)
+        merges = self._of_side(z, self._kappa_prime(k - 1), *densities, 1)
         camera_side = mis.alternatives(h, z, self._of_camera(k - 1), *densities)
-        return self._joined(1, light_side, camera_side, 0, merges)
+        return self._joined(1, light_side, camera_side, 0, merges, 1.0)
 
     def inner(self, s):
         """s and t >= 2 (connections.inner)."""
@@ -262,10 +262,9 @@ class Recursion:
         from_light = x.to_camera[s - 1] * x.cos_camera[s - 1] / x.dist2[s - 1]
         y = self.light[s - 1], self._of_light(s - 1), x.to_light[s - 1], from_camera
         z = self.camera[k - s], self._of_camera(k - s), x.to_camera[s], from_light
-        of_z = self._of_side(z[0], self._kappa_prime(k - s), *z[2:], kappa.inner, s)
-        merges = h.combine(self._of_side(*y, kappa.inner, s - 1), of_z)
+        merges = self._of_side(*y, s - 1) + self._of_side(z[0], self._kappa_prime(k - s), *z[2:], s)
         sides = mis.alternatives(h, *y), mis.alternatives(h, *z)
-        return self._joined(kappa.inner, *sides, s - 1, merges)
+        return self._joined(kappa.inner, *sides, s - 1, merges, kappa.inner)
 
     def splat(self):
         """t = 1 (techniques.splat)."""
@@ -276,8 +275,9 @@ class Recursion:
         y = self.light[k - 1], self._of_light(k - 1), x.to_light[k - 1], from_camera
         to_sensor = x.to_camera[k - 1] * x.cos_camera[k - 1] / (x.dist2[k - 1] * x.lens_pdf)
         camera_side = h.scale(h.start(to_sensor), self.arrival)
-        merges = self._of_side(*y, kappa.splat_prime, k - 1)
-        return self._joined(kappa.splat, mis.alternatives(h, *y), camera_side, k - 1, merges)
+        merges = self._of_side(*y, k - 1)
+        sides = mis.alternatives(h, *y), camera_side
+        return self._joined(kappa.splat, *sides, k - 1, merges, kappa.splat_prime)
 
 
 def columns(values, n) -> np.ndarray:

@@ -48,9 +48,12 @@ class Photon:
 
     def at(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Photon:
         """The photons at ``index``."""
-        stored = {name: x for name, x in vars(self).items() if x is not None}
-        return replace(self, **{name: dr.gather(type(x), x, index, active) for name, x in stored.items()})
+        gathered = {name: dr.gather(type(x), x, index, active) for name, x in self._stored().items()}
+        return replace(self, **gathered)
 
     def put(self, photon: Photon, index: mi.UInt32, active: mi.Bool):
         """Store ``photon`` at ``index``."""
-        dr.scatter(vars(self), vars(photon), index, active)
+        dr.scatter(self._stored(), photon._stored(), index, active)
+
+    def _stored(self) -> dict:
+        return {name: x for name, x in vars(self).items() if x is not None}
