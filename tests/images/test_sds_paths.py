@@ -82,6 +82,7 @@ def test_all_photons_of_a_disc_are_found():
         si=SimpleNamespace(p=mi.Point3f(*p, 0), n=mi.Normal3f(dr.zeros(mi.Float, n), 0, 1)),
         edges=mi.UInt32(edges.astype(np.uint32)),
         anchor=SimpleNamespace(offset=mi.Float(0)),
+        volume=mi.Bool(False),
     )
     word = sobol.mix(dr.arange(mi.UInt32, n))
     _, total = merging._draw(of_pass, z, dr.opaque(mi.UInt32, most) - z.edges, word, None)
