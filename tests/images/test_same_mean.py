@@ -65,6 +65,7 @@ WAYS = {
     "guided 4": {"decisions": guided(4)},
     "merged": {"merging": True, "merging_radius": 0.25},
     "wide discs": {"merging": True, "merging_radius": 0.5},
+    "small balls": {"merging": True, "merging_radius": 0.1},
 }
 
 
@@ -869,6 +870,81 @@ def all_vertices_merged(light, kind):
     scene = wide(scene) if kind == "thinlens" else scene
     patched = MANY_PHOTONS, (mis, "MERGE_DOMINATED", 0.0)
     return Row(scene, {}, 5, 64, 64, 8, EVERYTHING | NEVER, patched=patched)
+
+
+# -- merging in media ---------------------------------------------------------------------------
+
+
+ALL_MERGED = (mis, "MERGE_DOMINATED", 0.0)
+
+
+def under_water(medium, bed=0.2, judge=VOLPATH, patched=(MANY_PHOTONS, ALL_MERGED), **more):
+    """A lamp so large that hits find it through water; balls lack 1 % of the light at the water's surface."""
+    scene = sds.pool(medium, sds.ball(0.8), matte(bed), **more)
+    return Row(scene, judge, 5, 256, 2048, 8, patched=patched)
+
+
+def noise(*shape):
+    return np.random.default_rng(3).random(shape) ** 2
+
+
+IN_WATER = {"low": (-1.6, -1.6, -1), "edge": (3.2, 3.2, 1)}
+WATERS = {
+    "fog": lambda: under_water(fogs.fog(1, 0.8)),
+    "forward": lambda: under_water(fogs.fog(2, 0.9, 0.8)),
+    "black fog": lambda: under_water(fogs.fog(1, 0.0), 0.8),
+    "coloured": lambda: under_water(fogs.coloured(1.5), judge=VOLPATHMIS),
+    "grid": lambda: under_water(fogs.grid(noise(4, 4, 4), *IN_WATER.values(), 4.0, 0.9, phase=hg(0.3))),
+    "coloured grid": lambda: under_water(
+        coloured_grid(noise(4, 4, 4, 3) * [1, 0.5, 0.1], *IN_WATER.values(), scale=4.0), judge=VOLPATHMIS
+    ),
+}
+
+
+@same("small balls", of=WATERS)
+def pool(name):
+    return WATERS[name]()
+
+
+@same("small balls", of=("mono", "spectral"))
+def coloured_pool_in(variant):
+    mi.set_variant(variants.of(variant))
+    return pool("coloured")
+
+
+@same(*(f"small balls, {way}" for way in (*CHOICES, "quarter", "three vertices", "independent", "roulette")))
+def pool_by():
+    """Merges of half of the light, where they dominate."""
+    return under_water(fogs.fog(1, 0.8), patched=(MANY_PHOTONS,))
+
+
+@same("small balls, all", "small balls, camera", of=("homogeneous", "grid"))
+def pool_around_a(kind):
+    """Fog of another number behind a null boundary, in part black. (`volpath` is wrong behind these.)"""
+    at = (-0.5, -0.5, -0.9), (1, 1, 0.6)
+    other = fogs.fog(3, 0.9, 0.0) if kind == "homogeneous" else fogs.grid(noise(4, 4, 4), *at, 9.0, 0.9)
+    box = fogs.box(*at, interior=other, exterior={"type": "ref", "id": "water"})
+    return under_water(fogs.fog(0.5, 0.8), judge=WAYS["camera"], box=box)
+
+
+@same("wide discs, all", "wide discs, camera")
+def pool_point_lamp_and_wide_lens():
+    """t = 0 finds what merging finds."""
+    point = {"type": "point", "position": [-2.2, 2.0, 2.5], "intensity": 10.0}
+    eye = camera("thinlens", (-2.2, -2, 2.5), (0, 0, -0.3), 40, aperture_radius=0.8, focus_distance=3.9)
+    scene = sds.pool(fogs.fog(1, 0.8), point, matte(0.2), sensor=eye)
+    return Row(scene, EVERYTHING, 5, 256, 1024, 8, tile=8, patched=(MANY_PHOTONS,))
+
+
+@same("small balls", "small balls, camera", of=("null", "dielectric"))
+def fog_all_merged(bsdf):
+    """A foggy room and a ball of denser fog in it, the sensor in the fog."""
+    glass = fogs.ball({"type": "dielectric"}, 0.2, (0.2, -0.3, -0.4))
+    dense = fogs.ball(bsdf, interior=fogs.fog(5, 0.9), exterior={"type": "ref", "id": "fog"})
+    eye = fogs.sensor(medium=FOG)
+    scene = {"fog": fogs.fog(0.8, 0.8, id="fog"), **fogs.room(eye, dense=dense, glass=glass)}
+    judge = WAYS["camera"] if bsdf == "null" else VOLPATH
+    return Row(scene, judge, 4, 64, 256, 8, patched=(MANY_PHOTONS, ALL_MERGED))
 
 
 # -- guided emission, and several light subpaths in a lane --------------------------------------

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 import scenes
-from scenes import area, camera, matte, square, transform
+from scenes import area, both_sides, camera, matte, square, transform
 
 LAMP, CAMERA, FOV, SIZE = (0.5, 0.0, 4.5), (0.0, 0.5, 3.0), 60, 16
 
@@ -49,6 +49,28 @@ def under_glass(light, floor=None, plate=None, kind="perspective", **more):
         "floor": square(size=4, bsdf=floor),
         "plate": {"type": "cube", "to_world": to_world, "bsdf": plate or glass()},
         "light": light,
+        **more,
+    }
+
+
+WATER = 1.33
+
+
+def pool(medium, light, bed=None, **more):
+    """Water of depth 1 below z = 0, between black walls, that is a ``medium``; its floor is black or a ``bed``.
+
+    No light is mirrored into the camera.
+    """
+    clear, within = {"type": "dielectric", "int_ior": WATER, "ext_ior": 1.0}, {"type": "ref", "id": "water"}
+    wall = {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 0], "radius": 1.5, "bsdf": both_sides(0.0)}
+    return {
+        "type": "scene",
+        "medium": medium | {"id": "water"},
+        "sensor": camera(origin=(-2.2, -2, 2.5), target=(0, 0, -0.3), fov=40, size=SIZE),
+        "surface": {"type": "disk", "to_world": transform().scale(1.5), "bsdf": clear, "interior": within},
+        "wall": wall | {"interior": within},
+        "floor": square((0, 0, -1), size=1.6, bsdf=bed or matte(0.0)),
+        "light": light | ({"center": [-2.2, 2.0, 2.5]} if light["type"] == "sphere" else {}),
         **more,
     }
 
