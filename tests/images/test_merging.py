@@ -10,13 +10,14 @@ from functools import cache
 from types import SimpleNamespace
 
 import internals
+import media_parts as fogs
 import mitsuba as mi
 import numpy as np
 import pytest
 import welch as st
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
-from mitsuba_bdpt.merging.radius import Footprints
+from mitsuba_bdpt.merging.radius import BALLS, Footprints
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
@@ -33,12 +34,15 @@ from sds_scenes import (
     LAMP,
     SIZE,
     THICKNESS,
+    WATER,
     ball,
     glass,
     images,
     matte,
     point,
+    pool,
     principled,
+    rendered,
     rough,
     strategy_images,
     sun,
@@ -123,6 +127,85 @@ def test_floor_under_glass(light):
     st.check_known(found.mean((1, 2)), expected.mean(), relative=0.02, rounding=BLUR)
     if light == "point":
         assert not images(scene, 4, 1, merging=False).any()
+
+
+def through_water(mu):
+    """Cosine in water below this one, and what its surface lets through."""
+    inside = np.sqrt(1 - (1 - mu * mu) / WATER**2)
+    s, p = (mu - WATER * inside) / (mu + WATER * inside), (WATER * mu - inside) / (WATER * mu + inside)
+    return inside, 1 - (s * s + p * p) / 2
+
+
+def seen_in_water(sigma, albedo, g, mu, mu0, r):
+    """Radiance by one scattering, of extinction ``sigma`` (colours, depths), and of a bed of reflectance 0.2.
+
+    Fluence is the mean over the part of the ball of radius ``r`` that lies in the water.
+    """
+    (cos, seen), (cos0, sunlit) = through_water(mu), through_water(mu0)
+    step = 1 / sigma.shape[1]
+    depth = np.cumsum(sigma, axis=1) * step
+    height = np.arange(-int(r / step), int(r / step) + 1) * step / r
+    ball = (1 - height**2) / (1 - height**2).sum()
+    fluence = [np.convolve(np.exp(-of / cos0), ball, "same") for of in depth - sigma * step / 2]
+    scattered = (sigma * fluence * np.exp((sigma * step / 2 - depth) / cos)).sum(1) * step / cos
+    turn = np.sqrt((1 - cos**2) * (1 - cos0**2)) - cos * cos0
+    phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * turn) ** 1.5)
+    bed = 0.2 / np.pi * np.exp(-depth[:, -1] * (1 / cos + 1 / cos0))
+    return seen / WATER**2 * mu0 * sunlit * (albedo * phase * scattered / cos0 + bed)
+
+
+LAYERS = np.array([0.5, 3.0, 0.2, 1.0, 2.0])  # extinction from the bed upwards
+
+
+def layered(*colours):
+    """A grid of water whose extinction varies with depth."""
+    values = np.ascontiguousarray(np.tile(LAYERS[:, None, None, None] * colours, (1, 2, 2, 1)), np.float32)
+    grid = fogs.grid(np.zeros((2, 2, 2)), (-1.6, -1.6, -1), (3.2, 3.2, 1), 1.0, 0.9)
+    grid["sigma_t"] |= {"raw": True, "grid": mi.VolumeGrid(values)}
+    return grid | {"phase": {"type": "hg", "g": 0.3}}
+
+
+EVEN, DEPTHS = np.ones((3, 2000)), (np.arange(2000) + 0.5) / 2000
+OF_LAYERS = np.interp(5 * (1 - DEPTHS) - 0.5, np.arange(5), LAYERS)
+WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radius in pixels
+    "gray": (lambda: fogs.fog(1.0, 0.9, 0.3), EVEN, 0.9, 0.3, 0.85, 0.9, 0.5),
+    "dense": (lambda: fogs.fog(6.0, 0.9, -0.5), 6 * EVEN, 0.9, -0.5, 1.0, 0.7, 0.5),
+    "forward": (lambda: fogs.fog(2.0, 0.9, 0.8), 2 * EVEN, 0.9, 0.8, 0.95, 0.8, 0.5),
+    "coloured": (
+        lambda: fogs.coloured(2.0),
+        EVEN * [[1.8], [0.8], [0.2]],
+        np.array([0.5, 0.8, 0.95]),
+        0.3,
+        0.9,
+        0.9,
+        0.5,
+    ),
+    "grid": (lambda: layered(1.0), EVEN * OF_LAYERS, 0.9, 0.3, 0.85, 0.9, 1.0),
+    "coloured grid": (
+        lambda: layered(1.0, 0.6, 0.2),
+        OF_LAYERS * [[1], [0.6], [0.2]],
+        0.9,
+        0.3,
+        0.9,
+        0.85,
+        0.5,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WATERS)
+def test_the_sun_in_water(name, monkeypatch):
+    """Also what balls lack at the surface, up to a tenth. One pass of 256 samples per pixel."""
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
+    make, *water, mu, mu0, radius = WATERS[name]
+    sun = {"type": "directional", "direction": [np.sqrt(1 - mu0 * mu0), 0, -mu0], "irradiance": 1.0}
+    look = transform().look_at([10 * np.sqrt(1 - mu * mu), 0, 10 * mu], [0, 0, 0], [0, 1, 0])
+    eye = {"type": "orthographic", "to_world": look.scale([0.5, 0.5, 1]), "film": scenes.film(16)}
+    scene = mi.load_dict(pool(make(), sun, matte(0.2), sensor=eye))
+    method = internals.bdpt(max_depth=4, merging=True, merging_radius=radius)
+    found = rendered(method, scene, 256, 12).mean((1, 2))
+    expected = seen_in_water(*water, mu, mu0, radius * BALLS * 4 ** (-1 / 7) / 16)
+    st.check_known(found, expected, relative=0.05, rounding=0.003)
 
 
 def test_blur_goes_as_the_square_of_the_radius(monkeypatch):

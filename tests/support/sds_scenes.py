@@ -57,9 +57,9 @@ WATER = 1.33
 
 
 def pool(medium, light, bed=None, **more):
-    """Water of depth 1 below z = 0, between black walls, that is a ``medium``; its floor is black or a ``bed``.
+    """Water of depth 1 between black walls, which is a ``medium``; its floor is black or a ``bed``.
 
-    No light is mirrored into the camera.
+    The camera sees no mirrored lamp.
     """
     clear, within = {"type": "dielectric", "int_ior": WATER, "ext_ior": 1.0}, {"type": "ref", "id": "water"}
     wall = {"type": "cylinder", "p0": [0, 0, -1], "p1": [0, 0, 0], "radius": 1.5, "bsdf": both_sides(0.0)}
