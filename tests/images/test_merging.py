@@ -5,6 +5,7 @@ A floor under a plate of glass, lamp and camera above: lamp, delta events, floor
 strategy connects two neighbours of that path; point lamps are found by merging alone.
 """
 
+import re
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -208,6 +209,29 @@ def test_the_sun_in_water(name, monkeypatch):
     st.check_known(found, expected, relative=0.05, rounding=0.003)
 
 
+GLOBES = {
+    "gray": lambda: fogs.fog(3.0, 1.0),
+    "coloured": lambda: fogs.coloured(4.0) | {"albedo": 1.0},
+    "grid": lambda: fogs.grid(np.random.default_rng(0).random((5, 5, 5)), [-0.5] * 3, 1.0, 8.0, 1.0),
+}
+
+
+@pytest.mark.parametrize("way", [{}, {"light_paths": 0}, {"heuristic": "power"}], ids=str)
+@pytest.mark.parametrize("globe", GLOBES)
+def test_a_globe_of_white_fog_is_invisible(globe, way, monkeypatch):
+    """Glass around a medium of albedo 1 inside of a glowing sphere, all vertices merged; balls at the surface
+    lack 0.5 % of the image's light."""
+    monkeypatch.setattr(mis, "MERGE_DOMINATED", 0.0)
+    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
+    ball = fogs.ball(glass(), 0.4, (0, 0, 0), interior=GLOBES[globe]())
+    eye = scenes.camera(origin=(0, 0, 0.95), target=(0, 0, 0), size=SIZE)
+    glowing = fogs.wall(bsdf=matte(0.5), emitter=scenes.area(0.5))
+    scene = mi.load_dict({"type": "scene", "sensor": eye, "ball": ball, "wall": glowing})
+    method = internals.bdpt(max_depth=62, merging=True, merging_radius=0.1, **way)
+    found = rendered(method, scene, 32, 8).mean((1, 2))
+    st.check_known(found, 1.0, relative=0.05, rounding=0.005)
+
+
 def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
     """What discs of 1.5 and 3 pixels lack of those of half a pixel is as 1 : 4.4, with a standard error of
     0.5; between 3 and 7 (of the radius itself it would be 2.5, of its cube 8.3)."""
@@ -366,11 +390,21 @@ def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
     assert done == [*range(1, 55)]
 
 
-@pytest.mark.parametrize("spp", [1, 64])
-def test_merging_where_light_is_missing(spp):
+def under_plate(lamp):
+    return under_glass(lamp)
+
+
+def under_water(lamp):
+    return pool(fogs.fog(1.0, 0.8), lamp, matte(0.0))
+
+
+@pytest.mark.parametrize(
+    "spp, under", [(1, under_plate), (64, under_plate), (1, under_water), (64, under_water)]
+)
+def test_merging_where_light_is_missing(spp, under):
     """The image of ``merging=true`` where light is missing, with a pilot and without one; else that of
     ``merging=false``."""
-    hidden, seen = (mi.load_dict(under_glass(lamp)) for lamp in (point(), ball()))
+    hidden, seen = (mi.load_dict(under(lamp)) for lamp in (point(), ball()))
     default = bdpt()
     for scene, merged in ((hidden, True), (seen, False)):
         found, expected = (
@@ -380,7 +414,9 @@ def test_merging_where_light_is_missing(spp):
         assert default.statistics["unbiased"] != merged
     default.render(hidden, spp=spp)
     why = default.statistics["merging"]["why"]
-    assert "about 99 % of the image's light: that of emitter 'light', through or off shape" in why
+    assert re.search(
+        "about [79][0-9] % of the image's light: that of emitter 'light', through or off shape", why
+    )
     assert why in default.explain(hidden, spp=spp)
 
 
@@ -450,19 +486,22 @@ def test_photons_are_aimed(monkeypatch):
     st.assert_agree(st.compare_images(st.tiles(a)[:, bright], st.tiles(b)[:, bright]), at_least=5)
 
 
-def test_what_needs_no_merging():
-    scene = mi.load_dict(under_glass(ball(), plate=matte()))
+@pytest.mark.parametrize("medium", [False, True])
+def test_what_needs_no_merging(medium):
+    scene = mi.load_dict(fogs.foggy() if medium else under_glass(ball(), plate=matte()))
     method = bdpt(merging=True)
     assert "skipped (impossible): merging: without specular surfaces" in method.explain(scene)
     mi.render(scene, integrator=method, spp=4)
     assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
 
 
-def test_what_is_refused():
+@pytest.mark.parametrize("medium", [False, True])
+def test_what_is_refused(medium):
     """By default one warning."""
     method, default = bdpt(merging=True), bdpt()
     moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
+    moving["plate"] |= {"interior": fogs.fog()} if medium else {}
     scene = mi.load_dict(moving)
     with pytest.raises(NotImplementedError, match="shutter.*leave out merging"):
         method.render(scene, spp=1)

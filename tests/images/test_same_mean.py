@@ -65,7 +65,7 @@ WAYS = {
     "guided 4": {"decisions": guided(4)},
     "merged": {"merging": True, "merging_radius": 0.25},
     "wide discs": {"merging": True, "merging_radius": 0.5},
-    "small balls": {"merging": True, "merging_radius": 0.1},
+    "small balls": {"merging": True, "merging_radius": 0.05},
 }
 
 
@@ -879,7 +879,7 @@ ALL_MERGED = (mis, "MERGE_DOMINATED", 0.0)
 
 
 def under_water(medium, bed=0.2, judge=VOLPATH, patched=(MANY_PHOTONS, ALL_MERGED), **more):
-    """A lamp so large that hits find it through water; balls lack 1 % of the light at the water's surface."""
+    """A lamp so large that hits find it through water; balls lack 1 % of the light, at surfaces."""
     scene = sds.pool(medium, sds.ball(0.8), matte(bed), **more)
     return Row(scene, judge, 5, 256, 2048, 8, patched=patched)
 

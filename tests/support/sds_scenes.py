@@ -56,8 +56,8 @@ def under_glass(light, floor=None, plate=None, kind="perspective", **more):
 WATER = 1.33
 
 
-def pool(medium, light, bed=None, **more):
-    """Water of depth 1 between black walls, which is a ``medium``; its floor is black or a ``bed``.
+def pool(medium, light, bed, **more):
+    """Water of depth 1 between black walls, which is a ``medium``; its floor is a ``bed``.
 
     The camera sees no mirrored lamp.
     """
@@ -69,7 +69,7 @@ def pool(medium, light, bed=None, **more):
         "sensor": camera(origin=(-2.2, -2, 2.5), target=(0, 0, -0.3), fov=40, size=SIZE),
         "surface": {"type": "disk", "to_world": transform().scale(1.5), "bsdf": clear, "interior": within},
         "wall": wall | {"interior": within},
-        "floor": square((0, 0, -1), size=1.6, bsdf=bed or matte(0.0)),
+        "floor": {"type": "disk", "to_world": transform().translate([0, 0, -1]).scale(1.5), "bsdf": bed},
         "light": light | ({"center": [-2.2, 2.0, 2.5]} if light["type"] == "sphere" else {}),
         **more,
     }
