@@ -18,7 +18,7 @@ import pytest
 import welch as st
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
-from mitsuba_bdpt.merging.radius import BALLS, Footprints
+from mitsuba_bdpt.merging.radius import BALLS, MEAN_FREE_PATHS, Footprints
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
@@ -189,7 +189,7 @@ WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radiu
         0.3,
         0.9,
         0.85,
-        0.5,
+        0.8,
     ),
 }
 
@@ -205,7 +205,8 @@ def test_the_sun_in_water(name, monkeypatch):
     scene = mi.load_dict(pool(make(), sun, matte(0.2), sensor=eye))
     method = internals.bdpt(max_depth=4, merging=True, merging_radius=radius)
     found = rendered(method, scene, 256, 12).mean((1, 2))
-    expected = seen_in_water(*water, mu, mu0, radius * BALLS * 4 ** (-1 / 7) / 16)
+    r = 16 / (radius * BALLS * 4 ** (-1 / 7)) + water[0].mean() / MEAN_FREE_PATHS
+    expected = seen_in_water(*water, mu, mu0, 1 / r)
     st.check_known(found, expected, relative=0.05, rounding=0.003)
 
 

@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_bdpt import settings
-from mitsuba_bdpt.merging import merging, passes
-from mitsuba_bdpt.merging.radius import Radius
+from mitsuba_bdpt.merging import merging, passes, radius
+from mitsuba_bdpt.merging.radius import Balls, Radius
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.sampling.points import Points
 from mitsuba_bdpt.transport import connections, mis, techniques
@@ -130,9 +130,11 @@ class Recorder(Observer):
     def with_photons(self, kernel_, least, patch):
         """The kernel with photons of which all are merged. A first pass stores all vertices (B = 0)."""
         patch.setattr(merging, "SLACK", 1e30)
+        patch.setattr(radius, "MEAN_FREE_PATHS", np.inf)
         radii = (Radius(mi.Point3f(0), *map(mi.Float, (r, 0, r / 8, 8 * r))) for r in (DISC, BALL))
         discs, balls = radii
-        merges, draw = merging.Merging(discs, mi.Float(COUNT), mi.Float(1), balls=balls), merging.sample
+        merges, draw = merging.Merging(discs, mi.Float(COUNT), mi.Float(1)), merging.sample
+        merges.balls = Balls(balls, kernel_.space.media)
         for b in (0.0, least):
             patch.setattr(mis, "MERGE_DOMINATED", b)
             points = Points("independent", dr.opaque(mi.UInt32, 7))

@@ -30,7 +30,7 @@ from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
 from ..transport.sds import PhotonStrategy, State
 from ..transport.walk import Vertex
-from .radius import Radius
+from .radius import Balls, Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
 
 # Bits of a bucket's index in the hash table, and of each coordinate of a cell.
@@ -55,7 +55,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
     ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
     coefficient of merges in all weights, see `coefficient`; ``photons``: `Photons`, None while they are
     traced; ``wavelengths``: `WavelengthSets` in spectral variants, where photons merge with camera subpaths
-    of the same set; ``balls``: radius in media that scatter, else None. Numbers are opaque ``Float``.
+    of the same set; ``balls``: radius in media, None if none scatters. Numbers are opaque ``Float``.
     """
 
     radius: Radius
@@ -63,26 +63,28 @@ class Merging(PhotonStrategy, PhotonPolicy):
     kappa: mi.Float
     photons: Any = None
     wavelengths: WavelengthSets | None = None
-    balls: Radius | None = None
+    balls: Balls | None = None
 
     counters = ("merges",)
     merges = True
     only_specular = 0.0
 
-    def around(self, volume: mi.Bool) -> Radius:
-        """The radius of discs, in a ``volume`` that of balls."""
-        return self.radius if self.balls is None else dr.select(volume, self.balls, self.radius)
+    def around(self, p: mi.Point3f, volume: mi.Bool, medium) -> tuple[mi.Float, Radius]:
+        """The radius at ``p`` of a disc, in a ``volume`` of a ball in ``medium``; `Radius` that bounds it."""
+        if self.balls is None:
+            return self.radius.at(p), self.radius
+        return self.balls.at(p, dr.select(volume, medium, mi.UInt32(0)), self.radius)
 
     def eta(self, kernel: TraceContext, vertex) -> mi.Float:
         """Number of subpaths times the area of the disc at ``vertex`` (scene units squared).
 
         In a volume times the volume of the ball and the medium's mean extinction, see `Photon.flux`.
         """
-        r = self.around(vertex.volume).at(vertex.si.p)
+        r, _ = self.around(vertex.si.p, vertex.volume, vertex.medium)
         disc = self.count * dr.pi * dr.square(r)
         if self.balls is None:
             return disc
-        in_ball = 4 / 3 * r * kernel.space.media.mean(vertex.medium)
+        in_ball = 4 / 3 * r * self.balls.media.mean(vertex.medium)
         return disc * dr.select(vertex.volume, in_ball, 1)
 
     def kappa_eta(self, kernel, vertex):
@@ -210,8 +212,6 @@ def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None
     2^20: cells of equal index lie far apart, also those of different sets.
     """
     width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
-    if corner is not None:
-        p = p - radius.at(p)
     cell, number = mi.Point3i(dr.floor(p / width)), mi.UInt64(level)
     for axis in range(3):
         index = mi.UInt32(cell[axis])
@@ -264,8 +264,8 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
     """Draw a photon of at most ``most`` edges in the disc at ``z`` by flux; its index, total flux."""
-    radius, photons = merging.around(z.volume), merging.photons
-    r = radius.at(z.si.p)
+    photons = merging.photons
+    r, radius = merging.around(z.si.p, z.volume, z.medium)
     lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
     corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8
     corner, place, end = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
@@ -276,7 +276,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
         exclude=[z, wavelength_set, radius, photons, r, lowest, corners, most],
     ):
         through = place >= end  # the next cell
-        there = cell_at(radius, z.si.p, lowest + (corner >> 3), wavelength_set, corner & 7)
+        there = cell_at(radius, z.si.p - r, lowest + (corner >> 3), wavelength_set, corner & 7)
         bucket = bucket_of(there)
         place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
         end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)

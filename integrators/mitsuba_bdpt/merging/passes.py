@@ -16,7 +16,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import BALLS, Footprints, after, film_pixels
+from .radius import BALLS, Balls, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Which paths are merged")
@@ -75,7 +75,7 @@ class Passes:
         ``samples`` of each pixel; ``done``: earlier ones, in all parts of the image, from which the radius
         follows; ``start``: see `WavelengthSets.of`, in spectral variants.
         """
-        end, scatters = done + samples, kernel.space.phase is not None
+        end = done + samples
         if self._footprints.measured:
             radius = after(self._radius, end)  # in pixels
             count = photons_of_pass(samples * self._uncropped, self._uncropped, radius)
@@ -91,7 +91,10 @@ class Passes:
         # Photons beyond those of the samples would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
-        balls = self._footprints.radius(after(BALLS * self._radius, end, 3)) if scatters else None
+        balls = None
+        if kernel.space.phase is not None:
+            in_media = self._footprints.radius(after(BALLS * self._radius, end, 3))
+            balls = Balls(in_media, kernel.space.media)
         discs = self._footprints.radius(radius)
         merging = Merging(discs, met, kappa, wavelengths=wavelengths, balls=balls)
         return trace(kernel, merging, self._aim, points, count)
@@ -116,10 +119,11 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     """Sort the first ``count`` photons by bucket, subpath and edge: deterministic."""
     index = dr.arange(mi.UInt32, max(count, 1))  # without photons one in no bucket
     found = photons.at(index)
-    radius = merging.radius if found.medium is None else merging.around(found.medium != 0)
+    volume = mi.Bool(False) if found.medium is None else found.medium != 0
+    r, radius = merging.around(found.p, volume, found.medium)
     sets = merging.wavelengths
     number = None if sets is None else sets.number(found.lane)
-    cell = cell_at(radius, found.p, level_of(radius, radius.at(found.p)), number)
+    cell = cell_at(radius, found.p, level_of(radius, r), number)
     bucket = bucket_of(cell)
     key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
     order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,10 @@ _OF_DIAGONAL = 1 / 64
 
 # Samples per pixel after which the radius is that of the parameters, and `BALLS` times as large in media.
 _OF_SAMPLES, BALLS = 64, 3.0
+
+# Bound of a ball's radius in mean free paths: balls of dense media would hold many photons, and reach beyond
+# the boundary from most of their vertices.
+MEAN_FREE_PATHS = 0.2
 
 
 def after(radius: float, samples: float, dimensions: int = 2) -> float:
@@ -75,6 +80,23 @@ class Radius:
     def steepest(self) -> mi.Float:
         """Upper bound of the change of the radius per distance."""
         return dr.maximum(self.angle, _STEEPEST_ROUNDING)
+
+
+@dataclass
+class Balls:
+    """The ``radius`` in participating ``media``, smaller where these are dense."""
+
+    radius: Radius
+    media: Any
+
+    def at(self, p: mi.Point3f, medium: mi.UInt32, outside: Radius) -> tuple[mi.Float, Radius]:
+        """The radius at ``p`` (scene units) in a ``medium``, or on a surface (0) that of ``outside``.
+
+        Also the `Radius` of all media, which is an upper bound.
+        """
+        radius = dr.select(medium != 0, self.radius, outside)
+        r = dr.rcp(dr.rcp(radius.at(p)) + self.media.mean(medium) / MEAN_FREE_PATHS)
+        return dr.maximum(r, offset_at(dr.max(dr.abs(p)))), radius
 
 
 @dataclass(frozen=True)
