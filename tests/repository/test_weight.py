@@ -15,22 +15,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5105,
-    "transport merging guided_emission": 5693,
-    "planning": 1727,
+    "transport merging guided_emission": 5774,
+    "planning": 1729,
     "emitters": 2182,
     "cli": 1448,
-    "media": 1337,
+    "media": 1347,
     "geometry": 1429,
     "image": 1297,
     "files": 846,
-    "run": 1093,
+    "run": 1092,
     "scene sampling": 822,
     "host": 807,
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2847, "tests": 28154}
-MOST_WORDS = 29558
+OUTSIDE = {"scripts": 2848, "tests": 28471}
+MOST_WORDS = 30187
 
 
 def _lines(files):
