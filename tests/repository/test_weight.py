@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2848, "tests": 28471}
-MOST_WORDS = 30187
+MOST_WORDS = 30399
 
 
 def _lines(files):
