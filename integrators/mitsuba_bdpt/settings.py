@@ -145,8 +145,8 @@ class Settings:
         "auto",
         """Renders SDS paths (light that specular surfaces focus, seen through or in specular surfaces, such
         as the floor of a pool, or shafts of light in its water), also of nearly specular surfaces, by vertex
-        merging with photons: consistent, not unbiased. With ``auto`` it merges where the other strategies miss
-        1 % of the image's light or more.""",
+        merging with photons: consistent, not unbiased. With ``auto`` it merges where the other strategies
+        miss 1 % of the image's light or more.""",
         choices=("auto", "true", "false"),
     )
     guiding: str = _parameter(
