@@ -207,7 +207,7 @@ def test_the_sun_in_water(name, monkeypatch):
     found = rendered(method, scene, 256, 12).mean((1, 2))
     r = 16 / (radius * BALLS * 4 ** (-1 / 7)) + water[0].mean() / MEAN_FREE_PATHS
     expected = seen_in_water(*water, mu, mu0, 1 / r)
-    st.check_known(found, expected, relative=0.05, rounding=0.003)
+    st.check_known(found, expected, relative=0.1, rounding=0.003)
 
 
 GLOBES = {

@@ -933,7 +933,7 @@ def pool_point_lamp_and_wide_lens():
     point = {"type": "point", "position": [-2.2, 2.0, 2.5], "intensity": 10.0}
     eye = camera("thinlens", (-2.2, -2, 2.5), (0, 0, -0.3), 40, aperture_radius=0.8, focus_distance=3.9)
     scene = sds.pool(fogs.fog(1, 0.8), point, matte(0.2), sensor=eye)
-    return Row(scene, EVERYTHING, 5, 256, 1024, 8, tile=8, patched=(MANY_PHOTONS,))
+    return Row(scene, EVERYTHING, 5, 256, 1024, 8, tile=8, error=0.08, patched=(MANY_PHOTONS,))
 
 
 @same("small balls", "small balls, camera", of=("null", "dielectric"))

@@ -83,6 +83,7 @@ def test_all_photons_of_a_disc_are_found():
         edges=mi.UInt32(edges.astype(np.uint32)),
         anchor=SimpleNamespace(offset=mi.Float(0)),
         volume=mi.Bool(False),
+        medium=None,
     )
     word = sobol.mix(dr.arange(mi.UInt32, n))
     _, total = merging._draw(of_pass, z, dr.opaque(mi.UInt32, most) - z.edges, word, None)

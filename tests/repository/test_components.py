@@ -51,7 +51,7 @@ KNOWN = {
         asked={"merging": True},
         tests=(
             *("images/test_merging.py", "images/test_sds_paths.py"),
-            "planning/test_undersampled.py",
+            *("planning/test_undersampled.py", "transport/test_media_oracle.py"),
         ),
     ),
     "media": Component(
