@@ -29,8 +29,8 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2848, "tests": 28471}
-MOST_WORDS = 30399
+OUTSIDE = {"scripts": 2848, "tests": 28472}
+MOST_WORDS = 30401
 
 
 def _lines(files):
