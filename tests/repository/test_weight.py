@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2848, "tests": 28472}
-MOST_WORDS = 30438
+MOST_WORDS = 30430
 
 
 def _lines(files):
