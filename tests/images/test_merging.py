@@ -546,7 +546,7 @@ def test_bounds_lose_no_light(described, slack, ended, monkeypatch):
     roulette acts first; if they are not ``ended``, that of photons, and through a lens that of camera
     vertices. Tolerance: a few standard errors of the roulette."""
     if not ended:
-        never = lambda self, kernel, state, partial, vertex: (mi.Float(1), state)  # noqa: E731
+        never = lambda self, state, partial, vertex: (mi.Float(1), state)  # noqa: E731
         monkeypatch.setattr(merging.Merging, "survival", never)
     built, found = mi.load_dict(described()), []
     for least in (slack, 1e30):

@@ -75,7 +75,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
             return self.radius.at(p), self.radius
         return self.balls.at(p, dr.select(volume, medium, mi.UInt32(0)), self.radius)
 
-    def eta(self, kernel: TraceContext, vertex) -> mi.Float:
+    def eta(self, vertex) -> mi.Float:
         """Number of subpaths times the area of the disc at ``vertex`` (scene units squared).
 
         In a volume times the volume of the ball and the medium's mean extinction, see `Photon.flux`.
@@ -87,10 +87,10 @@ class Merging(PhotonStrategy, PhotonPolicy):
         in_ball = 4 / 3 * r * self.balls.media.mean(vertex.medium)
         return disc * dr.select(vertex.volume, in_ball, 1)
 
-    def kappa_eta(self, kernel, vertex):
+    def kappa_eta(self, vertex):
         disc = self.kappa * (self.count * dr.pi * dr.square(self.radius.at(vertex.si.p)))
         if self.balls is not None:  # as many camera vertices share its photons, or this is the only one
-            disc = dr.select(vertex.volume, dr.minimum(self.eta(kernel, vertex), disc), disc)
+            disc = dr.select(vertex.volume, dr.minimum(self.eta(vertex), disc), disc)
         return dr.minimum(disc, mis.SATURATION)
 
     def begin_light(self, kernel, walk):
@@ -102,10 +102,10 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def begin(self, kernel, e, walk):
         return replace(walk, sds=State(survived=mi.Float(1)))
 
-    def survival(self, kernel, state, partial, vertex):
+    def survival(self, state, partial, vertex):
         # Whichever is larger, since it may go on to where pixels are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
-        most = dr.maximum(self.kappa_eta(kernel, vertex), median)
+        most = dr.maximum(self.kappa_eta(vertex), median)
         survived = dr.minimum(state.survived, _probability(partial.d_vc, most))
         return survived / state.survived, State(survived=survived)
 
@@ -115,12 +115,12 @@ class Merging(PhotonStrategy, PhotonPolicy):
         ``connection``: c of the edge to it.
         """
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
-        return possible & mis.exceeds(self.kappa_eta(kernel, vertex), connection)
+        return possible & mis.exceeds(self.kappa_eta(vertex), connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
-        return dr.minimum(_probability(d_vc, self.kappa_eta(kernel, vertex)) / survived, 1)
+        return dr.minimum(_probability(d_vc, self.kappa_eta(vertex)) / survived, 1)
 
     def stored(self, kernel, y, stream):
         keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
@@ -140,7 +140,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
-        weight = mis.weigh_merge(h, self.kappa_eta(kernel, z), light, camera, connections)
+        weight = mis.weigh_merge(h, self.kappa_eta(z), light, camera, connections)
         active = drawn.active & ~(weight == 0)
         value = drawn.value / self.kept(kernel, z)
         of_camera = path_layers.evaluated(z.layer, f, adjoint=False)
@@ -208,7 +208,8 @@ def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None
     """Index of the cell at ``p`` in the grid ``level``, for a set of wavelengths.
 
     Cells are at least as wide as the discs of nearby camera vertices and of their photons, so that a disc
-    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these. Coordinates are taken modulo
+    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these, ``p`` being the disc's lowest
+    coordinates then. Coordinates are taken modulo
     2^20: cells of equal index lie far apart, also those of different sets.
     """
     width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
@@ -254,7 +255,7 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
     active = z.hit & (total > 0)
     photon = merging.photons.found.at(chosen, active)
     f = scattering.evaluate(kernel, z, z.si.to_local(photon.d), active)
-    eta = merging.eta(kernel, z)
+    eta = merging.eta(z)
     # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * z.cosine(photon.d)))
     value = z.throughput * f.value * estimate

@@ -16,7 +16,7 @@ from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
 from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
-from .radius import BALLS, Balls, Footprints, after, film_pixels
+from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Which paths are merged")
@@ -91,10 +91,7 @@ class Passes:
         # Photons beyond those of the samples would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
-        balls = None
-        if kernel.space.phase is not None:
-            in_media = self._footprints.radius(after(BALLS * self._radius, end, 3))
-            balls = Balls(in_media, kernel.space.media)
+        balls = self._footprints.balls(after(BALLS * self._radius, end, 3), kernel.space)
         discs = self._footprints.radius(radius)
         merging = Merging(discs, met, kappa, wavelengths=wavelengths, balls=balls)
         return trace(kernel, merging, self._aim, points, count)

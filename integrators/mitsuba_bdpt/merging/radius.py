@@ -118,6 +118,10 @@ class Footprints:
         dr.make_opaque(radius)
         return radius
 
+    def balls(self, factor: float, space) -> Balls | None:
+        """The radius of ``factor`` pixels in the media of a `vacuum.Vacuum`; None if none scatters."""
+        return None if space.phase is None else Balls(self.radius(factor), space.media)
+
     @staticmethod
     def of(scene: mi.Scene, sensor: mi.Sensor) -> Footprints:
         """Measure pixels by camera rays, with differentials where available."""

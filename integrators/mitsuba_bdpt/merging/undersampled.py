@@ -73,7 +73,7 @@ class Undersampled(Unsampled):
         camera = h.combine(newest, h.scale(z.partial.d_vc, f.pdf_rev_w))
         area = photon.connection + photon.d_vc * f.pdf_fwd_w + camera
         # The render's light subpaths are not aimed.
-        return self.samples * area * (found.number * photon.aim / merging.eta(kernel, z))
+        return self.samples * area * (found.number * photon.aim / merging.eta(z))
 
 
 @dataclass

@@ -26,7 +26,7 @@ from ..transport.walk import Side, Vertex, Walk, random_walk
 from .merging import Merging, Sample
 from .merging import sample as draw
 from .passes import sort
-from .radius import BALLS, Balls, Footprints, film_pixels
+from .radius import BALLS, Footprints, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
 RADIUS = 1.5  # merging radius in distances between camera samples (of a set of wavelengths) on the film
@@ -97,9 +97,7 @@ def estimate(
     of_samples = RADIUS * math.sqrt(film_pixels(kernel.camera.sensor) * sets / count)
     of_samples = of_samples if footprints.measured else 1.0
     discs = footprints.radius(of_samples)
-    balls = None
-    if kernel.space.phase is not None:
-        balls = Balls(footprints.radius(of_samples * BALLS), kernel.space.media)
+    balls = footprints.balls(of_samples * BALLS, kernel.space)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths, balls=balls)
     unmerged = PhotonStrategy()  # weights know of no merges

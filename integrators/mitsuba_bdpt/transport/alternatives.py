@@ -66,7 +66,7 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a) -> tu
     if not kernel.sds.merges:
         return found, ()
     kappa_prime = newest_coefficient(kernel, vertex, adjoint, prime=True)
-    kappa_eta = kernel.sds.kappa_eta(kernel, vertex)
+    kappa_eta = kernel.sds.kappa_eta(vertex)
     return found, (mis.merges(h, partial, kappa_prime, pdf_rev_w, pdf_a, kappa_eta),)
 
 

@@ -128,11 +128,11 @@ class PhotonStrategy:
     merges = False
     near_specular = False
 
-    def kappa_eta(self, kernel, vertex) -> mi.Float:
+    def kappa_eta(self, vertex) -> mi.Float:
         """Partial sum of a merge at ``vertex``, see `mis.scattered_merges`."""
         raise NotImplementedError
 
-    def survival(self, kernel, state: State, partial: mis.Partial, vertex) -> tuple[mi.Float, State]:
+    def survival(self, state: State, partial: mis.Partial, vertex) -> tuple[mi.Float, State]:
         """Probability with which a photon subpath goes on, and its new ``state``.
 
         ``partial`` after the event at ``vertex``.

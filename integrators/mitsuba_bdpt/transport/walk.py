@@ -303,7 +303,7 @@ def _scatter(kernel: TraceContext, side: Side, walk: Walk, vertex: Vertex, step,
     active &= (brightest > 0) & ~broken
     useful = None
     if sds is not None and sds.survived is not None:
-        useful, sds = side.sds.survival(kernel, sds, partial, vertex)
+        useful, sds = side.sds.survival(sds, partial, vertex)
     elif side.isolated and sds is not None:
         active &= sds.isolated
     if side.only_specular:
@@ -353,7 +353,7 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
     state, h = vertex.sds, kernel.heuristic
     if side.sds.merges:
         kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
-        kappa_eta = side.sds.kappa_eta(kernel, vertex)
+        kappa_eta = side.sds.kappa_eta(vertex)
         return state, *mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
     if state is None:
         return None, 0, 0
