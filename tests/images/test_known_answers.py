@@ -52,7 +52,7 @@ WAYS = {
     "one": {"skip": "impossible", "light_paths": 1, "connections": "one"},
     "every": {"skip": "impossible", "light_paths": 1, "connections": "all"},
 }
-MEDIA = "all", "default", "camera"
+MEDIA = "all", "camera"
 
 
 def pixels(images):
@@ -681,7 +681,7 @@ def meter_around_a_lamp(medium, **more):
     return {"wall": fogs.wall(bsdf=matte(0), sensor=meter(medium=medium)), "lamp": lamp, **more}
 
 
-@known("all", "default", of=METERS)
+@known("all", of=METERS)
 def meter_in_fog(kind):
     """t = 0 and the last edge of light subpaths, which ends before the flight does (in coloured grids there
     is none): of albedo 1 all light arrives on the black sphere, which camera subpaths alone cannot find."""

@@ -217,8 +217,11 @@ GLOBES = {
 }
 
 
-@pytest.mark.parametrize("way", [{}, {"light_paths": 0}, {"heuristic": "power"}], ids=str)
-@pytest.mark.parametrize("globe", GLOBES)
+@pytest.mark.parametrize(
+    "globe, way",
+    [*((globe, {}) for globe in GLOBES), ("grid", {"light_paths": 0}), ("coloured", {"heuristic": "power"})],
+    ids=str,
+)
 def test_a_globe_of_white_fog_is_invisible(globe, way, monkeypatch):
     """Glass around a medium of albedo 1 inside of a glowing sphere, all vertices merged; balls at the surface
     lack 0.5 % of the image's light."""

@@ -236,7 +236,6 @@ MASK = {"type": "mask", "opacity": 0.6, "nested": PLASTIC}
 # Scene, its integrator by Mitsuba, longest paths, our ways.
 SCENES = {
     "rough metal and plastic": (lambda: room(floor(ROUGH), ball(PLASTIC)), "path", 5, WAYS),
-    "glass": (lambda: room(floor(PLASTIC), ball(GLASS)), "path", 5, (ALL,)),
     "mirror and filters": (lambda: room(floor(ROUGH), ball(MIRROR), *FILTERS), "path", 5, (ALL,)),
     "two sides, mask": (lambda: room(TWO_SIDES, ball(MASK)), "path", 5, WAYS[2:]),
     "gold in four wavelengths": (lambda: room(floor(GOLD), ball(GLASS)), "path", 4, (ALL,)),

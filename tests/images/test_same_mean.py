@@ -791,7 +791,8 @@ MANY_PHOTONS = ("mitsuba_bdpt.merging.passes.SAMPLES_PER_PHOTON", 1)
 NEVER = {"guiding": "never"}
 
 
-@same("guided 4", "merged", of=sds.NEAR_SPECULAR)
+@same("guided 4", of=("alpha .005", "blend", "bumpy", "coated floor", "lens", "ramp"))
+@same("merged", of=[case for case in sds.NEAR_SPECULAR if case != "alpha .03"])
 def near_specular(case):
     """Which strategy finds a path changes with guiding, gate, weights and bounds; across the gate (a ramp of
     alpha) nothing may jump."""
@@ -911,7 +912,7 @@ def coloured_pool_in(variant):
     return pool("coloured")
 
 
-@same(*(f"small balls, {way}" for way in (*CHOICES, "quarter", "three vertices", "independent", "roulette")))
+@same(*(f"small balls, {way}" for way in (*CHOICES, "quarter, three vertices, independent, roulette")))
 def pool_by():
     """Merges of half of the light, where they dominate."""
     return under_water(fogs.fog(1, 0.8), patched=(MANY_PHOTONS,))

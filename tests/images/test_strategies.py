@@ -198,8 +198,6 @@ MEDIA = {
     "mask": in_fog(mask),
     "nested": in_fog(nested),
     "grid": in_fog(lambda: lit(ball=cloud()), 4),
-    "sun and sky": in_fog(lambda: fogs.outdoors(sun=fogs.sun(), sky=fogs.sky())),
-    "glass": in_fog(lambda: in_a_ball(fogs.fog(3, 0.7), "dielectric", fogs.lamp)),
     "chromatic ball": in_fog(lambda: in_a_ball(fogs.coloured(6.0)), 0, "volpathmis"),
     "grid and chromatic": in_fog(chromatic_cloud, 0, "volpathmis"),
     "ball": in_fog(lambda: in_a_ball(fogs.fog(4, 0.9), light=fogs.lamp), 4, ""),

@@ -29,7 +29,7 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2848, "tests": 28471}
+OUTSIDE = {"scripts": 2848, "tests": 28475}
 MOST_WORDS = 30430
 
 

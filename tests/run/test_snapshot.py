@@ -64,12 +64,12 @@ def test_pilots_and_decisions_go_on(monkeypatch, blind):
         monkeypatch.setattr(choice, "choose", lambda *of: [])
     target = scene()
     whole = bdpt(spp_per_pass=8)
-    expected = np.array(whole.render(target, seed=1, spp=256))
+    expected = np.array(whole.render(target, seed=1, spp=128))
     assert len(whole.statistics["decisions"]) == 1 - blind
-    start = stopped(bdpt(spp_per_pass=8), target, 6, seed=1, spp=256)
+    start = stopped(bdpt(spp_per_pass=8), target, 6, seed=1, spp=128)
     resumed = bdpt(spp_per_pass=8)
     anew = scene()  # of which no pilot is remembered
-    image = np.array(resumed.render(anew, seed=1, spp=256, start=start))
+    image = np.array(resumed.render(anew, seed=1, spp=128, start=start))
     assert resumed.statistics["decisions"] == whole.statistics["decisions"]
     assert resumed.statistics["passes"] == whole.statistics["passes"]
     np.testing.assert_allclose(image, expected, **ROUNDING)
