@@ -1,4 +1,4 @@
-"""`bdpt` beside other renderers at equal processor time: docs/reports/peers.json and its tables.
+"""`bdpt` beside other renderers at equal time: docs/reports/peers.json and its tables.
 
     python scripts/peers.py --peers /opt/peers/bin/python --smallvcm /opt/SmallVCM/smallvcm
     python scripts/peers.py cornell_box --methods bdpt PATHCPU --seconds 5 --peers /opt/peers/bin/python
@@ -59,6 +59,7 @@ METHODS = {
 NEEDS = {"shadow caustics": {"glass"}, "PATHCPU, caustic cache": {"glass", "mirror"}}
 # A reference that is made here is two halves. How long a half takes, in times of an image.
 HALVES = {"ajar_door": 10, "veach_bidir": 2}
+SEEDS = 1, 2, 3  # the samples of the first take the seconds; SmallVCM has one built in
 HEAD = "renderer|method|samples per pixel|error|efficiency over `bdpt`|raw error|raw efficiency|mean"
 METALS = re.compile(r'<bsdf type="roughconductor"([^>]*)>.*?</bsdf>', re.DOTALL)
 GREY = r'<bsdf type="diffuse"\1><rgb name="reflectance" value="0.5"/></bsdf>'
@@ -155,14 +156,14 @@ class Renders:
         np.savez(self.folder / "scene.npz", scene=json.dumps(scene), **arrays)
 
     def __call__(
-        self, renderer: str, method: str, seed: int = 1, times: float = 1
+        self, renderer: str, method: str, seed: int = 1, times: float = 1, spp: int | None = None
     ) -> tuple[np.ndarray, dict]:
-        """An image of ``times`` the processor seconds, (SIZE, SIZE, 3), and its figures."""
+        """An image of ``spp`` samples or of ``times`` the seconds, (SIZE, SIZE, 3), and its figures."""
         kept = self.folder / re.sub(r"\W+", "_", f"{renderer} {method} {seed}")
         image, figures = kept.with_suffix(".npy"), kept.with_suffix(".json")
         if not figures.exists():
             job = {"renderer": renderer, "method": METHODS[renderer][method], "seconds": times * self.seconds}
-            job |= {"seed": seed, "program": self.programs[renderer]}
+            job |= {"seed": seed, "spp": spp, "program": self.programs[renderer]}
             python = sys.executable if renderer in ("mitsuba", "smallvcm") else self.programs[renderer]
             words = [python, ADAPTERS, self.folder / "scene.npz", json.dumps(job), image]
             said = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True).stdout
@@ -172,27 +173,32 @@ class Renders:
     def reference(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """A reference and half the difference of its halves."""
         if self.changed:
-            a, b = (self("mitsuba", "bdpt", seed, HALVES[name])[0] for seed in (2, 3))
+            a, b = (self("mitsuba", "bdpt", seed, HALVES[name])[0] for seed in (8, 9))
             return (a + b) / 2, (a - b) / 2
         stored = repository.load_reference(name, SIZE, self.depth)
         return stored.image, stored.difference
 
 
 def measured(name: str, renders: Renders, wanted: list[str]) -> list[dict]:
-    """The rows of a scene. The reference's own noise is taken off the errors."""
+    """The rows of a scene, means over seeds. The reference's own noise is taken off the errors."""
     rows = []
+    reference, difference = renders.reference(name)
     jobs = [(renderer, m) for renderer in renders.programs for m in METHODS[renderer]]
     for renderer, method in sorted(jobs, key=lambda job: [*METHODS[job[0]]].index(job[1])):
         if (wanted and method not in wanted) or (renderer == "smallvcm" and SCENES[name] is None):
             continue
         if NEEDS.get(method, renders.kinds).isdisjoint(renders.kinds):
             continue
-        image, figures = renders(renderer, method)
-        reference, difference = renders.reference(name)
-        row = {"scene": name, "renderer": renderer, "method": method} | figures
-        row["mean"] = float(image.mean() / reference.mean())
-        for key, trim in (("trimmed", TRIM), ("raw", 0.0)):
-            row[key] = rel_mse(image, reference, trim) - reference_rel_mse(difference, image, reference, trim)
+        found, spp = [], None
+        for seed in SEEDS[: 1 if renderer == "smallvcm" else None]:
+            image, figures = renders(renderer, method, seed, spp=spp)
+            spp, figures["mean"] = figures["spp"], image.mean() / reference.mean()
+            for key, trim in (("trimmed", TRIM), ("raw", 0.0)):
+                own = reference_rel_mse(difference, image, reference, trim)
+                figures[key] = rel_mse(image, reference, trim) - own
+            found.append(figures)
+        row = {"scene": name, "renderer": renderer, "method": method, "spp": spp}
+        row |= {key: float(np.mean([f[key] for f in found])) for key in found[0] if key != "spp"}
         rows.append(row)
         print(json.dumps(row), flush=True)
     return rows
@@ -205,10 +211,10 @@ def tables(record: dict) -> str:
         rows = [row for row in record["rows"] if row["scene"] == name]
         (ours,) = [row for row in rows if row["method"] == "bdpt"]
         cells = []
-        for row in sorted(rows, key=lambda row: row["cpu"] * row["trimmed"]):
+        for row in sorted(rows, key=lambda row: row["wall"] * row["trimmed"]):
             cells.append([row["renderer"], f"`{row['method']}`", f"{row['spp']}"])
             for key in ("trimmed", "raw"):
-                gain = ours["cpu"] * ours[key] / (row["cpu"] * row[key])
+                gain = ours["wall"] * ours[key] / (row["wall"] * row[key])
                 cells[-1] += [f"{row[key]:.2g}", f"{gain:.2g}"]
             cells[-1] += [f"{row['mean']:.3f}", f"{row['first']:.1f} s", f"{row['prepared']:.1f} s"]
         texts.append(f"### `{name}`\n\n" + table([*HEAD.split("|"), "first image", "preparation"], cells))
@@ -221,7 +227,7 @@ def main() -> int:
     parser.add_argument("--peers", help="Python with bpy and pyluxcore")
     parser.add_argument("--smallvcm", help="program of SmallVCM")
     parser.add_argument("--methods", nargs="+", default=[], metavar="METHOD")
-    parser.add_argument("--seconds", type=float, default=6.0, help="processor seconds of an image")
+    parser.add_argument("--seconds", type=float, default=3.0, help="of an image")
     options = parser.parse_args()
     mi.set_variant("llvm_ad_rgb")
     programs = {"mitsuba": sys.executable, "cycles": options.peers, "luxcore": options.peers}

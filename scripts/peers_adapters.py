@@ -200,7 +200,7 @@ def smallvcm(scene: dict, method: dict) -> Render:
 
 
 def main() -> None:
-    """Render the job: first a few samples, then as many as take its processor seconds."""
+    """Render the job: first a few samples; then as many as it says, or as take its seconds."""
     parser = command_line.parser(__doc__)
     for name, kind in (("scene", np.load), ("job", json.loads), ("output", Path)):
         parser.add_argument(name, type=kind)
@@ -209,20 +209,22 @@ def main() -> None:
     scene = json.loads(str(stored["scene"])) | {"program": job["program"]}
     for i, shape in enumerate(scene["shapes"]):
         shape |= {name: stored[f"{name}{i}"] for name in ARRAYS}
-    began = processor()
+    began = time.perf_counter()
     render = globals()[job["renderer"]](scene, job["method"])
-    prepared = processor()
+    prepared = time.perf_counter()
     n, seed, taken = 4, job["seed"] * 100, 0.0
     render(n, seed)
-    first = processor() - began
+    first = time.perf_counter() - began
     while taken < 0.8 * job["seconds"]:
-        n = round(n * min(8, max(1.3, job["seconds"] / taken))) if taken else 16
+        n = job["spp"] or (round(n * min(8, max(1.3, job["seconds"] / taken))) if taken else 16)
         seed += 1
-        started, wall = processor(), time.perf_counter()
+        cpu, started = processor(), time.perf_counter()
         image = render(n, seed)
-        taken, wall = processor() - started, time.perf_counter() - wall
+        cpu, taken = processor() - cpu, time.perf_counter() - started
+        if job["spp"]:
+            break
     np.save(options.output, image.astype(np.float32))
-    figures = {"spp": n, "cpu": taken, "wall": wall, "first": first, "prepared": prepared - began}
+    figures = {"spp": n, "cpu": cpu, "wall": taken, "first": first, "prepared": prepared - began}
     print("ANSWER", json.dumps(figures), flush=True)
     os._exit(0)  # LuxCore's threads abort when Python ends
 

@@ -29,8 +29,8 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2848, "tests": 28475}
-MOST_WORDS = 30430
+OUTSIDE = {"scripts": 2856, "tests": 28475}
+MOST_WORDS = 30452
 
 
 def _lines(files):
