@@ -5,7 +5,7 @@ the kernel (`sds.PhotonStrategy`). `estimate` estimates the light that no other 
 """
 
 from .passes import Passes, why_not
-from .undersampled import GUIDABLE, Guidable, Undersampled
+from .undersampled import Guidable, Undersampled
 from .unsampled import Estimate, Unsampled, estimate
 
-__all__ = ["GUIDABLE", "Estimate", "Guidable", "Passes", "Undersampled", "Unsampled", "estimate", "why_not"]
+__all__ = ["Estimate", "Guidable", "Passes", "Undersampled", "Unsampled", "estimate", "why_not"]

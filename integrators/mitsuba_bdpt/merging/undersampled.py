@@ -25,9 +25,7 @@ FEWEST = 0.1  # expected samples per pixel below which light is undersampled
 # outliers).
 KINDS = (0.0, FEWEST, 1.0)
 
-# What photons can guide s = 0 to find: SDS light, second and fourth moments of its samples without guiding
-# (mean over the colours), vertices at which s = 0 is guided, and the light that s = 0 does not find.
-GUIDABLE = ("light", "second", "fourth", "vertices", "rare")
+_SUMS = 5  # of `Guidable` per tile of the film
 
 
 @dataclass
@@ -80,9 +78,9 @@ class Undersampled(Unsampled):
 class Guidable(Undersampled):
     """Which merges are on paths that photons can guide.
 
-    Camera subpaths go on as long as no edge is connectible, and merge where s = 0 can be guided. ``sums`` of
-    `GUIDABLE` over camera samples by tile of the film, ``tiles`` per direction; with fewer than ``rarest``
-    expected samples in a pixel s = 0 does not find the light.
+    Camera subpaths go on as long as no edge is connectible, and merge where s = 0 can be guided. ``sums``
+    over camera samples by tile of the film, ``tiles`` per direction: fields of `moments.GuidableLight`. Light
+    is ``rare`` with fewer than ``rarest`` expected samples in a pixel.
     """
 
     rarest: mi.Float
@@ -92,7 +90,7 @@ class Guidable(Undersampled):
     def of(samples: float, rarest: float = 0.0, tiles: int = 1) -> Guidable:
         """Empty sums for a render of ``samples`` per pixel."""
         given, rare = (dr.opaque(mi.Float, x) for x in (samples, rarest))
-        return Guidable(given, dr.zeros(mi.Float64, tiles**2 * len(GUIDABLE)), rare, tiles)
+        return Guidable(given, dr.zeros(mi.Float64, tiles**2 * _SUMS), rare, tiles)
 
     def begin(self, kernel, e, walk):
         return replace(walk, active=walk.active & ~e.delta)  # s = 0 samples no others

@@ -91,8 +91,8 @@ class Moments:
 class GuidableLight(NamedTuple):
     """SDS light that photons can guide s = 0 to find, per camera sample, by fine tile.
 
-    Moments are those of s = 0 without guiding; s = 0 is guided at ``vertices``. ``rare``: see
-    `unsampled_light.FEWEST_HITS`.
+    ``light``: mean over the colours; ``second``, ``fourth``: moments of its samples by s = 0 without guiding;
+    ``vertices``: number at which s = 0 is guided; ``rare`` part of ``light``: `unsampled_light.FEWEST_HITS`.
     """
 
     light: np.ndarray

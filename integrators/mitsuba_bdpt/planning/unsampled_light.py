@@ -208,7 +208,7 @@ def guidable(prepared: PreparedScene, plan: Plan, settings: Settings, spp: int, 
     rarest = fewest / int(prepared.camera.region.size.prod())
     policy = components.merging.Guidable.of(max(spp, PREVIEW), rarest, FINE)
     _, lanes = _merged(prepared, replace(plan, guided=0, merging=False), settings, spp, policy)
-    return GuidableLight(*np.array(policy.sums).reshape(-1, len(components.merging.GUIDABLE)).T / lanes)
+    return GuidableLight(*np.array(policy.sums).reshape(FINE**2, -1).T / lanes)
 
 
 def _merged(
