@@ -1,10 +1,10 @@
 """Vertex merging (photon mapping) of paths that merges dominate; consistent, not unbiased.
 
-Source: Georgiev 2012, see `mis`. A photon within a radius of the camera vertex counts as if it were there.
-Two bounds from one side leave out most photons and camera vertices of other paths, without bias
-(docs/method/sds_paths.md, "Bounds"):
+Source: Georgiev 2012, see `mis`; in media docs/method/merging_in_media.md. A photon within a radius of the
+camera vertex counts as if it were there. Two bounds from one side leave out most photons and camera vertices
+of other paths, without bias (docs/method/sds_paths.md, "Bounds"):
 
-* A merge needs B times the connections of both of its own edges, each of which one side knows.
+* A merge counts if its kappa eta is at least B times c of both adjacent edges, one from each side.
 * Photons, photon subpaths and camera vertices play Russian roulette with the ratio of the merge to the older
   alternatives of their side at a diffuse surface. The estimate of a merge is then at most 1 / SLACK times
   that at a diffuse surface: its density, and with it its BSDF, is as small as the probability.
@@ -52,10 +52,10 @@ _FLAT, _SAME_SURFACE = 0.25, 0.8
 class Merging(PhotonStrategy, PhotonPolicy):
     """Vertex merging in one pass; stores photons at all vertices where merges may count.
 
-    ``radius`` of the discs; ``count``: photon subpaths that can be merged with a camera subpath; ``kappa``:
+    ``radius`` of discs (surfaces); ``count``: photon subpaths that merge with a camera subpath; ``kappa``:
     coefficient of merges in all weights, see `coefficient`; ``photons``: `Photons`, None while they are
     traced; ``wavelengths``: `WavelengthSets` in spectral variants, where photons merge with camera subpaths
-    of the same set; ``balls``: radius in media, None if none scatters. Numbers are opaque ``Float``.
+    of the same set; ``balls``: radius in media, None if no medium scatters. Numbers are opaque ``Float``.
     """
 
     radius: Radius
@@ -70,15 +70,15 @@ class Merging(PhotonStrategy, PhotonPolicy):
     only_specular = 0.0
 
     def around(self, p: mi.Point3f, volume: mi.Bool, medium) -> tuple[mi.Float, Radius]:
-        """The radius at ``p`` of a disc, in a ``volume`` of a ball in ``medium``; `Radius` that bounds it."""
+        """Radius at ``p`` (scene units) of a disc, in a ``volume`` of a ball; the `Radius` that bounds it."""
         if self.balls is None:
             return self.radius.at(p), self.radius
         return self.balls.at(p, dr.select(volume, medium, mi.UInt32(0)), self.radius)
 
     def eta(self, vertex) -> mi.Float:
-        """Number of subpaths times the area of the disc at ``vertex`` (scene units squared).
+        """n pi r^2 at a ``vertex`` on a surface, n 4/3 pi r^3 times mean extinction in a volume.
 
-        In a volume times the volume of the ball and the medium's mean extinction, see `Photon.flux`.
+        In scene units squared; n: ``count``. See docs/method/merging_in_media.md.
         """
         r, _ = self.around(vertex.si.p, vertex.volume, vertex.medium)
         disc = self.count * dr.pi * dr.square(r)
@@ -89,7 +89,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
 
     def kappa_eta(self, vertex):
         disc = self.kappa * (self.count * dr.pi * dr.square(self.radius.at(vertex.si.p)))
-        if self.balls is not None:  # as many camera vertices share its photons, or this is the only one
+        if self.balls is not None:  # kappa of a ball: a disc's over the probability of a collision, at most 1
             disc = dr.select(vertex.volume, dr.minimum(self.eta(vertex), disc), disc)
         return dr.minimum(disc, mis.SATURATION)
 
@@ -103,22 +103,19 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return replace(walk, sds=State(survived=mi.Float(1)))
 
     def survival(self, state, partial, vertex):
-        # Whichever is larger, since it may go on to where pixels are larger.
+        # Also at the median radius: the subpath may go on to where discs are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
         most = dr.maximum(self.kappa_eta(vertex), median)
         survived = dr.minimum(state.survived, _probability(partial.d_vc, most))
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
-        """Mask: a merge at ``vertex`` may count, as far as its side knows.
-
-        ``connection``: c of the edge to it.
-        """
+        """Mask: by its side alone a merge at ``vertex`` may count; ``connection``: c of the edge to it."""
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
         return possible & mis.exceeds(self.kappa_eta(vertex), connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
-        """Probability with which merges at ``vertex`` are sampled; given that its subpath ``survived``."""
+        """Probability of sampling merges at ``vertex``, over that with which its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
         return dr.minimum(_probability(d_vc, self.kappa_eta(vertex)) / survived, 1)
 
@@ -130,8 +127,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
 
     def is_merged(self, kernel, z, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))
-        asks = self.may_merge(kernel, z, _connection(kernel, z))
-        return asks & (sequential(word)[0] < self.kept(kernel, z))
+        possible = self.may_merge(kernel, z, _connection(kernel, z))
+        return possible & (sequential(word)[0] < self.kept(kernel, z))
 
     def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
@@ -208,9 +205,8 @@ def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None
     """Index of the cell at ``p`` in the grid ``level``, for a set of wavelengths.
 
     Cells are at least as wide as the discs of nearby camera vertices and of their photons, so that a disc
-    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these, ``p`` being the disc's lowest
-    coordinates then. Coordinates are taken modulo
-    2^20: cells of equal index lie far apart, also those of different sets.
+    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these, ``p`` being the lowest corner
+    of its box. Coordinates are modulo 2^20: cells of equal index lie far apart, also of different sets.
     """
     width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
     cell, number = mi.Point3i(dr.floor(p / width)), mi.UInt64(level)
@@ -234,8 +230,8 @@ def bucket_of(cell: mi.UInt64) -> mi.UInt32:
 class Sample:
     """A photon drawn for a camera vertex.
 
-    ``f``: the BSDF (an `Evaluation`) towards it; ``value``: estimate of all merges of the vertex, without
-    weight; ``number``: estimate of the number of photons near it.
+    ``f``: BSDF or phase function (an `Evaluation`) towards it; ``value``: estimate of all merges of the
+    vertex, without weight; ``number``: estimate of the number of photons near it.
     """
 
     photon: Photon
@@ -246,9 +242,9 @@ class Sample:
 
 
 def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wavelength_set=None) -> Sample:
-    """Draw a photon near the camera vertex ``z`` by flux.
+    """Draw a photon near the camera vertex ``z`` in proportion to its flux.
 
-    Estimates the merges with all of its ``wavelength_set``, see `inputs.Shared`.
+    `Sample.value` estimates the merges with all photons of the ``wavelength_set``, see `inputs.Shared`.
     """
     word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(1))
     chosen, total = _draw(merging, z, kernel.last_merged - z.edges, word, wavelength_set)
@@ -256,7 +252,7 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
     photon = merging.photons.found.at(chosen, active)
     f = scattering.evaluate(kernel, z, z.si.to_local(photon.d), active)
     eta = merging.eta(z)
-    # Per area of the surface: irradiance on the disc, since f |cos| is per solid angle.
+    # The value of a BSDF contains |cos|, as the flux through a disc does; both are 1 in a volume.
     estimate = (photon.flux / size_of(photon.flux)) * (total / (eta * z.cosine(photon.d)))
     value = z.throughput * f.value * estimate
     return Sample(photon, f, value, active & ~spectra.is_zero(value), total / size_of(photon.flux))
@@ -264,7 +260,7 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
 
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
-    """Draw a photon of at most ``most`` edges in the disc at ``z`` by flux; its index, total flux."""
+    """Draw a photon of up to ``most`` edges in the disc or ball at ``z`` by flux; its index, total flux."""
     photons = merging.photons
     r, radius = merging.around(z.si.p, z.volume, z.medium)
     lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
@@ -286,7 +282,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
 
         tried = place < end
         photon = photons.found.at(place, tried)
-        near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # others share its bucket
+        near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # cells may share a bucket
         near &= _is_near(photon, z, r) & (photon.edges <= most)
         size = dr.select(near, size_of(photon.flux), 0)
         u, after = sequential(word)

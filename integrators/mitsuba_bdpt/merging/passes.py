@@ -19,16 +19,16 @@ from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coeffici
 from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
-SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Which paths are merged")
+SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Vertex merging")
 
 # Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
 _PER_DISC = 64
 
-# Samples per pixel of a pass, of one that merges many vertices, and least samples of a pass: merges grow with
-# their square (experiments, "Which paths are merged").
+# Samples per pixel of a pass; with near-specular lobes or without light subpaths, where many vertices merge;
+# least samples of a pass. Merged photons grow with their square (experiments, "Which paths are merged").
 _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 
-# Without pixels (meters): least photon subpaths of a pass, and pixels of a film with as small a radius.
+# Where pixels have no size (meters): least photon subpaths of a pass; samples that count as one per pixel.
 _METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
 
 _EDGES_BITS, _LANE_BITS = 12, 32  # bits of the edges and of the subpath's index in the sort key of photons
@@ -45,9 +45,9 @@ def why_not(sensor: mi.Sensor) -> str:
 
 
 class Passes:
-    """Vertex merging in one render of ``pixels`` pixels; ``near_specular``: the scene has such lobes.
+    """Vertex merging in one render of ``pixels`` pixels.
 
-    ``best_pass``: samples per pixel of a pass.
+    ``near_specular``: the scene has near-specular lobes; ``best_pass``: samples per pixel of a pass.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Passes:
         per_pixel = _SHORT_PASS if near_specular or settings.light_paths == 0 else _PASS
         self.best_pass = max(per_pixel, _LEAST_SAMPLES // pixels)
         self._footprints = Footprints.of(scene, sensor)
-        # Densities decide where the light of an even sky is merged.
+        # Photons of a uniform environment too: weights decide where its light is merged.
         self._aim = replace(aim, no_sky=False)
         self._radius, self._pixels = settings.internals.merging_radius, pixels
         self._uncropped = max(pixels, film_pixels(sensor))
@@ -72,8 +72,8 @@ class Passes:
     ) -> tuple[Merging, mi.UInt64]:
         """Trace the photons of a pass; returns its strategy, and counters.
 
-        ``samples`` of each pixel; ``done``: earlier ones, in all parts of the image, from which the radius
-        follows; ``start``: see `WavelengthSets.of`, in spectral variants.
+        ``samples`` per pixel of the pass, ``done`` before it in all parts of the image: their sum gives the
+        radius. ``start``: see `WavelengthSets.of`, None but in spectral variants.
         """
         end = done + samples
         if self._footprints.measured:
@@ -88,7 +88,7 @@ class Passes:
             sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)
             count = max(count // sets, 1) * sets
         kappa = coefficient(samples / sets, radius)
-        # Photons beyond those of the samples would make ordinary paths merge-dominated.
+        # Photon subpaths beyond one per `SAMPLES_PER_PHOTON` would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
         kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
         balls = self._footprints.balls(after(BALLS * self._radius, end, 3), kernel.space)
@@ -113,7 +113,7 @@ def trace(
 
 
 def sort(merging: Merging, photons: Photon, count: int) -> Photons:
-    """Sort the first ``count`` photons by bucket, subpath and edge: deterministic."""
+    """Sort the first ``count`` photons by bucket, then subpath and edge: independent of threads."""
     index = dr.arange(mi.UInt32, max(count, 1))  # without photons one in no bucket
     found = photons.at(index)
     volume = mi.Bool(False) if found.medium is None else found.medium != 0

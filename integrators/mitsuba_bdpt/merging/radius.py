@@ -22,26 +22,25 @@ _LOWEST, _HIGHEST = 1 / 8, 8
 # Radius in diagonals of the scene where no pixels can be measured (meters, custom sensors, empty views).
 _OF_DIAGONAL = 1 / 64
 
-# Samples per pixel after which the radius is that of the parameters, and `BALLS` times as large in media.
+# Samples per pixel after which discs have the radius of the parameters, and balls in media `BALLS` times it.
 _OF_SAMPLES, BALLS = 64, 3.0
 
-# Bound of a ball's radius in mean free paths: balls of dense media would hold many photons, and reach beyond
-# the boundary from most of their vertices.
+# Bound of a ball's radius in mean free paths; see experiments, "Merging in media".
 MEAN_FREE_PATHS = 0.2
 
 
 def after(radius: float, samples: float, dimensions: int = 2) -> float:
     """Radius of a pass that ends after ``samples`` per pixel; ``radius`` after `_OF_SAMPLES`.
 
-    Variance falls with samples * radius^``dimensions``, the square of the bias with radius^4: the least sum
-    has a radius of samples^(-1 / (dimensions + 4)), which is alpha = 2/3 in discs, 4/7 in balls (C. Knaus and
+    Variance is proportional to 1 / (samples radius^``dimensions``), squared bias to radius^4. The least sum
+    has a radius of samples^(-1 / (dimensions + 4)): alpha = 2/3 in discs, 4/7 in balls (C. Knaus and
     M. Zwicker, "Progressive Photon Mapping: A Probabilistic Approach", 2011, eq. 15).
     """
     return radius * (samples / _OF_SAMPLES) ** (-1 / (dimensions + 4))
 
 
 def film_pixels(sensor: mi.Sensor) -> int:
-    """Number of pixels of the whole film: photons do not know the crop window."""
+    """Number of pixels of the whole film: photons reach the scene beyond the crop window too."""
     return math.prod(sensor.film().size())
 
 
@@ -73,7 +72,7 @@ class Radius:
 
     @property
     def median(self) -> mi.Float:
-        """The radius at the median distance of what camera rays meet first."""
+        """Radius of the median pixel over the first hits of camera rays (scene units)."""
         return self.high / _HIGHEST
 
     @property
@@ -84,24 +83,27 @@ class Radius:
 
 @dataclass
 class Balls:
-    """The ``radius`` in participating ``media``, smaller where these are dense."""
+    """The ``radius`` in participating ``media``, in harmonic sum with `MEAN_FREE_PATHS`."""
 
     radius: Radius
     media: Any
 
-    def at(self, p: mi.Point3f, medium: mi.UInt32, outside: Radius) -> tuple[mi.Float, Radius]:
-        """The radius at ``p`` (scene units) in a ``medium``, or on a surface (0) that of ``outside``.
+    def at(self, p: mi.Point3f, medium: mi.UInt32, discs: Radius) -> tuple[mi.Float, Radius]:
+        """Radius at ``p`` (scene units) of a ball in ``medium``, or on a surface (0) of ``discs``.
 
-        Also the `Radius` of all media, which is an upper bound.
+        Also the `Radius` without the bound by mean free paths, which is at least as large.
         """
-        radius = dr.select(medium != 0, self.radius, outside)
+        radius = dr.select(medium != 0, self.radius, discs)
         r = dr.rcp(dr.rcp(radius.at(p)) + self.media.mean(medium) / MEAN_FREE_PATHS)
         return dr.maximum(r, offset_at(dr.max(dr.abs(p)))), radius
 
 
 @dataclass(frozen=True)
 class Footprints:
-    """Size of pixels: ``base`` + ``angle`` times distance from ``centre``; ``median``; if ``measured``."""
+    """Size of a pixel (scene units): ``base`` + ``angle`` times the distance from ``centre``.
+
+    ``median`` over the first hits of camera rays; without ``measured`` pixels `_OF_DIAGONAL`.
+    """
 
     centre: tuple[float, float, float]
     base: float
@@ -119,7 +121,7 @@ class Footprints:
         return radius
 
     def balls(self, factor: float, space) -> Balls | None:
-        """The radius of ``factor`` pixels in the media of a `vacuum.Vacuum`; None if none scatters."""
+        """The radius of ``factor`` pixels in the media of ``space`` (a `Vacuum`); None if none scatters."""
         return None if space.phase is None else Balls(self.radius(factor), space.media)
 
     @staticmethod

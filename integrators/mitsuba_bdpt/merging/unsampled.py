@@ -100,7 +100,7 @@ def estimate(
     balls = footprints.balls(of_samples * BALLS, kernel.space)
     met = dr.opaque(mi.Float, count / sets)
     merging = Merging(discs, met, mi.Float(1), wavelengths=wavelengths, balls=balls)
-    unmerged = PhotonStrategy()  # weights know of no merges
+    unmerged = PhotonStrategy()  # no merges in the weights
     unmerged.wavelengths = wavelengths
     kernel = kernel.replaced(sds=unmerged, last_light=kernel.max_depth)
     traced = photon_pass.trace(kernel, policy, aim, photon_points, count)
@@ -127,7 +127,7 @@ def _merged(kernel: TraceContext, merging: Merging, batch: Batch, policy: Unsamp
         value = dr.select(active, mi.unpolarized_spectrum(found.value) + flaw, 0)
         for i in range(channels):
             index = found.photon.emitter * channels + i
-            # Other modes leave out NaN.
+            # Other modes drop NaN.
             mode = dr.ReduceMode.Direct
             dr.scatter_reduce(dr.ReduceOp.Add, sums, mi.Float64(value[i]), index, active, mode)
         return size + dr.sum(value)

@@ -52,7 +52,7 @@ class Aim:
     def emission(self, emitters: Emitters, u_point, u_direction, shared) -> tuple[Emission, mi.Float]:
         """Sample emissions of photons; also the emitter's own density over the mixture's.
 
-        ``pdf_second`` of the emissions is the emitter's own: weights do not know of the aim.
+        ``pdf_second`` of the emissions is the emitter's own: weights leave the aim out.
         """
         number = None
         if self.spheres:

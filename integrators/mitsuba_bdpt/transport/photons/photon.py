@@ -13,14 +13,14 @@ import mitsuba as mi
 class Photon:
     """A stored light vertex, or arrays of many.
 
-    ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal; ``flux``:
-    throughput, not divided by the number of subpaths; in a volume times mean extinction over scattering
-    coefficient, that is as it arrives if the medium is homogeneous; ``medium``: number of that of a volume, 0
-    on surfaces, None without media. Partial sums, see `mis`: ``connection`` (c), its
+    ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal, 0 in a volume;
+    ``flux``: throughput, not divided by the number of subpaths, in a volume times mean extinction over
+    sigma_s (in homogeneous media the throughput before scattering); ``medium``: number of the medium in a
+    volume, 0 on surfaces, None if no medium scatters. Partial sums, see `mis`: ``connection`` (c), its
     ``d_vcm`` times the coefficient of the connection of the last edge; ``d_vc``, ``d_vm``, ``d_vm_newest``.
-    ``aim``: the emitter's own density of the first direction over that of `Aim`;
-    ``distance``: length of the edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``:
-    index in the scene; ``layer`` of its subpath before the event at it, see `path_layers`.
+    ``aim``: the emitter's own density of the first direction over that of `Aim`; ``distance``: length of the
+    edge to it; ``edges`` up to it; ``lane``: index of its subpath; ``emitter``: index in the scene; ``layer``
+    of its subpath before the event at it, see `path_layers`.
     """
 
     p: mi.Point3f
@@ -41,7 +41,7 @@ class Photon:
 
     @staticmethod
     def zeros(count: int, media: bool = False) -> Photon:
-        """Memory for ``count`` photons, in scenes with ``media`` or without."""
+        """Memory for ``count`` photons; ``media``: some medium of the scene scatters."""
         # Dr.Jit would keep the types of the first variant in use.
         kinds = get_type_hints(Photon) | {"medium": mi.UInt32 if media else None}
         return Photon(**{name: kind and dr.zeros(kind, count) for name, kind in kinds.items()})
