@@ -57,6 +57,7 @@ class Space(Vacuum):
         mei = interaction(vertex.si.p, d, vertex.si)
         sigma_s, _ = self.media.query(vertex.medium, coefficients, mei, vertex.volume)
         ratio = dr.select(vertex.volume, self.media.mean(vertex.medium) / sigma_s, 1)
+        # The throughput contains sigma_s: 0 in channels that do not scatter.
         ratio = mi.UnpolarizedSpectrum(dr.select(vertex.volume & (sigma_s == 0), 0, ratio))
         number = dr.select(vertex.volume, vertex.medium, mi.UInt32(0))
         return polarization.scaled(vertex.throughput, ratio), number

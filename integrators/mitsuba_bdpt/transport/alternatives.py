@@ -42,7 +42,7 @@ def has_lobe(kernel: TraceContext, vertex) -> mi.Bool:
 
 
 def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
-    """Mask: ``vertex`` may be the diffuse one of an SDS path, as far as its side knows.
+    """Mask: by its side alone ``vertex`` may be the diffuse one of an SDS path.
 
     It has a lobe (`has_lobe`), and no strategy in use connects an edge up to it.
     """
@@ -58,7 +58,7 @@ def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
 def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a) -> tuple:
     """Other strategies on the side of a connected ``vertex``.
 
-    Returns `mis.alternatives`, and with merging `mis.merges` in a tuple, which else is empty.
+    Returns `mis.alternatives`, and a tuple for `Heuristic.weigh`: `mis.merges`, empty without merging.
     """
     h, partial = kernel.heuristic, vertex.partial
     newest = newest_coefficient(kernel, vertex, adjoint)

@@ -128,13 +128,13 @@ class Heuristic:
         light_side: PartialSum,
         camera_side: PartialSum,
         merges: tuple = (),
-        own: Coefficient = 0,
+        kappa_prime: Coefficient = 0,
         tr: mi.Float | None = None,
     ) -> tuple[mi.Float, mi.Vector4f | None]:
         """`weight`, and the shares of the classes (only `ByClass`, else None).
 
-        ``merges`` at the end and at older vertices of each subpath, see `merges`, whose sum V counts where it
-        dominates; ``own``: coefficient with which those at ends are compared. ``tr``: T~ of the connected
+        ``merges``: for each subpath the pair that `merges` returns; their sum V counts where V >= B S.
+        ``kappa_prime`` of the connected edge, with which merges at its ends are compared. ``tr``: T~ of that
         edge, which the other strategies sample; None without media.
         """
         if tr is not None:
@@ -144,7 +144,7 @@ class Heuristic:
             if tr is not None:
                 at_end, older = self.scale(at_end, tr), self.scale(older, tr)
             if not is_absent(at_end):
-                at_end = dr.select(exceeds(at_end, own), at_end, 0)
+                at_end = dr.select(exceeds(at_end, kappa_prime), at_end, 0)
             v = self.combine(v, self.combine(at_end, older))
         if not is_absent(v):
             others = self.combine(self.combine(light_side, camera_side), coefficient)
@@ -248,8 +248,8 @@ def scattered_merges(
 ):
     """``d_vm`` and ``d_vm_newest`` after an event (eqs. 36, 55).
 
-    ``kappa_eta``: eta is the number of photon subpaths times the area of the disc; ``kappa_prime`` of the
-    edge to the vertex. Next to a delta event no edge is connected: the newest merge counts.
+    ``kappa_eta`` of a merge at the vertex (`Merging.eta`); ``kappa_prime`` of the edge to it. Next to a delta
+    event no edge is connected: the newest merge counts.
     """
     connection, before = h.scale(partial.d_vcm, kappa_prime), h.combine(partial.d_vm, partial.d_vm_newest)
     older = older_merges(h, partial, connection, step.pdf_rev_w)
@@ -265,10 +265,10 @@ def merges(
     pdf_a: mi.Float,
     kappa_eta: mi.Float,
 ) -> tuple[PartialSum, PartialSum]:
-    """Merges at the last vertex of a subpath, which is connected, and at older ones; see `Heuristic.weigh`.
+    """Merges at the last vertex of a subpath, which is connected, and at older ones: terms of V.
 
-    ``kappa_prime`` of the edge to that vertex; ``pdf_rev_w``, ``pdf_a``: as in `alternatives`; ``kappa_eta``:
-    there.
+    ``kappa_prime`` of the edge to that vertex; ``pdf_rev_w``, ``pdf_a``: as in `alternatives`; ``kappa_eta``
+    of a merge at it. The first is still to be compared with the connection, see `Heuristic.weigh`.
     """
     connection = h.scale(partial.d_vcm, kappa_prime)
     there = h.scale(kappa_eta, pdf_a)

@@ -65,7 +65,7 @@ class Vacuum:
         return mi.Bool(True)
 
     def before_event(self, vertex, d: mi.Vector3f) -> tuple[mi.Spectrum, Any]:
-        """`Photon.flux` and `Photon.medium` of ``vertex``, reached along ``d``."""
+        """`Photon.flux` and `Photon.medium` of ``vertex``, reached along unit ``d``, before its event."""
         return vertex.throughput, None
 
     def guessed(self, vertex, between: mi.Vector3f) -> mi.Float:
