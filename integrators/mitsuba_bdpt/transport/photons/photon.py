@@ -15,7 +15,7 @@ class Photon:
 
     ``p``: position; ``d``: unit direction towards the light's side; ``n``: geometric normal, 0 in a volume;
     ``flux``: throughput, not divided by the number of subpaths, in a volume times mean extinction over
-    sigma_s (in homogeneous media the throughput before scattering); ``medium``: number of the medium in a
+    sigma_s (in gray homogeneous media the throughput before scattering); ``medium``: number of that of a
     volume, 0 on surfaces, None if no medium scatters. Partial sums, see `mis`: ``connection`` (c), its
     ``d_vcm`` times the coefficient of the connection of the last edge; ``d_vc``, ``d_vm``, ``d_vm_newest``.
     ``aim``: the emitter's own density of the first direction over that of `Aim`; ``distance``: length of the
