@@ -45,12 +45,13 @@ class Mold:
                 parameters["value"] = value
 
 
-def molds(bsdfs: Iterable[mi.BSDF]) -> list[Mold]:
-    """Group ``bsdfs`` by all that their functions depend on but the numbers of textures."""
-    kinds: dict[Any, list[tuple]] = {}
+def molds(bsdfs: Iterable[mi.BSDF]) -> tuple[list[Mold], int]:
+    """Group ``bsdfs`` by all that their functions depend on but numbers of textures; count structures."""
+    kinds, structures = dict[Any, list[tuple]](), set()
     for bsdf in bsdfs:
-        kind, textures, values = [bsdf.flags()], [], []
-        for name, part in parts(bsdf):
+        kind, textures, values, found = [bsdf.flags()], [], [], parts(bsdf)
+        structures.add(tuple((name, part.class_name()) for name, part in found))  # names and classes of parts
+        for name, part in found:
             own, of_class = own_parameters(part), part.class_name()
             if of_class not in _PLAIN or any(dr.width(x) != 1 or dr.grad_enabled(x) for x in own.values()):
                 kind.append(id(bsdf))
@@ -61,4 +62,4 @@ def molds(bsdfs: Iterable[mi.BSDF]) -> list[Mold]:
             else:
                 kind.append((name, of_class, *((key, number(x)) for key, x in own.items())))
         kinds.setdefault(tuple(kind), []).append((bsdf, textures, values))
-    return [Mold(*map(list, zip(*members, strict=True))) for members in kinds.values()]
+    return [Mold(*map(list, zip(*members, strict=True))) for members in kinds.values()], len(structures)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..geometry import polarization
-from ..host.introspection import parts, registry_id
+from ..host.introspection import registry_id
 from ..host.molds import molds
 from . import draws
 from .draws import needs_full_pdf, nested
@@ -136,14 +136,15 @@ class BSDFDispatch:
     ray hits, and those of other scenes. They are used for `MANY` BSDFs beside few that no ray hits
     (``unhit``; None: some of ``bsdfs`` need a correction), whatever other scenes hold. Else calls go through
     Python to ``bsdfs`` alone; of `MANY` that have few kinds to one of each (`Mold`). ``apart``: a vertex
-    makes several calls.
+    makes several calls; ``kinds``: number of BSDF structures if `MANY`, else 0: BSDFs of one share the
+    functions of a kernel.
     """
 
     def __init__(self, bsdfs: Iterable[mi.BSDF], unhit: int | None = None):
         by_id = {registry_id(b): b for b in bsdfs}
         self.bsdfs, self.count = list(by_id.values()), len(by_id)
         self.many = len(by_id) >= MANY
-        found = molds(self.bsdfs) if self.many else []
+        found, self.kinds = molds(self.bsdfs) if self.many else ([], 0)
         self._molds = found if len(found) <= _MOLDS * self.count else []
         self.apart = self.many and not 0 < len(self._molds) < MANY
         self.by_mitsuba = self.many and not self._molds and unhit is not None and unhit <= _UNHIT * self.count
@@ -156,11 +157,6 @@ class BSDFDispatch:
             for row, index in enumerate(index_of[id(b)] for b in group):
                 numbers[index], rows[index] = number, row
         self._numbers, self._rows = mi.UInt32(numbers), mi.UInt32(rows)
-
-    @cached_property
-    def kinds(self) -> int:
-        """Number of BSDF structures; BSDFs of one share the functions of a kernel."""
-        return len({tuple((name, p.class_name()) for name, p in parts(bsdf)) for bsdf in self.bsdfs})
 
     def __call__(self, bsdf, question, *args):
         """Return ``question(bsdf, *args)``; the last of ``args`` is the call's mask.
