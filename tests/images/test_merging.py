@@ -394,16 +394,12 @@ def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
     assert done == {2: [*range(1, 55)], 3: [*range(1, 55)]}
 
 
-def under_plate(lamp):
-    return under_glass(lamp)
-
-
 def under_water(lamp):
     return pool(fogs.fog(1.0, 0.8), lamp, matte(0.0))
 
 
 @pytest.mark.parametrize(
-    "spp, under", [(1, under_plate), (64, under_plate), (1, under_water), (64, under_water)]
+    "spp, under", [(1, under_glass), (64, under_glass), (1, under_water), (64, under_water)]
 )
 def test_merging_where_light_is_missing(spp, under):
     """The image of ``merging=true`` where light is missing, with a pilot and without one; else that of
@@ -499,13 +495,11 @@ def test_what_needs_no_merging(medium):
     assert method.statistics["unbiased"] and not method.statistics["rays"]["photon"]
 
 
-@pytest.mark.parametrize("medium", [False, True])
-def test_what_is_refused(medium):
+def test_what_is_refused():
     """By default one warning."""
     method, default = bdpt(merging=True), bdpt()
     moving = under_glass(point())
     moving["sensor"] |= {"shutter_open": 0.0, "shutter_close": 1.0}
-    moving["plate"] |= {"interior": fogs.fog()} if medium else {}
     scene = mi.load_dict(moving)
     with pytest.raises(NotImplementedError, match="shutter.*leave out merging"):
         method.render(scene, spp=1)
