@@ -28,8 +28,7 @@ class Mold:
             if (np.array(column) != column[0]).any():
                 parameters = mi.traverse(texture)
                 # Lists, as in `emitters.tables.table`.
-                numbers = map(mi.Float, np.array(column).T.tolist())
-                table = type(parameters["value"])(*numbers)
+                table = type(parameters["value"])(*map(mi.Float, np.array(column).T.tolist()))
                 dr.make_opaque(table)
                 self._held.append((parameters, table))
 

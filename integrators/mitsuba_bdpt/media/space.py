@@ -55,9 +55,8 @@ class Space(Vacuum):
         if self.phase is None:
             return vertex.throughput, None
         mei = interaction(vertex.si.p, d, vertex.si)
-        sigma_s, _ = self.media.query(vertex.medium, coefficients, mei, vertex.volume)
+        sigma_s, _ = self.media.query(vertex.medium, coefficients, mei, vertex.volume)  # 0: throughput is 0
         ratio = dr.select(vertex.volume, self.media.mean(vertex.medium) / sigma_s, 1)
-        # The throughput contains sigma_s: 0 in channels that do not scatter.
         ratio = mi.UnpolarizedSpectrum(dr.select(vertex.volume & (sigma_s == 0), 0, ratio))
         number = dr.select(vertex.volume, vertex.medium, mi.UInt32(0))
         return polarization.scaled(vertex.throughput, ratio), number
