@@ -30,7 +30,7 @@ MOST = {
     "": 1280,  # top files
 }
 OUTSIDE = {"scripts": 2856, "tests": 28469}
-MOST_WORDS = 30657
+MOST_WORDS = 30436
 
 
 def _lines(files):
