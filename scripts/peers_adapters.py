@@ -212,17 +212,16 @@ def main() -> None:
     began = time.perf_counter()
     render = globals()[job["renderer"]](scene, job["method"])
     prepared = time.perf_counter()
-    n, seed, taken = 4, job["seed"] * 100, 0.0
-    render(n, seed)
+    n, seed, taken = job["spp"] or 16, job["seed"] * 100, 0.0
+    render(4, seed)
     first = time.perf_counter() - began
-    while taken < 0.8 * job["seconds"]:
-        n = job["spp"] or (round(n * min(8, max(1.3, job["seconds"] / taken))) if taken else 16)
+    while not taken or (not job["spp"] and taken < 0.8 * job["seconds"]):
+        if taken:
+            n = round(n * min(8, max(1.3, job["seconds"] / taken)))
         seed += 1
         cpu, started = processor(), time.perf_counter()
         image = render(n, seed)
         cpu, taken = processor() - cpu, time.perf_counter() - started
-        if job["spp"]:
-            break
     np.save(options.output, image.astype(np.float32))
     figures = {"spp": n, "cpu": cpu, "wall": taken, "first": first, "prepared": prepared - began}
     print("ANSWER", json.dumps(figures), flush=True)

@@ -29,8 +29,8 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2856, "tests": 28469}
-MOST_WORDS = 30436
+OUTSIDE = {"scripts": 2855, "tests": 28469}
+MOST_WORDS = 30433
 
 
 def _lines(files):
