@@ -322,7 +322,7 @@ def test_photons_are_the_same_in_any_order(monkeypatch):
     for."""
     of_pass, counts = traced()
     first = of_pass.photons
-    count, starts = dr.width(first.cell), np.array(first.starts).astype(int)
+    count, starts = dr.width(first.found.lane), np.array(first.starts).astype(int)
     assert count > 1000 and starts[-1] == count and (np.diff(starts) >= 0).all()
     order = mi.UInt32(np.random.default_rng(2).permutation(count).astype(np.uint32))
     monkeypatch.setattr(photon_pass, "_CAPACITY", 1e-3)
@@ -334,35 +334,46 @@ def test_photons_are_the_same_in_any_order(monkeypatch):
 
 
 def columns(photons):
-    return [np.array(x) for x in (*vars(photons.found).values(), photons.cell, photons.starts)]
+    return [np.array(x) for x in (*vars(photons.found).values(), photons.searched, photons.starts)]
 
 
 def test_cells_may_share_a_bucket(monkeypatch):
-    """The image does not depend on which photon of a disc is drawn."""
+    """The image does not depend on which photon of a disc is drawn. Only the bits of a bucket that cells of
+    one search differ in remain."""
     scene = mi.load_dict(under_glass(point()))
     expected = images(scene, 16, 1, merging=True)
     for module in (passes, merging):
-        monkeypatch.setattr(module, "BUCKET_BITS", 2)
+        monkeypatch.setattr(module, "BUCKET_BITS", 8)
     np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
 
 
 def test_which_photons_are_near():
     """On surfaces those in a flat disc, whose normals agree to 37 degrees, but for twice the rounding error
-    of a hit. In volumes, without normals, those in a ball of the same medium."""
+    of a hit. In volumes, without normals, those in a ball."""
     p = mi.Point3f([0, 0.99, 1.01, 0, 0, 0, 0, 0.99], 0, [0, 0, 0, 0.24, 0.26, 0, 0, 0.19])
     n = mi.Normal3f([0, 0, 0, 0, 0, 0.5, 0.7, 0], 0, [1, 1, 1, 1, 1, np.sqrt(0.75), np.sqrt(0.51), 1])
-    photon = Photon(p, None, n, *[None] * 11)
     si = SimpleNamespace(p=mi.Point3f(0), n=mi.Normal3f(0, 0, 1))
     for offset, rounded in ((0, False), (0.1, True)):
-        z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=offset), volume=mi.Bool(False), medium=1)
-        found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
+        z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=offset), volume=mi.Bool(False))
+        found = merging._is_near(p, n, z, mi.Float(1)).numpy().tolist()
         assert found == [True, True, False, True, rounded, True, False, rounded]
-    p, n = mi.Point3f([0, 0, 0, 0, 0, 0], 0, [0.99, 1.01, 0, 0, 0, 0]), mi.Normal3f(0, 0, [0, 0, 0, 1, 0, 1])
-    photon = replace(photon, p=p, n=n, medium=mi.UInt32(1, 1, 2, 0, 1, 0))
-    si.n = mi.Normal3f(0, 0, [0, 0, 0, 0, 1, 1])
-    z.anchor.offset, z.volume = 0, si.n.z == 0
-    found = merging._is_near(photon, z, mi.Float(1)).numpy().tolist()
-    assert found == [True, False, False, False, False, True]
+    z.anchor.offset, z.volume, si.n = 0, mi.Bool(True), mi.Normal3f(0)
+    found = merging._is_near(p, mi.Normal3f(0), z, mi.Float(1)).numpy().tolist()
+    assert found == [True, True, False, True, True, True, True, False]
+
+
+def test_which_photons_are_of_a_kind():
+    """Those of the same medium and the same wavelengths, with few enough edges; many count as 4,095."""
+    edges, sets, media = mi.UInt32(3, 4, 3, 3, 5000), mi.UInt32(1, 1, 0, 1, 1), mi.UInt32(2, 2, 2, 0, 2)
+    count, zero = 5, dr.zeros(mi.Float, 5)
+    found = replace(Photon.zeros(count, media=True), edges=edges, medium=media, flux=mi.Spectrum(1))
+    photons = merging.Photons.of(found, merging.tag_of(edges, sets, media), mi.UInt32(0))
+    si = SimpleNamespace(p=mi.Point3f(zero), n=mi.Normal3f(zero))
+    z = SimpleNamespace(si=si, anchor=SimpleNamespace(offset=0), volume=mi.Bool(True))
+    for most, expected in ((3, [1, 0, 0, 0, 0]), (4, [1, 1, 0, 0, 0]), (1 << 20, [1, 1, 0, 0, 1])):
+        tag = merging.tag_of(mi.UInt32(most), mi.UInt32(1), mi.UInt32(2))
+        near = merging._flux_near(photons, dr.arange(mi.UInt32, count), z, mi.Float(1), tag, mi.Bool(True))
+        np.testing.assert_array_equal(near, expected)
 
 
 # -- renders -----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5105,
-    "transport merging guided_emission": 5766,
+    "transport merging guided_emission": 5811,
     "planning": 1729,
     "emitters": 2182,
     "cli": 1448,
@@ -29,7 +29,7 @@ MOST = {
     "sensors": 882,
     "": 1280,  # top files
 }
-OUTSIDE = {"scripts": 2855, "tests": 28469}
+OUTSIDE = {"scripts": 2855, "tests": 28480}
 MOST_WORDS = 30433
 
 

@@ -33,9 +33,12 @@ from ..transport.walk import Vertex
 from .radius import Balls, Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
 
-# Bits of a bucket's index in the hash table, and of each coordinate of a cell.
-BUCKET_BITS = 18
-_CELL_BITS = 20
+# Bits of a bucket's index in the hash table, and of the number of edges in what is sorted and searched.
+BUCKET_BITS, EDGES_BITS = 20, 12
+
+# Factors of a cell's coordinates; M. Teschner et al., "Optimized Spatial Hashing for Collision Detection of
+# Deformable Objects", 2003, section 4.1.
+_PRIMES = 73856093, 19349663, 83492791
 
 # Roulette begins where a merge at a diffuse surface has 1 / SLACK of B times the older alternatives.
 SLACK = 0.2
@@ -188,12 +191,27 @@ def coefficient(samples: float, radius: float) -> float:
 class Photons:
     """The photons of a pass, ``found`` (a `Photon` of arrays), sorted by bucket.
 
-    ``cell`` of each, see `cell_at`; ``starts``: the first photon of each bucket, and the end of the last.
+    ``searched``: what a search needs of each, 8 numbers (position, flux; normal, tag), for two packet loads;
+    ``starts``: the first photon of each bucket, and the end of the last.
     """
 
     found: Photon
-    cell: mi.UInt64
+    searched: mi.Float
     starts: mi.UInt32
+
+    @staticmethod
+    def of(found: Photon, tag: mi.UInt32, starts: mi.UInt32) -> Photons:
+        """The photons ``found``, sorted, with their ``tag``."""
+        rows = [*found.p, size_of(found.flux), *found.n, dr.reinterpret_array(mi.Float, tag)]
+        return Photons(found, dr.ravel(mi.ArrayXf(rows)), starts)
+
+
+def tag_of(edges: mi.UInt32, wavelength_set: Any, medium: Any) -> mi.UInt32:
+    """A photon's kind, by its medium (0 on surfaces) and wavelengths, above `EDGES_BITS` of its edges."""
+    kind = mi.UInt32(0) if medium is None else medium << SET_BITS
+    if wavelength_set is not None:
+        kind |= wavelength_set
+    return (kind << EDGES_BITS) | dr.minimum(edges, (1 << EDGES_BITS) - 1)
 
 
 def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
@@ -201,29 +219,21 @@ def level_of(radius: Radius, r: mi.Float) -> mi.UInt32:
     return mi.UInt32(dr.maximum(dr.floor(dr.log2(r / radius.low)), 0))
 
 
-def cell_at(radius: Radius, p: mi.Point3f, level: mi.UInt32, wavelength_set=None, corner=None) -> mi.UInt64:
-    """Index of the cell at ``p`` in the grid ``level``, for a set of wavelengths.
+def width_of(radius: Radius, level: mi.UInt32) -> mi.Float:
+    """Width of the cells of a ``level``: at least the radius of nearby camera vertices and of its photons."""
+    return radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(2) << level)
 
-    Cells are at least as wide as the discs of nearby camera vertices and of their photons, so that a disc
-    overlaps at most two per direction; ``corner`` (0 to 7) chooses among these, ``p`` being the lowest corner
-    of its box. Coordinates are modulo 2^20: cells of equal index lie far apart, also of different sets.
+
+def bucket_of(cell: mi.Point3i, level: mi.UInt32, tag: mi.UInt32) -> mi.UInt32:
+    """The bucket of a ``cell`` in the hash table, for photons of the kind of ``tag``.
+
+    Its low bits are those of the level and of the coordinates: cells that one search visits differ in them.
     """
-    width = radius.low * (1 + 2 * radius.steepest) * mi.Float(mi.UInt32(4) << level)
-    cell, number = mi.Point3i(dr.floor(p / width)), mi.UInt64(level)
-    for axis in range(3):
+    word, low = tag >> EDGES_BITS, level & 3
+    for axis, prime in enumerate(_PRIMES):
         index = mi.UInt32(cell[axis])
-        if corner is not None:
-            index += (corner >> axis) & 1
-        if axis == 0 and wavelength_set is not None:
-            index += wavelength_set << (_CELL_BITS - SET_BITS)
-        number = (number << _CELL_BITS) | mi.UInt64(index & ((1 << _CELL_BITS) - 1))
-    return number
-
-
-def bucket_of(cell: mi.UInt64) -> mi.UInt32:
-    """The bucket of a cell in the hash table."""
-    word = sobol.mix(mi.UInt32(cell) ^ sobol.mix(mi.UInt32(cell >> 32)))
-    return word >> (32 - BUCKET_BITS)
+        word, low = word ^ ((index >> 2) * prime), (low << 2) | (index & 3)
+    return ((sobol.mix(word) << 8) | low) & ((1 << BUCKET_BITS) - 1)
 
 
 @dataclass
@@ -261,47 +271,73 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
     """Draw a photon of up to ``most`` edges in the disc or ball at ``z`` by flux; its index, total flux."""
-    photons = merging.photons
+    photons, chosen, total = merging.photons, mi.UInt32(0), mi.Float(0)
     r, radius = merging.around(z.si.p, z.volume, z.medium)
-    lowest = level_of(radius, r * (1 - 1.01 * radius.steepest))
-    corners = (level_of(radius, r * (1 + 1.01 * radius.steepest)) - lowest + 1) * 8
-    corner, place, end = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-    cell, chosen, total = mi.UInt64(0), mi.UInt32(0), mi.Float(0)
-    while dr.hint(
-        (corner < corners) | (place < end),
-        label="photons near a camera vertex",
-        exclude=[z, wavelength_set, radius, photons, r, lowest, corners, most],
-    ):
-        through = place >= end  # the next cell
-        there = cell_at(radius, z.si.p - r, lowest + (corner >> 3), wavelength_set, corner & 7)
-        bucket = bucket_of(there)
-        place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
-        end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
-        cell = dr.select(through, there, cell)
-        corner += dr.select(through, mi.UInt32(1), 0)
+    level = level_of(radius, r * (1 - 1.01 * radius.steepest))
+    last = level_of(radius, r * (1 + 1.01 * radius.steepest))
+    medium = None if merging.balls is None else dr.select(z.volume, z.medium, 0)
+    tag = tag_of(most, wavelength_set, medium)
+    while dr.hint(level <= last, label="grids of photons", exclude=[z, photons, r, radius, tag, last]):
+        first, cells = _overlapped(z.si.p, r, width_of(radius, level))
+        place, end = mi.UInt32(0), mi.UInt32(0)
+        while dr.hint(
+            (cells != 0) | (place < end),
+            label="photons near a camera vertex",
+            exclude=[z, photons, r, radius, tag, last, level, first],
+        ):
+            through = place >= end  # the next cell
+            number = dr.tzcnt(cells)
+            bucket = bucket_of(_neighbour(first, number), level, tag)
+            place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
+            end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
+            cells = dr.select(through, cells & (cells - 1), cells)
 
-        tried = place < end
-        photon = photons.found.at(place, tried)
-        near = tried & (dr.gather(mi.UInt64, photons.cell, place, tried) == cell)  # cells may share a bucket
-        near &= _is_near(photon, z, r) & (photon.edges <= most)
-        size = dr.select(near, size_of(photon.flux), 0)
-        u, after = sequential(word)
-        total, take, _ = offer(total, size, u)
-        take &= tried
-        word = dr.select(tried, after, word)
-        chosen = dr.select(take, place, chosen)
-        place += dr.select(tried, mi.UInt32(1), 0)
+            tried = place < end
+            size = _flux_near(photons, place, z, r, tag, tried)
+            u, after = sequential(word)
+            total, take, _ = offer(total, size, u)
+            take &= tried
+            word = dr.select(tried, after, word)
+            chosen = dr.select(take, place, chosen)
+            place += dr.select(tried, mi.UInt32(1), 0)
+        level += 1
     return chosen, total
 
 
-def _is_near(photon: Photon, z: Vertex, r: mi.Float) -> mi.Bool:
-    """Mask: the ``photon`` counts as if it were at ``z``."""
-    off = photon.p - z.si.p
-    height = dr.abs(dr.dot(off, z.si.n))
+def _overlapped(p: mi.Point3f, r: mi.Float, width: mi.Float) -> tuple[mi.Point3i, mi.UInt32]:
+    """Cells that the ball of radius ``r`` about ``p`` overlaps: the lowest of 27, and a bit for each."""
+    first = mi.Point3i(dr.floor((p - r) / width))
+    lows = [mi.Vector3f(first + i) * width - p for i in range(3)]
+    squares = [dr.square(dr.maximum(dr.maximum(low, -low - width), 0)) for low in lows]
+    cells = mi.UInt32(0)
+    for number in range(27):
+        x, y, z = number % 3, number // 3 % 3, number // 9
+        distance2 = squares[x].x + squares[y].y + squares[z].z
+        cells |= dr.select(distance2 <= dr.square(r), mi.UInt32(1 << number), 0)
+    return first, cells
+
+
+def _neighbour(first: mi.Point3i, number: mi.UInt32) -> mi.Point3i:
+    """The cell of a bit of `_overlapped`."""
+    return first + mi.Point3i(mi.Int32(number % 3), mi.Int32(number // 3 % 3), mi.Int32(number // 9))
+
+
+def _flux_near(photons: Photons, index: mi.UInt32, z: Vertex, r, tag: mi.UInt32, active) -> mi.Float:
+    """Flux of the photon ``index`` if it counts as if it were at ``z``, else 0."""
+    first = dr.gather(mi.Vector4f, photons.searched, 2 * index, active)
+    second = dr.gather(mi.Vector4f, photons.searched, 2 * index + 1, active)
+    own = dr.reinterpret_array(mi.UInt32, second.w)
+    # Of the same kind, with few enough edges.
+    near = active & ((own >> EDGES_BITS) == (tag >> EDGES_BITS)) & (own <= tag)
+    near &= _is_near(mi.Point3f(first.xyz), mi.Normal3f(second.xyz), z, r)
+    return dr.select(near, first.w, 0)
+
+
+def _is_near(p: mi.Point3f, n: mi.Normal3f, z: Vertex, r: mi.Float) -> mi.Bool:
+    """Mask: a photon at ``p``, with normal ``n``, lies in the disc or ball at ``z``."""
+    off = p - z.si.p
+    height = dr.abs(dr.dot(off, z.si.n))  # in volumes normals are 0
     # Each position may lie off its surface by the rounding error of its hit.
     beyond_rounding = dr.maximum(height - 2 * z.anchor.offset, 0)
     within = dr.squared_norm(off) - dr.square(height) + dr.square(beyond_rounding) < dr.square(r)
-    same = dr.dot(photon.n, z.si.n) > _SAME_SURFACE
-    if photon.medium is not None:  # in volumes normals are 0
-        same |= z.volume & (photon.medium == z.medium)
-    return within & (beyond_rounding < _FLAT * r) & same
+    return within & (beyond_rounding < _FLAT * r) & (z.volume | (dr.dot(n, z.si.n) > _SAME_SURFACE))

@@ -15,7 +15,17 @@ from ..transport.inputs import TraceContext
 from ..transport.photons import photon_pass
 from ..transport.photons.aim import Aim
 from ..transport.photons.photon import Photon
-from .merging import BUCKET_BITS, Merging, Photons, bucket_of, cell_at, coefficient, level_of
+from .merging import (
+    BUCKET_BITS,
+    EDGES_BITS,
+    Merging,
+    Photons,
+    bucket_of,
+    coefficient,
+    level_of,
+    tag_of,
+    width_of,
+)
 from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
@@ -31,7 +41,7 @@ _PASS, _SHORT_PASS, _LEAST_SAMPLES = 32, 16, 1 << 16
 # Where pixels have no size (meters): least photon subpaths of a pass; samples that count as one per pixel.
 _METER_PHOTONS, _METER_PIXELS = 1 << 16, 1 << 10
 
-_EDGES_BITS, _LANE_BITS = 12, 32  # bits of the edges and of the subpath's index in the sort key of photons
+_LANE_BITS = 32  # bits of a subpath's index in the sort key of photons
 
 
 def why_not(sensor: mi.Sensor) -> str:
@@ -119,14 +129,13 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     volume = mi.Bool(False) if found.medium is None else found.medium != 0
     r, radius = merging.around(found.p, volume, found.medium)
     sets = merging.wavelengths
-    number = None if sets is None else sets.number(found.lane)
-    cell = cell_at(radius, found.p, level_of(radius, r), number)
-    bucket = bucket_of(cell)
-    key = (mi.UInt64(bucket) << (_LANE_BITS + _EDGES_BITS)) | (mi.UInt64(found.lane) << _EDGES_BITS)
-    order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << _EDGES_BITS) - 1)))
+    level = level_of(radius, r)
+    tag = tag_of(found.edges, None if sets is None else sets.number(found.lane), found.medium)
+    bucket = bucket_of(mi.Point3i(dr.floor(found.p / width_of(radius, level))), level, tag)
+    key = (mi.UInt64(bucket) << (_LANE_BITS + EDGES_BITS)) | (mi.UInt64(found.lane) << EDGES_BITS)
+    order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << EDGES_BITS) - 1)))
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
-    starts = dr.cumsum(counts)
-    result = Photons(found.at(order), dr.gather(mi.UInt64, cell, order), starts)
+    result = Photons.of(found.at(order), dr.gather(mi.UInt32, tag, order), dr.cumsum(counts))
     dr.eval(result)
     return result
