@@ -48,8 +48,8 @@ from .showing import amount
 
 EVERYTHING = {"type": "bdpt", "skip": "none", "light_paths": 1, "connections": "all", "merging": False}
 
-# Passes of few samples have the most photons. A pilot decides the rest: its tables of emission leave a twentieth
-# of the variance of `pool_water`.
+# Passes of few samples have the most photons. A pilot decides the rest: its tables of emission leave 1/20 of
+# the variance of `pool_water`.
 MERGING = {"type": "bdpt", "merging": True, "spp_per_pass": 64}
 
 FOCUS_TIMES = 16  # times the samples of the rest, in windows
