@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import CommandError
-from ..files.loading import named_files, parsed_anyway, searching, spectra
+from ..files.loading import contents
 from ..files.whole import replacing
 from ..run.snapshot import Snapshot, read
 
@@ -27,13 +27,8 @@ def digest(options: Namespace) -> str:
     """Hash the loaded scene's files, files and spectra that they name, definitions, sensor and film."""
     film = [options.size, options.crop] if options.size or options.crop else []
     found = hashlib.sha256(json.dumps([sorted(options.defines), options.sensor, *film]).encode())
-    with searching(options.scene, options.append):
-        state = parsed_anyway(options.scene, dict(options.defines))
-        files = named_files(state)
-    for path in files:
-        found.update(hashlib.sha256(path.read_bytes()).digest())
-    for text in spectra(state):
-        found.update(text.encode())
+    for part in contents(options.scene, dict(options.defines), options.append):
+        found.update(hashlib.sha256(part).digest())
     return found.hexdigest()
 
 

@@ -77,22 +77,21 @@ def parsed_anyway(scene: Path, definitions: Mapping[str, object]) -> mi.parser.P
             definitions = {**definitions, missing[1]: "1"}
 
 
-def named_files(state: mi.parser.ParserState) -> list[Path]:
-    """Return the files of a parsed scene, and the existing ones that it names, each once.
+def contents(scene: Path, definitions: Mapping[str, object], folders: Iterable[Path] = ()) -> Iterator[bytes]:
+    """Yield the bytes of the files of a ``scene`` and of the existing ones that it names, each once.
 
-    Those of spectra are left out, see `spectra`. Has to be called within `searching`.
+    Tables of spectra follow as text: the parser has read their files. ``folders``: see `searching`.
     """
-    named = (name for node in state.nodes if isinstance(name := node.props.get("filename"), str))
-    names = (from_utf8(str(mi.file_resolver().resolve(name))) for name in named)
-    files = [from_utf8(str(file)) for file in state.files]
-    return list(dict.fromkeys((*files, *filter(Path.is_file, names))))
-
-
-def spectra(state: mi.parser.ParserState) -> list[str]:
-    """Return the tables of spectra of a parsed scene, as text: the parser has read their files."""
-    held = ((node.props, name, value) for node in state.nodes for name, value in node.props.items())
+    with searching(scene, folders):
+        state = parsed_anyway(scene, definitions)
+        held = [(node.props, name, value) for node in state.nodes for name, value in node.props.items()]
+        named = (value for _, name, value in held if name == "filename" and isinstance(value, str))
+        names = (from_utf8(str(mi.file_resolver().resolve(name))) for name in named)
+        files = [from_utf8(str(file)) for file in state.files]
+        paths = dict.fromkeys((*files, *filter(Path.is_file, names)))
+    yield from map(Path.read_bytes, paths)
     tables = (value for props, name, value in held if props.type(name) == mi.Properties.Type.Spectrum)
-    return [repr((list(table.wavelengths), list(table.values))) for table in tables]
+    yield from (repr((list(table.wavelengths), list(table.values))).encode() for table in tables)
 
 
 def in_proportion(scene: Path, definitions: dict) -> dict:

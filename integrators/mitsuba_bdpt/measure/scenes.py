@@ -13,15 +13,7 @@ from typing import Any
 import mitsuba as mi
 
 from ..errors import CommandError, message
-from ..files.loading import (
-    choose_sensor,
-    named_files,
-    parsed,
-    parsed_anyway,
-    searching,
-    spectra,
-    unless_incompatible,
-)
+from ..files.loading import choose_sensor, contents, parsed, searching, unless_incompatible
 from ..host.introspection import media_of
 
 
@@ -35,10 +27,7 @@ class SceneFile:
     @property
     def sha256(self) -> str:
         """SHA-256 of the scene and of all files that it names."""
-        with searching(self.file):
-            state = parsed_anyway(self.file, {})
-            content = [*(file.read_bytes() for file in named_files(state)), *map(str.encode, spectra(state))]
-        return hashlib.sha256(b"".join(content)).hexdigest()
+        return hashlib.sha256(b"".join(contents(self.file, {}))).hexdigest()
 
     def _instantiated(self, sampler: str | None, merges: bool) -> mi.Scene:
         """Return the scene, with a ``sampler`` unless None; ``merges`` meshes of a BSDF."""
