@@ -46,17 +46,9 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
     for name, why in emitters.left_out:
         possible(name, why)
 
-    everything = settings.skip == "none"
-    light_paths, connections = settings.light_paths, settings.connections
-    if isinstance(light_paths, str):  # "auto"
-        light_paths = 1 if everything else 1 / 4
-    if connections == "auto":
-        connections = "all" if everything else "one"
-    if settings.strategy_images and connections == "one":
-        connections = "all"  # a drawn connection does not estimate each strategy
-    contradiction = prepared.light_media.contradiction if prepared.light_media else ""
+    everything, (light_paths, connections) = settings.skip == "none", _light_paths(settings)
     traced = possible(_ALL_LIGHT, "" if light_paths else "light_paths=0", BY_HAND)
-    traced = traced and possible(_ALL_LIGHT, contradiction)
+    traced = traced and possible(_ALL_LIGHT, prepared.contradiction)
     splat, endpoints, arrival, inner = (each and traced for each in (splat, endpoints, arrival, inner))
     if inner and connections == "none":
         inner = possible("inner", "connections=none", BY_HAND)
@@ -65,7 +57,7 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         teachable = possible("guided emission", f"guiding={settings.guiding}", BY_HAND)
     elif light:
         why = components.why_absent("guided_emission") or components.guided_emission.why_not(emitters)
-        teachable = possible("guided emission", why or "")
+        teachable = possible("guided emission", why)
     return Plan(
         hit=hit,
         direct=direct,
@@ -84,6 +76,19 @@ def plan(prepared: PreparedScene, settings: Settings) -> Plan:
         guidable=guidable,
         teachable=teachable,
     )
+
+
+def _light_paths(settings: Settings) -> tuple[float, str]:
+    """Light subpaths per camera subpath, and connections, without a decision of a pilot."""
+    everything = settings.skip == "none"
+    light_paths, connections = settings.light_paths, settings.connections
+    if isinstance(light_paths, str):  # "auto"
+        light_paths = 1 if everything else 1 / 4
+    if connections == "auto":
+        connections = "all" if everything else "one"
+    if settings.strategy_images and connections == "one":
+        connections = "all"  # a drawn connection does not estimate each strategy
+    return light_paths, connections
 
 
 _UNTRACED = "no light subpath can start from the emitters"
@@ -142,8 +147,8 @@ def _why_not_merging(prepared: PreparedScene, direct: bool) -> str:
     emitters = prepared.emitters
     if not emitters.traced:
         return _UNTRACED
-    if prepared.light_media is not None and prepared.light_media.contradiction:
-        return prepared.light_media.contradiction
+    if prepared.contradiction:
+        return prepared.contradiction
     if emitters.contrast <= EVEN:
         return "s=0 finds a uniform environment by itself"
     if direct and not (prepared.delta or prepared.near_specular or emitters.beams):

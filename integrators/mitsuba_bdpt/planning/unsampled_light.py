@@ -148,9 +148,8 @@ def _called(emitters: Iterable[mi.Emitter]) -> str:
 
 def is_possible(prepared: PreparedScene, plan: Plan, settings: Settings) -> bool:
     """Whether emitters, surfaces and sensor of the scene allow such paths."""
-    media = prepared.light_media
-    contradictory = media is not None and media.contradiction  # light subpaths would see another scene
-    if plan.merging or components.why_absent("merging") or not prepared.emitters.traced or contradictory:
+    traced = prepared.emitters.traced and not prepared.contradiction
+    if plan.merging or components.why_absent("merging") or not traced:
         return False
     never = not plan.arrival and (_has_sds_paths(prepared) or (prepared.emitters.beams and not plan.splat))
     return never or is_undersampling_possible(prepared, plan, settings)

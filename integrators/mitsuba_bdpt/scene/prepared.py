@@ -76,6 +76,11 @@ class PreparedScene:
             delta &= ~null  # which edges pass
         self.delta = any(f & delta for f in flags)
 
+    @property
+    def contradiction(self) -> str:
+        """Why light subpaths would see other media than the camera; empty if they would not."""
+        return self.light_media.contradiction if self.light_media else ""
+
     @cached_property
     def has_small_emitter(self) -> bool:
         """Whether an emitter may be so small that few subpaths hit it (`SMALL`), or cannot be hit.
