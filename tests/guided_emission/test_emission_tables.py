@@ -288,7 +288,7 @@ def test_tables_come_back_from_json():
     densities = np.random.default_rng(3).random((5, 8, 8)) + 0.1
     densities /= densities.mean(axis=(1, 2), keepdims=True)
     tables = EmissionTables.of(densities, 0.5)
-    again = EmissionTables(**json.loads(json.dumps(tables.record())))
+    again = EmissionTables(**json.loads(json.dumps(vars(tables))))
     assert again == tables and hash(again) == hash(tables)
     np.testing.assert_allclose(again.densities(), densities, rtol=0.045)
     np.testing.assert_allclose(again.densities().mean(axis=(1, 2)), 1)

@@ -36,7 +36,7 @@ def test_weights_are_those_of_explicit_densities(lamps, heuristic):
     """Weights of real paths within 1e-3, and sums of 1 (but for the 2 % where rounding decides)."""
     scene = scene_of(lamps, lens=lamps != "spot")
     tables = random_tables(scene)
-    more = {"max_depth": 4, "heuristic": heuristic} | decided(emission=tables.record())
+    more = {"max_depth": 4, "heuristic": heuristic} | decided(emission=vars(tables))
     found = Weighed()
     found.add(Capture(scene, internals.bdpt(**more), 4000, 3), heuristic)
     assert found.bad == 0 and found.paths > 3000

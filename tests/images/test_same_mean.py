@@ -1000,7 +1000,7 @@ def scene_of(lamps, lens=False, **more):
 
 
 def by_tables(scene, spp=256, seeds=10, more=None, **way):
-    ours = decided(emission=random_tables(scene).record(), **way)
+    ours = decided(emission=vars(random_tables(scene)), **way)
     return Row(scene, EVERYTHING, 4, spp, spp, seeds, more or {}, ours)
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -65,9 +65,6 @@ class EmissionTables:
         densities = self.densities()
         first = _first_tables(emitters.tables, (densities != 1).any(axis=(1, 2)))
         return emitters.with_guide(EmissionGuide(self, first), [number > 0 for number in first])
-
-    def record(self) -> dict[str, int | float | str]:
-        return asdict(self)
 
 
 def side_of(tables: int) -> int:

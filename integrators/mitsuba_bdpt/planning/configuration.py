@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from .. import components
@@ -125,9 +125,9 @@ class Decision(Configuration):
 
     def record(self) -> dict[str, Any]:
         """Entry of ``statistics["decisions"]``."""
-        values = dict(vars(self))
+        values = asdict(self)
         values["coefficients"] = {"t<=1": values.pop("kappa_light"), "s=1": values.pop("kappa_direct")}
-        return values | {"emission": None if self.emission is None else self.emission.record()}
+        return values
 
     @staticmethod
     def read(record: dict[str, Any]) -> Decision:
