@@ -29,8 +29,6 @@ from .light_media import LightMedia, medium_at_far_plane
 from .media import Media
 from .space import Space
 
-__all__ = ["prepare"]
-
 
 def prepare(
     found: dict[int, mi.Medium],

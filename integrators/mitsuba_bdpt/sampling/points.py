@@ -50,28 +50,12 @@ _KEY = 0x27D4EB2F  # keeps the key of sample 0 nonzero
 
 # Stratified draws and their number in `sobol.related`; None: a shuffle of its own. The light samples of the
 # first and second vertex may share a number: no contribution depends on both.
+_ALONE = dict.fromkeys((Purpose.ROULETTE, Purpose.CONNECTION, Purpose.FLIGHT))
+_OF_BOTH: dict[Purpose, int | None] = {Purpose.BSDF: 2, Purpose.LOBE: 3} | _ALONE
+_EMISSION = {Purpose.EMISSION_POINT: 0, Purpose.EMISSION_DIRECTION: 1}
 STRATIFIED = {
-    "camera": {
-        Purpose.FILM: 0,
-        Purpose.APERTURE: 4,
-        Purpose.EMITTER: 1,
-        Purpose.BSDF: 2,
-        Purpose.LOBE: 3,
-        Purpose.ROULETTE: None,
-        Purpose.CONNECTION: None,
-        Purpose.FLIGHT: None,
-    },
-    "light": {
-        Purpose.TIME: None,
-        Purpose.WAVELENGTH: None,
-        Purpose.EMISSION_POINT: 0,
-        Purpose.EMISSION_DIRECTION: 1,
-        Purpose.BSDF: 2,
-        Purpose.LOBE: 3,
-        Purpose.ROULETTE: None,
-        Purpose.CONNECTION: None,
-        Purpose.FLIGHT: None,
-    },
+    "camera": _OF_BOTH | {Purpose.FILM: 0, Purpose.APERTURE: 4, Purpose.EMITTER: 1},
+    "light": _OF_BOTH | _EMISSION | dict.fromkeys((Purpose.TIME, Purpose.WAVELENGTH)),
 }
 
 

@@ -43,16 +43,6 @@ import mitsuba as mi
 if TYPE_CHECKING:
     UInt32Like = mi.UInt32 | int
 
-__all__ = [
-    "hash_u32",
-    "mix",
-    "pair_of",
-    "related",
-    "shuffled",
-    "single_of",
-    "split_index",
-]
-
 # Maps of digit words, each a product of x -> x ^ ((x >> shift) & mask): upper unitriangular over GF(2), so
 # that every pair stays a (0,2)-sequence. Found by a beam search (width 6, 40 random sets of shifts from 1 to
 # 8), bit by bit of the index and map by map. Objective: over blocks of 2^m points, m = 2 to 20, the least
