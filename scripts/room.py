@@ -39,37 +39,21 @@ def _matte(i: int) -> dict:
     return _two_sided("diffuse", reflectance=_colour(i))
 
 
-def _cut_out(i: int) -> dict:
-    """A picture with clear parts."""
-    return {
-        "type": "mask",
-        "opacity": _picture(i, 1),
-        "bsdf": _two_sided("diffuse", reflectance=_picture(i + 1)),
-    }
-
-
-def _metal(i: int) -> dict:
-    return _two_sided("roughconductor", material=("Cu", "Al", "Au")[i % 3], alpha=0.1 + 0.01 * i)
-
-
-def _coated(i: int) -> dict:
-    parts = {"base_color": _picture(i), "roughness": 0.4, "metallic": 0.02 * i, "clearcoat": 0.3}
-    return _two_sided("principled", **parts)
-
-
 # Kinds of materials, by how often they are met in public scenes; each takes a number, which it varies by.
 KINDS = (
     _matte,
     lambda i: _two_sided("diffuse", reflectance=_picture(i)),
     lambda i: _two_sided("roughplastic", diffuse_reflectance=_colour(i), alpha=0.05 + 0.01 * i),
-    _metal,
+    lambda i: _two_sided("roughconductor", material=("Cu", "Al", "Au")[i % 3], alpha=0.1 + 0.01 * i),
     lambda i: _two_sided("principled", base_color=_colour(i), roughness=0.2 + 0.02 * i),
     lambda i: {"type": "dielectric", "int_ior": 1.3 + 0.02 * i},
-    _coated,
+    lambda i: _two_sided(
+        "principled", base_color=_picture(i), roughness=0.4, metallic=0.02 * i, clearcoat=0.3
+    ),
     lambda i: _two_sided("roughplastic", diffuse_reflectance=_picture(i), alpha=0.1),
     lambda i: _two_sided("bumpmap", arbitrary=_picture(i, 1), bsdf={"type": "roughplastic"}),
     lambda i: _two_sided("normalmap", normalmap=_normals(i), bsdf=_matte(i)["bsdf"]),
-    _cut_out,
+    lambda i: {"type": "mask", "opacity": _picture(i, 1), "bsdf": KINDS[1](i + 1)},
     lambda i: {"type": "thindielectric", "int_ior": 1.4 + 0.01 * i},
     lambda i: _two_sided("conductor", material="Ag", specular_reflectance=_colour(i)),
     lambda i: _two_sided("plastic", diffuse_reflectance=_colour(i)),

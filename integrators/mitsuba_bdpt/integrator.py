@@ -252,11 +252,12 @@ class BDPTIntegrator(metaclass=ABCMeta):
 
     def render_forward(self, *args, **kwargs):
         """Not supported; raises ``UnsupportedError``."""
-        raise UnsupportedError(NO_DERIVATIVES)
+        raise UnsupportedError(
+            "derivatives are not supported; use integrator type 'prb' or 'path' for render_forward and "
+            "render_backward"
+        )
 
-    def render_backward(self, *args, **kwargs):
-        """Not supported; raises ``UnsupportedError``."""
-        raise UnsupportedError(NO_DERIVATIVES)
+    render_backward = render_forward
 
     def to_string(self) -> str:
         """Return the parameters, one per line."""
@@ -264,12 +265,6 @@ class BDPTIntegrator(metaclass=ABCMeta):
         values |= {"max_depth": self.max_depth, "layers": ",".join(self.settings.layers)}
         lines = "".join(f"  {k} = {v},\n" for k, v in values.items())
         return f"BDPTIntegrator[\n{lines}]"
-
-
-NO_DERIVATIVES = (
-    "derivatives are not supported; use integrator type 'prb' or 'path' for render_forward "
-    "and render_backward"
-)
 
 
 def _result(film, develop: bool, evaluate: bool) -> mi.TensorXf:

@@ -14,22 +14,22 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
-    "measure": 5105,
-    "transport merging guided_emission": 5811,
-    "planning": 1729,
-    "emitters": 2182,
-    "cli": 1448,
-    "media": 1347,
+    "measure": 5097,
+    "transport merging guided_emission": 5808,
+    "planning": 1733,
+    "emitters": 2181,
+    "cli": 1436,
+    "media": 1345,
     "geometry": 1429,
     "image": 1297,
-    "files": 846,
+    "files": 845,
     "run": 1092,
-    "scene sampling": 822,
+    "scene sampling": 801,
     "host": 807,
-    "sensors": 882,
-    "": 1280,  # top files
+    "sensors": 881,
+    "": 1275,  # top files
 }
-OUTSIDE = {"scripts": 2855, "tests": 28480}
+OUTSIDE = {"scripts": 2839, "tests": 28480}
 MOST_WORDS = 30433
 
 

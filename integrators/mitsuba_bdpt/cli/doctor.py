@@ -148,7 +148,10 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
     if child.returncode < 0:
         text = f"the process rendering it was killed by {signal.Signals(-child.returncode).name} ({text})."
         if variant.startswith("llvm"):
-            text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {crash_remedy()}"
+            choice, remedy = mitsuba_bdpt.llvm_choice, llvm.remedy()
+            if choice is not None and choice.why == llvm.NAMED:
+                remedy = f"Unset {llvm.VARIABLE}; it names {str(choice.path)!r}."
+            text += f" The usual reason is an LLVM version that Dr.Jit cannot use. {remedy}"
     elif child.returncode > 0:
         if "backends" in report and (reason := why_not(variant, report["backends"])):
             text = f"{variant} cannot render here: {reason}"
@@ -159,10 +162,3 @@ def judge(child: subprocess.CompletedProcess, report: dict, variant: str) -> Fin
         with_llvm = f", LLVM {report['llvm']}" if report.get("llvm") else ""
         return Finding("ok", "test image", f"rendered with {variant}{with_llvm}, mean {mean:.3f}")
     return Finding("FAIL", "test image", text)
-
-
-def crash_remedy() -> str:
-    choice = mitsuba_bdpt.llvm_choice
-    if choice is not None and choice.why == llvm.NAMED:
-        return f"Unset {llvm.VARIABLE}; it names {str(choice.path)!r}."
-    return llvm.remedy()

@@ -86,11 +86,8 @@ def in_words(error: BaseException) -> str:
 
 
 def _of_memory(error: BaseException) -> BaseException | None:
-    return behind(error, MemoryError) or next(filter(_is_drjits_memory, chain(error)), None)
-
-
-def _is_drjits_memory(error: BaseException) -> bool:
-    return isinstance(error, RuntimeError) and bool(OUT_OF_MEMORY.search(str(error)))
+    of_drjit = (e for e in chain(error) if isinstance(e, RuntimeError) and OUT_OF_MEMORY.search(str(e)))
+    return behind(error, MemoryError) or next(of_drjit, None)
 
 
 def _is_mitsubas(error: BaseException) -> bool:

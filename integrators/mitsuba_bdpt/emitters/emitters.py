@@ -122,8 +122,7 @@ class Emitters:
 
     def with_guide(self, guide=None, is_guided: Sequence[bool] = ()) -> Emitters:
         """Return a copy that has `place`; ``guide`` guides the emitters where ``is_guided``."""
-        other = copy(self)
-        other.indexed = True
+        other = self.with_indices()
         other.groups = tuple(
             group.with_guide(guide if guide is not None and any(is_guided[i] for i in own) else None)
             for group, own in zip(self.groups, self._of_groups, strict=True)

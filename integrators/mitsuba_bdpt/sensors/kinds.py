@@ -11,10 +11,19 @@ from . import cameras, checks
 from .others import Distant, IrradianceMeter, Orthographic, RayOnlySensor
 from .records import Sensor
 
+# Sensors whose film has no border to sample, and why.
+_WITHOUT_BORDER = {
+    "BatchSensor": "has no meaning beside the views of a batch",
+    "IrradianceMeter": "needs points beyond its shape",
+}
+
 
 def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Sensor:
     """Return the sensor for one render; ``UnsupportedError`` for those that Mitsuba cannot render."""
     kind = sensor.class_name()
+    if kind in _WITHOUT_BORDER and sensor.film().sample_border():
+        text = f"film of {checks.called(sensor)} has sample_border, which {_WITHOUT_BORDER[kind]}"
+        raise UnsupportedError(f"{text}; set it to false")
     if kind in cameras.KINDS:
         return cameras.Camera(sensor, [sensor])
     if kind == "OrthographicCamera":
@@ -22,11 +31,6 @@ def prepare(sensor: mi.Sensor, shape_errors: ShapeErrors, scene: mi.Scene) -> Se
     if kind == "BatchSensor":
         return _batch(sensor, shape_errors)
     if kind == "IrradianceMeter":
-        if sensor.film().sample_border():
-            raise UnsupportedError(
-                f"film of irradiance meter {named(sensor)} has sample_border, which needs points beyond "
-                "its shape; set it to false"
-            )
         shape = sensor.get_shape()
         return IrradianceMeter(sensor, shape_errors, in_scene=any(shape is other for other in scene.shapes()))
     if kind == "RadianceMeter":
@@ -50,11 +54,6 @@ def _by_rays(sensor: mi.Sensor, reason: str, views: list[mi.Sensor] | None = Non
 
 def _batch(sensor: mi.Sensor, shape_errors: ShapeErrors) -> Sensor:
     views = checks.views(sensor)
-    if sensor.film().sample_border():
-        raise UnsupportedError(
-            f"film of batch sensor {named(sensor)} has sample_border, which has no meaning beside "
-            "the views of a batch; set it to false"
-        )
     if mi.is_spectral and any("srf" in children(view) for view in views):
         raise UnsupportedError(
             f"a view of batch sensor {named(sensor)} has an srf of its own, but wavelengths are "
