@@ -18,7 +18,7 @@ import pytest
 import welch as st
 from mitsuba_bdpt.geometry import rays
 from mitsuba_bdpt.merging import merging, passes
-from mitsuba_bdpt.merging.radius import BALLS, MEAN_FREE_PATHS, Footprints
+from mitsuba_bdpt.merging.radius import BALLS, MEAN_FREE_PATHS, Balls, Footprints
 from mitsuba_bdpt.planning import unsampled_light
 from mitsuba_bdpt.run import rendering
 from mitsuba_bdpt.run.rendering import Render
@@ -308,12 +308,13 @@ def test_crop_windows_of_one_pixel_find_photons():
 # -- photons -----------------------------------------------------------------------------------------------
 
 
-def traced(count=1 << 14):
+def traced(count=1 << 14, described=None):
     """Merging with the photons of one pass, and counts."""
-    scene = mi.load_dict(under_glass(point()))
+    scene = mi.load_dict(described or under_glass(point()))
     render = rendering.Render(scene, scene.sensors()[0], bdpt(merging=True).settings, 0, 4)
-    radius = Footprints.of(scene, scene.sensors()[0]).radius(1.0)
-    of_pass = merging.Merging(radius, dr.opaque(mi.Float, count), mi.Float(1))
+    footprints = Footprints.of(scene, scene.sensors()[0])
+    of_pass = merging.Merging(footprints.radius(1.0), dr.opaque(mi.Float, count), mi.Float(1))
+    of_pass.balls = footprints.balls(BALLS, render.kernel.space)
     return passes.trace(render.kernel, of_pass, render.aim, Points("sobol", mi.UInt32(1)), count)
 
 
@@ -335,6 +336,15 @@ def test_photons_are_the_same_in_any_order(monkeypatch):
 
 def columns(photons):
     return [np.array(x) for x in (*vars(photons.found).values(), photons.searched, photons.starts)]
+
+
+def test_no_photons_lie_where_a_medium_absorbs_only():
+    """A black ball in water that absorbs all red: photons of the water and of surfaces are left."""
+    black = fogs.ball(glass(), 0.3, (0, 0, -0.5), interior=fogs.fog(3.0, 0.0))
+    water = fogs.coloured(2.0) | {"albedo": scenes.rgb(0.0, 0.8, 0.95)}
+    found = traced(described=pool(water, sun(), matte(0.2), black=black))[0].photons.found
+    flux = np.array(found.flux)
+    assert np.isfinite(flux).all() and flux.any(0).all() and len(np.unique(found.medium)) == 2
 
 
 def test_cells_may_share_a_bucket(monkeypatch):
@@ -397,7 +407,9 @@ def test_a_resumed_render_is_the_uninterrupted_one(parameters):
 
 @pytest.mark.parametrize("layers", ["", "variance"])
 def test_the_radius_goes_on_from_part_to_part(layers, monkeypatch):
-    """An average of renders, or of replicates, has the bias of the radii of each."""
+    """An average of renders, or of replicates, has the bias of the radii of each, which halve after 64 times
+    the samples in discs, after 128 times in balls."""
+    assert [passes.after(1.0, 64 * 64), passes.after(1.0, 64 * 128, 3)] == pytest.approx([0.5, 0.5])
     done, method = {2: [], 3: []}, bdpt(spp_per_pass=1, layers=layers)
     monkeypatch.setattr(passes, "after", lambda radius, samples, d=2: done[d].append(samples) or radius)
     for method.part in range(3):
@@ -442,9 +454,19 @@ def test_no_light_is_called_lost_that_merging_finds(kind):
 
 
 def test_camera_vertices_that_share_photons_are_not_independent():
-    """Kappa of merges is one over the number of camera vertices in a disc, of at least one."""
+    """Kappa of merges is one over the number of camera vertices in a disc, of at least one. That of a ball,
+    here in thin and in dense fog, is larger by the probability of a collision, and at most one."""
     assert merging.coefficient(16, 2.0) == pytest.approx(1 / (16 * np.pi * 2**2))
     assert merging.coefficient(1, 0.25) == 1
+    sigma, radius = np.array([0, 1e-5, 10]), Footprints((0.0,) * 3, 0.5, 0.0, 0.5).radius(1.0)
+    balls = Balls(radius, SimpleNamespace(mean=lambda medium: dr.gather(mi.Float, mi.Float(sigma), medium)))
+    of_pass = merging.Merging(radius, mi.Float(1e4), mi.Float(1e-4), balls=balls)
+    si, medium = SimpleNamespace(p=mi.Point3f(0)), mi.UInt32(0, 1, 2)
+    found = of_pass.kappa_eta(SimpleNamespace(si=si, volume=medium > 0, medium=medium))
+    r = 1 / (1 / 0.5 + sigma / 0.2)
+    disc, ball = np.pi * 0.5**2, 1e4 * 4 / 3 * np.pi * r**3 * sigma
+    np.testing.assert_allclose(of_pass.around(si.p, medium > 0, medium)[0], r, rtol=1e-5)
+    np.testing.assert_allclose(found, [disc, ball[1], disc], rtol=1e-5)
 
 
 def test_strategy_image_of_merges(monkeypatch):

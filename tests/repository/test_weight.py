@@ -29,8 +29,8 @@ MOST = {
     "sensors": 881,
     "": 1275,  # top files
 }
-OUTSIDE = {"scripts": 2839, "tests": 28480}
-MOST_WORDS = 30433
+OUTSIDE = {"scripts": 2839, "tests": 28519}
+MOST_WORDS = 30443
 
 
 def _lines(files):

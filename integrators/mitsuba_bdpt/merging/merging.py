@@ -114,7 +114,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
 
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
         """Mask: by its side alone a merge at ``vertex`` may count; ``connection``: c of the edge to it."""
-        possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged)
+        absorbed = vertex.volume & spectra.is_zero(vertex.throughput)
+        possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged) & ~absorbed
         return possible & mis.exceeds(self.kappa_eta(vertex), connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
@@ -286,8 +287,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
             exclude=[z, photons, r, radius, tag, last, level, first],
         ):
             through = place >= end  # the next cell
-            number = dr.tzcnt(cells)
-            bucket = bucket_of(_neighbour(first, number), level, tag)
+            bucket = bucket_of(_neighbour(first, dr.tzcnt(cells)), level, tag)
             place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
             end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
             cells = dr.select(through, cells & (cells - 1), cells)
