@@ -49,18 +49,15 @@ def results(client, function, arguments):
     try:
         for future in as_completed(list(futures)):
             index = futures.pop(future)
-            yield index, _result(future, index)
+            try:
+                found = future.result()
+            except Exception as error:
+                text = str(error) or type(error).__name__
+                raise FailureError(f"part {index} failed on the cluster: {text}") from error
+            yield index, found
     finally:
         with contextlib.suppress(Exception):  # the scheduler may be gone
             client.cancel(list(futures), force=True)
-
-
-def _result(future, index: int):
-    try:
-        return future.result()
-    except Exception as error:
-        text = str(error) or type(error).__name__
-        raise FailureError(f"part {index} failed on the cluster: {text}") from error
 
 
 def worker_count(client) -> int:

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..geometry.boxes import asked_anew, boxes
+from ..geometry.boxes import asked_anew, known_box
 from .records import Factor
 
 DETAIL = 0.25  # longest side of a detail's bounding box, relative to the scene's
@@ -72,13 +72,14 @@ class Disks:
     """
 
     def __init__(self, scene, about: Callable = asked_anew):
-        each, box = boxes(scene, about), mi.ScalarBoundingBox3f()
+        found = (known_box(shape, about) for shape in scene.shapes())
+        each, box = [one for one in found if one is not None], mi.ScalarBoundingBox3f()
         for one in each:
             box.expand(one)
         sphere = box.bounding_sphere() if box.valid() else mi.ScalarBoundingSphere3f([0] * 3, 1)
         self.scene = BoundingSphere.about(sphere)
-        found = details(each, box) if box.valid() else None
-        self.details = BoundingSphere.about(found) if found is not None else None
+        small = details(each, box) if box.valid() else None
+        self.details = BoundingSphere.about(small) if small is not None else None
 
     def share(self, side: int) -> float:
         """Share of subpaths aimed at details; 0 unless they are smaller than one of ``side``^2 cells."""

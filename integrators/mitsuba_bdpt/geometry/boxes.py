@@ -43,12 +43,6 @@ def known_box(shape: mi.Shape, about: Callable[..., Any]) -> mi.ScalarBoundingBo
     return about("box", partial(box_of, shape), shape)
 
 
-def boxes(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> list[mi.ScalarBoundingBox3f]:
-    """Valid boxes of a scene's shapes; ``about`` as in `known_box`."""
-    found = (known_box(shape, about) for shape in scene.shapes())
-    return [box for box in found if box is not None]
-
-
 def scene_box(scene: mi.Scene, about: Callable[..., Any] = asked_anew) -> mi.ScalarBoundingBox3f:
     """Bounding box of a scene, including shapes that Mitsuba leaves out; ``about`` as in `known_box`."""
     whole = mi.ScalarBoundingBox3f(scene.bbox())
