@@ -296,6 +296,17 @@ def test_meters_of_one_ray_find_photons():
     np.testing.assert_allclose(found, centre, rtol=0.1)
 
 
+def test_sensors_of_one_ray_have_no_pixels():
+    """Mitsuba gives sensors of one's own differentials, of 0 where all rays are the same: no radius of 0, in
+    which a search would not end."""
+    o, d = mi.Point3f(CAMERA), dr.normalize(-mi.Vector3f(CAMERA))
+    ray = mi.RayDifferential3f(mi.Ray3f(o, d))
+    ray.o_x, ray.d_x, ray.has_differentials = o, d, True
+    sensor = SimpleNamespace(shutter_open=lambda: 0.0, sample_ray_differential=lambda *_: (ray, None))
+    found = Footprints.of(mi.load_dict(under_glass(point())), sensor)
+    assert not found.measured and found.median > 0
+
+
 def test_crop_windows_of_one_pixel_find_photons():
     """As many as in the whole film; standard deviation of the means: 18 and 8 %."""
     scene = under_glass(point())

@@ -44,7 +44,8 @@ def film_pixels(sensor: mi.Sensor) -> int:
     return math.prod(sensor.film().size())
 
 
-# Most change of the radius per distance, which the widths of cells allow for (`merging.cell_at`).
+# Most change of the radius per distance, which the widths of cells allow for (`merging.width_of`); a search
+# visits at most three levels, and buckets tell four apart (`merging.bucket_of`).
 _STEEPEST = 0.5
 
 # Most change per distance of the rounding error of a position, the least radius.
@@ -131,15 +132,14 @@ class Footprints:
         film = mi.Point2f(np.tile(grid, _PROBES), np.repeat(grid, _PROBES))
         ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, film, mi.Point2f(0.5))
         si = scene.ray_intersect(mi.Ray3f(ray))
-        found = np.isfinite(np.array(si.t))
-        if not ray.has_differentials or not found.any():
+        size = np.array(dr.norm(ray.o_x - ray.o + (ray.d_x - ray.d) * si.t))[np.isfinite(np.array(si.t))]
+        median = float(np.median(size)) if ray.has_differentials and len(size) else 0.0
+        if median == 0:  # a sensor of one ray has differentials of 0
             box = scene_box(scene)
             diagonal = math.dist([*box.min], [*box.max])
             size = diagonal * _OF_DIAGONAL if 0 < diagonal < math.inf else 1.0
             return Footprints((0.0, 0.0, 0.0), size, 0.0, size, measured=False)
-        spread = dr.norm(ray.d_x - ray.d)
-        size = np.array(dr.norm(ray.o_x - ray.o + (ray.d_x - ray.d) * si.t))
-        median, angle = float(np.median(size[found])), float(np.median(np.array(spread)))
+        angle = float(np.median(np.array(dr.norm(ray.d_x - ray.d))))
         if not isinstance(sensor, mi.ProjectiveCamera) or angle == 0:  # of one size, or from several origins
             return Footprints((0.0, 0.0, 0.0), median, 0.0, median)
         centre = world_matrix(sensor)[:3, 3]
