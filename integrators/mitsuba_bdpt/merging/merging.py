@@ -33,7 +33,7 @@ from ..transport.walk import Vertex
 from .radius import Balls, Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
 
-# Bits of a bucket's index in the hash table, and of the number of edges in what is sorted and searched.
+# Bits of a bucket's index in the hash table, and of the number of edges in sort keys and tags.
 BUCKET_BITS, EDGES_BITS = 20, 12
 
 # Factors of a cell's coordinates; M. Teschner et al., "Optimized Spatial Hashing for Collision Detection of
@@ -192,7 +192,7 @@ def coefficient(samples: float, radius: float) -> float:
 class Photons:
     """The photons of a pass, ``found`` (a `Photon` of arrays), sorted by bucket.
 
-    ``searched``: what a search needs of each, 8 numbers (position, flux; normal, tag), for two packet loads;
+    ``searched``: 8 numbers of each (position, flux; normal, `tag_of`), read by two packet loads;
     ``starts``: the first photon of each bucket, and the end of the last.
     """
 
@@ -208,7 +208,7 @@ class Photons:
 
 
 def tag_of(edges: mi.UInt32, wavelength_set: Any, medium: Any) -> mi.UInt32:
-    """A photon's kind, by its medium (0 on surfaces) and wavelengths, above `EDGES_BITS` of its edges."""
+    """Medium (0 on surfaces) and wavelength set of a photon, above `EDGES_BITS` of its number of edges."""
     kind = mi.UInt32(0) if medium is None else medium << SET_BITS
     if wavelength_set is not None:
         kind |= wavelength_set
@@ -228,7 +228,8 @@ def width_of(radius: Radius, level: mi.UInt32) -> mi.Float:
 def bucket_of(cell: mi.Point3i, level: mi.UInt32, tag: mi.UInt32) -> mi.UInt32:
     """The bucket of a ``cell`` in the hash table, for photons of the kind of ``tag``.
 
-    Its low bits are those of the level and of the coordinates: cells that one search visits differ in them.
+    Low bits: the level and the coordinates modulo 4. The cells of one search (at most three levels, three
+    per axis) differ in them, so that no photon is found twice.
     """
     word, low = tag >> EDGES_BITS, level & 3
     for axis, prime in enumerate(_PRIMES):
@@ -323,7 +324,7 @@ def _neighbour(first: mi.Point3i, number: mi.UInt32) -> mi.Point3i:
 
 
 def _flux_near(photons: Photons, index: mi.UInt32, z: Vertex, r, tag: mi.UInt32, active) -> mi.Float:
-    """Flux of the photon ``index`` if it counts as if it were at ``z``, else 0."""
+    """Flux of the photon ``index`` if it is merged at ``z``, else 0."""
     first = dr.gather(mi.Vector4f, photons.searched, 2 * index, active)
     second = dr.gather(mi.Vector4f, photons.searched, 2 * index + 1, active)
     own = dr.reinterpret_array(mi.UInt32, second.w)
