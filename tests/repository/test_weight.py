@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5097,
-    "transport merging guided_emission": 5808,
+    "transport merging guided_emission": 5807,
     "planning": 1733,
     "emitters": 2182,
     "cli": 1436,
@@ -29,8 +29,8 @@ MOST = {
     "sensors": 881,
     "": 1272,  # top files
 }
-OUTSIDE = {"scripts": 2839, "tests": 28519}
-MOST_WORDS = 30443
+OUTSIDE = {"scripts": 2839, "tests": 28530}
+MOST_WORDS = 30469
 
 
 def _lines(files):

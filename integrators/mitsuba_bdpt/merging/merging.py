@@ -228,8 +228,7 @@ def width_of(radius: Radius, level: mi.UInt32) -> mi.Float:
 def bucket_of(cell: mi.Point3i, level: mi.UInt32, tag: mi.UInt32) -> mi.UInt32:
     """The bucket of a ``cell`` in the hash table, for photons of the kind of ``tag``.
 
-    Low bits: the level and the coordinates modulo 4. The cells of one search (at most three levels, three
-    per axis) differ in them, so that no photon is found twice.
+    Low bits: level and coordinates modulo 4, different in all cells of one search (3 levels, 3 per axis).
     """
     word, low = tag >> EDGES_BITS, level & 3
     for axis, prime in enumerate(_PRIMES):

@@ -44,8 +44,7 @@ def film_pixels(sensor: mi.Sensor) -> int:
     return math.prod(sensor.film().size())
 
 
-# Most change of the radius per distance, which the widths of cells allow for (`merging.width_of`); a search
-# visits at most three levels, and buckets tell four apart (`merging.bucket_of`).
+# Most change of the radius per distance: bounds the widths of cells and, by 3, the levels of one search.
 _STEEPEST = 0.5
 
 # Most change per distance of the rounding error of a position, the least radius.
