@@ -47,11 +47,6 @@ gallery: $(INSTALLED)
 		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
 			--spp 256 -D resolution=192 && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
 	done
-	for scene in pool_floor lamp_in_glass_seen rough_glass_caustics frosted_glass_caustics pane frosted_bulb polished_metal \
-			pool_water bulb_in_fog_seen ice_in_milk smoke_globe; do \
-		$(VENV)/bin/mitsuba-bdpt render scenes/$$scene.xml -o renders/gallery/$$scene.exr \
-			--spp 256 -D resolution=192 -P merging=true && cp renders/gallery/$$scene.png docs/images/gallery || exit 1; \
-	done
 
 # The caustic below the glass ball, and what is seen in it.
 CAUSTICS := 0.28,0.86 0.3,0.7
@@ -73,6 +68,7 @@ pictures: $(INSTALLED)
 	done
 	$(VENV)/bin/mitsuba-bdpt equal-time lamp_behind_glass --spp 64 -o docs/images/lamp_behind_glass_equal_time.png
 	$(VENV)/bin/mitsuba-bdpt equal-time fog_caustic --spp 64 -o docs/images/fog_caustic_equal_time.png
+	$(VENV)/bin/mitsuba-bdpt equal-time pool_water --spp 64 -o docs/images/pool_water_equal_time.png
 	$(VENV)/bin/mitsuba-bdpt pyramid veach_bidir -o renders/pyramid.exr
 	cp renders/pyramid_weighted.png renders/pyramid_unweighted.png docs/images
 

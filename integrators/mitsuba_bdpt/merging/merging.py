@@ -330,7 +330,7 @@ def _flux_near(photons: Photons, index: mi.UInt32, z: Vertex, r, tag: mi.UInt32,
     # Of the same kind, with few enough edges.
     near = active & ((own >> EDGES_BITS) == (tag >> EDGES_BITS)) & (own <= tag)
     near &= _is_near(mi.Point3f(first.xyz), mi.Normal3f(second.xyz), z, r)
-    return dr.select(near, first.w, 0)
+    return dr.select(near, mi.Float(first.w), 0)
 
 
 def _is_near(p: mi.Point3f, n: mi.Normal3f, z: Vertex, r: mi.Float) -> mi.Bool:
