@@ -383,6 +383,28 @@ def test_which_photons_are_near():
     assert found == [True, True, False, True, True, True, True, False]
 
 
+def test_balls_end_at_the_surface_where_a_photon_comes_from():
+    """The part on its side, of 10^6 points of a ball, for each distance from the surface; all of a disc, and
+    of a ball whose photon comes from a volume."""
+    points = np.random.default_rng(1).normal(size=(1000000, 3))
+    points *= (
+        np.random.default_rng(2).uniform(size=(1000000, 1)) ** (1 / 3)
+        / np.linalg.norm(points, axis=1)[:, None]
+    )
+    h = np.array([0, 0.3, 0.9, 1.1])
+    expected = [(points[:, 2] > -x).mean() for x in h]
+    of_pass = merging.Merging(None, mi.Float(1), mi.Float(1))
+    of_pass.around = lambda *_: (mi.Float(2), None)
+    y = SimpleNamespace(
+        si=SimpleNamespace(p=mi.Point3f(5, 7, mi.Float(2 * h))), volume=mi.Bool(True), medium=None
+    )
+    start, n = mi.Point3f(1, -3, 0), mi.Normal3f(0, 0, -1)
+    np.testing.assert_allclose(of_pass.inside(y, start, n), expected, atol=2e-3)
+    np.testing.assert_array_equal(of_pass.inside(y, start, mi.Normal3f(0)), 1)
+    y.volume = mi.Bool(False)
+    np.testing.assert_array_equal(of_pass.inside(y, start, n), 1)
+
+
 def test_which_photons_are_of_a_kind():
     """Those of the same medium and the same wavelengths, with few enough edges; many count as 4,095."""
     edges, sets, media = mi.UInt32(3, 4, 3, 3, 5000), mi.UInt32(1, 1, 0, 1, 1), mi.UInt32(2, 2, 2, 0, 2)

@@ -52,6 +52,10 @@ class PhotonPolicy:
         """Mask: ``y`` is stored; the probability of that."""
         raise NotImplementedError
 
+    def inside(self, y: Vertex, start: mi.Point3f, n: mi.Normal3f) -> mi.Float | float:
+        """Part of the photon's disc or ball on its side of the plane through ``start`` with normal ``n``."""
+        return 1.0
+
 
 class GuidePhotons(PhotonPolicy):
     """Stores vertices with a lobe up to the first non-specular event, if s = 0 can sample the path."""
@@ -111,16 +115,21 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
     side = replace(side, connect=None, only_specular=policy.only_specular)
     present = kernel.heuristic.present
 
-    def visit(y, counters, walk):
+    # Normal of the surface where the edge starts, 0 in a volume or free space; without balls None.
+    boundary = mi.Normal3f(e.anchor.n) if kernel.space.phase is not None else None
+
+    def visit(y, state, walk):
+        counters, boundary = state
         keep, probability = policy.stored(kernel, y, stream)
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         arriving, medium = kernel.space.before_event(y, walk.d)
+        inside = 1.0 if boundary is None else policy.inside(y, walk.o, boundary)
         found = Photon(
             p=y.si.p,
             d=-walk.d,
             n=y.si.n,
-            flux=arriving / probability,
+            flux=arriving / (probability * inside),
             connection=present(newest_connection(kernel, y, adjoint=True)),
             d_vc=present(y.partial.d_vc),
             d_vm=present(y.partial.d_vm),
@@ -135,9 +144,10 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
         )
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         out.put(found, place, keep & (place < most))
-        return counters + Counters(photons=one(keep))
+        return counters + Counters(photons=one(keep)), None if boundary is None else y.si.n
 
-    counters, walk = random_walk(kernel, side, begun, visit, Counters.zeros("photons"))
+    state = Counters.zeros("photons"), boundary
+    (counters, _), walk = random_walk(kernel, side, begun, visit, state)
     rays = dr.select(begun.active, walk.traced(), 0)
     counts = (counters + Counters(photon=rays, non_finite=one(walk.broken))).summed()
     broken = dr.zeros(mi.Bool, kernel.emitters.count)
