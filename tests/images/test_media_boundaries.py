@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import variants
 from mitsuba_bdpt.geometry import rays
+from mitsuba_bdpt.media import tracking
 from mitsuba_bdpt.media.equal import representatives
 from mitsuba_bdpt.media.media import MediumProperties
 from mitsuba_bdpt.media.transmittance import through_surfaces
@@ -224,6 +225,19 @@ def test_media_are_told_apart_by_what_they_are(variant):
     for name, (one, other, equal) in PAIRS.items():
         media = [mi.load_dict(fog(0.1)), mi.load_dict(one()), mi.load_dict(other())]
         assert representatives([MediumProperties(m) for m in media]) == [0, 1, 1 if equal else 2], name
+
+
+def test_transmittance_of_a_grid_is_not_negative():
+    """Where the extinction between equal values exceeds its majorant by rounding."""
+    medium = parts.grid(np.full((4, 4, 4), 0.7), [-0.5] * 3, 1.0, 5.0, 0.5)
+    box = parts.box([-0.5] * 3, 1.0, interior=medium)
+    media, _ = prepared(
+        mi.load_dict({"type": "scene", "sensor": parts.sensor(), "box": box, "sky": {"type": "constant"}})
+    )
+    word = dr.arange(mi.UInt32, 1 << 14)
+    ray = mi.Ray3f(mi.Point3f(-0.5, 0.1, 0.2), dr.normalize(mi.Vector3f(1, 0.1, 0.2)))
+    found, *_ = tracking.ratio(media, mi.UInt32(1), ray, mi.Float(1), word, mi.Bool(True))
+    assert np.array(found).min() == 0
 
 
 def test_media_of_python_are_equal_to_themselves_only():

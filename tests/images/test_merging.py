@@ -140,14 +140,16 @@ def through_water(mu):
 def seen_in_water(sigma, albedo, g, mu, mu0, r):
     """Radiance by one scattering, of extinction ``sigma`` (colours, depths), and of a bed of reflectance 0.2.
 
-    Fluence is the mean over the part of the ball of radius ``r`` that lies in the water.
+    Fluence is that in the ball of radius ``r``, each photon's over the part of its ball below the surface.
     """
     (cos, seen), (cos0, sunlit) = through_water(mu), through_water(mu0)
     step = 1 / sigma.shape[1]
     depth = np.cumsum(sigma, axis=1) * step
     height = np.arange(-int(r / step), int(r / step) + 1) * step / r
     ball = (1 - height**2) / (1 - height**2).sum()
-    fluence = [np.convolve(np.exp(-of / cos0), ball, "same") for of in depth - sigma * step / 2]
+    h = np.minimum((np.arange(sigma.shape[1]) + 0.5) * step / r, 1)
+    below = 1 - (1 - h) ** 2 * (2 + h) / 4
+    fluence = [np.convolve(np.exp(-of / cos0) / below, ball, "same") for of in depth - sigma * step / 2]
     scattered = (sigma * fluence * np.exp((sigma * step / 2 - depth) / cos)).sum(1) * step / cos
     turn = np.sqrt((1 - cos**2) * (1 - cos0**2)) - cos * cos0
     phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * turn) ** 1.5)
@@ -196,7 +198,7 @@ WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radiu
 
 @pytest.mark.parametrize("name", WATERS)
 def test_the_sun_in_water(name, monkeypatch):
-    """Also what balls lack at the surface, up to a tenth. One pass of 256 samples per pixel."""
+    """Also what balls lack at the bed, up to a tenth. One pass of 256 samples per pixel."""
     monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
     make, *water, mu, mu0, radius = WATERS[name]
     sun = {"type": "directional", "direction": [np.sqrt(1 - mu0 * mu0), 0, -mu0], "irradiance": 1.0}

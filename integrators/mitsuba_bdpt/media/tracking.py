@@ -61,11 +61,12 @@ def delta(media: Media, number, ray, end, rest, throughput, word, active):
         t = dr.select(tentative, t + rest / majorant, t)
         mei = interaction(ray(t), ray.d, ray)
         _, sigma_t = media.query(number, coefficients, mei, tentative)
-        null = dr.mean(majorant - sigma_t)
+        left_out = dr.maximum(majorant - sigma_t, 0)  # interpolation exceeds a majorant by rounding
+        null = dr.mean(left_out)
         u, word = sequential(word)
         # The probability of a real collision is the mean over channels; the channels' ratios remain.
         passed = tentative & (u * majorant < null)
-        left_over = polarization.scaled(throughput, (majorant - sigma_t) / null)
+        left_over = polarization.scaled(throughput, left_out / null)
         throughput = dr.select(passed, left_over, throughput)
         met = dr.select(tentative & ~passed, t, met)
         u, word = sequential(word)
@@ -95,7 +96,7 @@ def ratio(media: Media, number, ray, end, word, active):
         collisions += dr.select(going, mi.UInt32(1), 0)
         mei = interaction(ray(dr.select(going, t, 0)), ray.d, ray)
         _, sigma_t = media.query(number, coefficients, mei, going)
-        transmittance = dr.select(going, transmittance * (1 - sigma_t / majorant), transmittance)
+        transmittance = dr.select(going, transmittance * dr.maximum(1 - sigma_t / majorant, 0), transmittance)
         going &= ~dr.all(transmittance == 0)
     depth = dr.select(inside, media.mean(number) * (high - low), 0)
     return transmittance, depth, word, collisions

@@ -115,7 +115,7 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
     side = replace(side, connect=None, only_specular=policy.only_specular)
     present = kernel.heuristic.present
 
-    # Normal of the surface where the edge starts, 0 in a volume or free space; without balls None.
+    # Normal of the surface where the edge starts; 0 in volumes, at null BSDFs; None if no medium scatters.
     boundary = mi.Normal3f(e.anchor.n) if kernel.space.phase is not None else None
 
     def visit(y, state, walk):
@@ -144,7 +144,9 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
         )
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         out.put(found, place, keep & (place < most))
-        return counters + Counters(photons=one(keep)), None if boundary is None else y.si.n
+        if boundary is not None:
+            boundary = dr.select(mi.has_flag(y.bsdf.flags(), mi.BSDFFlags.Null), 0, y.si.n)
+        return counters + Counters(photons=one(keep)), boundary
 
     state = Counters.zeros("photons"), boundary
     (counters, _), walk = random_walk(kernel, side, begun, visit, state)
