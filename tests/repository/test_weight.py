@@ -15,11 +15,11 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5097,
-    "transport merging guided_emission": 5807,
+    "transport merging guided_emission": 5825,
     "planning": 1733,
     "emitters": 2182,
     "cli": 1436,
-    "media": 1345,
+    "media": 1346,
     "geometry": 1423,
     "image": 1297,
     "files": 845,
@@ -29,8 +29,8 @@ MOST = {
     "sensors": 881,
     "": 1272,  # top files
 }
-OUTSIDE = {"scripts": 2839, "tests": 28530}
-MOST_WORDS = 30469
+OUTSIDE = {"scripts": 2839, "tests": 28569}
+MOST_WORDS = 30713
 
 
 def _lines(files):
