@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5097,
-    "transport merging guided_emission": 5825,
+    "transport merging guided_emission": 5827,
     "planning": 1733,
     "emitters": 2182,
     "cli": 1436,
@@ -30,7 +30,7 @@ MOST = {
     "": 1272,  # top files
 }
 OUTSIDE = {"scripts": 2839, "tests": 28569}
-MOST_WORDS = 30796
+MOST_WORDS = 30753
 
 
 def _lines(files):

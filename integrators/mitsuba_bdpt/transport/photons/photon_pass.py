@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -35,10 +36,11 @@ def photons_of(samples: int, each: int = 1, most: int = MOST_OF_GUIDE) -> int:
 class PhotonPolicy:
     """Which photon subpaths are followed, and which of their vertices are stored.
 
-    ``only_specular``: see `Side`.
+    ``only_specular``: see `Side`; ``balls``: photons in media fill some, see `inside`.
     """
 
     only_specular: float = math.inf
+    balls: Any = None
 
     def emission(self, e: Emission, aim: mi.Float) -> tuple[Emission, mi.Float]:
         """The emission with which a subpath begins, and `Photon.aim`, given what `Aim` sampled."""
@@ -115,8 +117,8 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
     side = replace(side, connect=None, only_specular=policy.only_specular)
     present = kernel.heuristic.present
 
-    # Normal of the surface where the edge starts; 0 in volumes, at null BSDFs; None if no medium scatters.
-    boundary = mi.Normal3f(e.anchor.n) if kernel.space.phase is not None else None
+    # Normal of the surface where the edge starts; 0 in volumes, at null BSDFs; None without balls.
+    boundary = None if policy.balls is None else mi.Normal3f(e.anchor.n)
 
     def visit(y, state, walk):
         counters, boundary = state
