@@ -30,7 +30,7 @@ MOST = {
     "": 1272,  # top files
 }
 OUTSIDE = {"scripts": 2839, "tests": 28569}
-MOST_WORDS = 30753
+MOST_WORDS = 30778
 
 
 def _lines(files):
