@@ -133,7 +133,7 @@ def sort(merging: Merging, photons: Photon, count: int) -> Photons:
     tag = tag_of(found.edges, None if sets is None else sets.number(found.lane), found.medium)
     bucket = bucket_of(mi.Point3i(dr.floor(found.p / width_of(radius, level))), level, tag)
     key = (mi.UInt64(bucket) << (_LANE_BITS + EDGES_BITS)) | (mi.UInt64(found.lane) << EDGES_BITS)
-    order = dr.argsort(key | mi.UInt64(dr.minimum(found.edges, (1 << EDGES_BITS) - 1)))
+    order = dr.argsort(key | mi.UInt64(tag & ((1 << EDGES_BITS) - 1)))
     counts = dr.zeros(mi.UInt32, (1 << BUCKET_BITS) + 1)
     dr.scatter_add(counts, mi.UInt32(1), bucket + 1, index < dr.opaque(mi.UInt32, count))
     result = Photons.of(found.at(order), dr.gather(mi.UInt32, tag, order), dr.cumsum(counts))

@@ -54,9 +54,9 @@ class PhotonPolicy:
         """Mask: ``y`` is stored; the probability of that."""
         raise NotImplementedError
 
-    def inside(self, y: Vertex, start: mi.Point3f, n: mi.Normal3f) -> mi.Float | float:
-        """Part of the photon's disc or ball on its side of the plane through ``start`` with normal ``n``."""
-        return 1.0
+    def inside(self, y: Vertex, start: mi.Point3f, n: mi.Normal3f) -> mi.Float:
+        """Part of the photon's ball on its side of the plane at ``start`` with normal ``n``; 1 of a disc."""
+        raise NotImplementedError
 
 
 class GuidePhotons(PhotonPolicy):
