@@ -199,7 +199,7 @@ WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radiu
 @pytest.mark.parametrize("name", WATERS)
 def test_the_sun_in_water(name, monkeypatch):
     """Also what balls lack at the bed, up to a tenth. One pass of 256 samples per pixel."""
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
+    monkeypatch.setattr(passes, "IN_MEDIA", 1)
     make, *water, mu, mu0, radius = WATERS[name]
     sun = {"type": "directional", "direction": [np.sqrt(1 - mu0 * mu0), 0, -mu0], "irradiance": 1.0}
     look = transform().look_at([10 * np.sqrt(1 - mu * mu), 0, 10 * mu], [0, 0, 0], [0, 1, 0])
@@ -228,7 +228,7 @@ def test_a_globe_of_white_fog_is_invisible(globe, way, monkeypatch):
     """Glass around a medium of albedo 1 inside of a glowing sphere, all vertices merged; balls at the surface
     lack 0.5 % of the image's light."""
     monkeypatch.setattr(mis, "MERGE_DOMINATED", 0.0)
-    monkeypatch.setattr(passes, "SAMPLES_PER_PHOTON", 1)
+    monkeypatch.setattr(passes, "IN_MEDIA", 1)
     ball = fogs.ball(glass(), 0.4, (0, 0, 0), interior=GLOBES[globe]())
     eye = scenes.camera(origin=(0, 0, 0.95), target=(0, 0, 0), size=SIZE)
     glowing = fogs.wall(bsdf=matte(0.5), emitter=scenes.area(0.5))
@@ -238,10 +238,9 @@ def test_a_globe_of_white_fog_is_invisible(globe, way, monkeypatch):
     st.check_known(found, 1.0, relative=0.05, rounding=0.005)
 
 
-def test_blur_goes_as_the_square_of_the_radius(monkeypatch):
+def test_blur_goes_as_the_square_of_the_radius():
     """What discs of 1.5 and 3 pixels lack of those of half a pixel is as 1 : 4.4, with a standard error of
     0.5; between 3 and 7 (of the radius itself it would be 2.5, of its cube 8.3)."""
-    monkeypatch.setattr(passes, "_PER_DISC", 1 << 18)
     scene = mi.load_dict(under_glass(point() | {"position": [0.0, 0.0, 1.5]}))
     small, middle, large = (
         images(scene, 128, 6, merging=True, merging_radius=r).mean() for r in (0.5, 1.5, 3.0)
@@ -268,7 +267,6 @@ def test_far_from_the_origin(monkeypatch):
     Rays leave surfaces by 0.02: 1.7 % brighter. Standard error 0.4 %."""
     monkeypatch.setattr(passes, "coefficient", lambda *_: 1.0)
     monkeypatch.setattr(photon_pass, "FEWEST_PHOTONS", 1 << 17)
-    monkeypatch.setattr(passes, "_PER_DISC", 1 << 17)
     near, far = (
         images(under_a_spot(away), 16, 1, merging=True, merging_radius=radius).mean()
         for away, radius in (([0, 0, 0], 1.0), ([1e4, -1e4, 7e3], 0.1))
@@ -363,6 +361,7 @@ def test_no_photons_lie_where_a_medium_absorbs_only():
 def test_cells_may_share_a_bucket(monkeypatch):
     """The image does not depend on which photon of a disc is drawn. Only the bits of a bucket that cells of
     one search differ in remain."""
+    monkeypatch.setattr(passes, "PER_CELL", 1 << 20)
     scene = mi.load_dict(under_glass(point()))
     expected = images(scene, 16, 1, merging=True)
     for module in (passes, merging):
@@ -497,7 +496,7 @@ def test_camera_vertices_that_share_photons_are_not_independent():
     balls = Balls(radius, SimpleNamespace(mean=lambda medium: dr.gather(mi.Float, mi.Float(sigma), medium)))
     of_pass = merging.Merging(radius, mi.Float(1e4), mi.Float(1e-4), balls=balls)
     si, medium = SimpleNamespace(p=mi.Point3f(0)), mi.UInt32(0, 1, 2)
-    found = of_pass.kappa_eta(SimpleNamespace(si=si, volume=medium > 0, medium=medium))
+    found = of_pass.kappa_eta(SimpleNamespace(si=si, volume=medium > 0, medium=medium, sds=None))
     r = 1 / (1 / 0.5 + sigma / 0.2)
     disc, ball = np.pi * 0.5**2, 1e4 * 4 / 3 * np.pi * r**3 * sigma
     np.testing.assert_allclose(of_pass.around(si.p, medium > 0, medium)[0], r, rtol=1e-5)

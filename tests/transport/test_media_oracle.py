@@ -327,7 +327,8 @@ def test_kernel_in_fog_agrees_with_explicit_densities(kind, heuristic, monkeypat
         eta = COUNT * np.where(paths.extinction != 1, 4 / 3 * np.pi * BALL**3, np.pi * DISC**2)
         explicit = oracle.Explicit(paths, oracle.Coefficients())
         if least:
-            explicit = oracle.Merged(paths, oracle.Coefficients(), eta, float(least), heuristic)
+            volume = paths.extinction != 1
+            explicit = oracle.Merged(paths, oracle.Coefficients(), eta, float(least), heuristic, volume)
         expected = explicit.weights(heuristic)
         np.testing.assert_allclose(expected.sum(1), 1, atol=1e-9)
         for i, (path, volume, weights) in enumerate(

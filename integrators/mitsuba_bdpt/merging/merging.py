@@ -28,7 +28,7 @@ from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import TraceContext
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
-from ..transport.sds import PhotonStrategy, State
+from ..transport.sds import PhotonStrategy, State, is_spread
 from ..transport.walk import Vertex
 from .radius import Balls, Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
@@ -56,14 +56,16 @@ class Merging(PhotonStrategy, PhotonPolicy):
     """Vertex merging in one pass; stores photons at all vertices where merges may count.
 
     ``radius`` of discs (surfaces); ``count``: photon subpaths that merge with a camera subpath; ``kappa``:
-    coefficient of merges in all weights, see `coefficient`; ``photons``: `Photons`, None while they are
-    traced; ``wavelengths``: `WavelengthSets` in spectral variants, where photons merge with camera subpaths
-    of the same set; ``balls``: radius in media, None if no medium scatters. Numbers are opaque ``Float``.
+    coefficient of merges in all weights, see `coefficient`; ``tested``: most photons of a cell that a search
+    tests; ``photons``: `Photons`, None while they are traced; ``wavelengths``: `WavelengthSets` in spectral
+    variants, where photons merge with camera subpaths of the same set; ``balls``: radius in media, None if no
+    medium scatters. Numbers are opaque ``Float``.
     """
 
     radius: Radius
     count: mi.Float
     kappa: mi.Float
+    tested: mi.Float | float = dr.inf
     photons: Any = None
     wavelengths: WavelengthSets | None = None
     balls: Balls | None = None
@@ -94,13 +96,17 @@ class Merging(PhotonStrategy, PhotonPolicy):
         disc = self.kappa * (self.count * dr.pi * dr.square(self.radius.at(vertex.si.p)))
         if self.balls is not None:  # kappa of a ball: a disc's over the probability of a collision, at most 1
             disc = dr.select(vertex.volume, dr.minimum(self.eta(vertex), disc), disc)
+        if vertex.sds is not None and vertex.sds.spread is not None:
+            disc = dr.select(vertex.sds.spread, 0, disc)
         return dr.minimum(disc, mis.SATURATION)
 
     def begin_light(self, kernel, walk):
         zero = kernel.heuristic.zero()
         return replace(walk, partial=replace(walk.partial, d_vm=zero, d_vm_newest=zero))
 
-    begin_camera = begin_light
+    def begin_camera(self, kernel, walk):
+        state = None if self.balls is None else State(spread=mi.Bool(False))
+        return replace(self.begin_light(kernel, walk), sds=state)
 
     def begin(self, kernel, e, walk):
         return replace(walk, sds=State(survived=mi.Float(1)))
@@ -109,19 +115,20 @@ class Merging(PhotonStrategy, PhotonPolicy):
         # Also at the median radius: the subpath may go on to where discs are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
         most = dr.maximum(self.kappa_eta(vertex), median)
-        survived = dr.minimum(state.survived, _probability(partial.d_vc, most))
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, most, vertex.volume))
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
         """Mask: by its side alone a merge at ``vertex`` may count; ``connection``: c of the edge to it."""
         absorbed = vertex.volume & spectra.is_zero(vertex.throughput)
         possible = vertex.hit & vertex.connectible() & (vertex.edges < kernel.last_merged) & ~absorbed
-        return possible & mis.exceeds(self.kappa_eta(vertex), connection)
+        merge = self.kappa_eta(vertex)
+        return possible & (merge > 0) & mis.exceeds(merge, connection)
 
     def kept(self, kernel: TraceContext, vertex, survived: mi.Float | float = 1.0) -> mi.Float:
         """Probability of sampling merges at ``vertex``, over that with which its subpath ``survived``."""
         d_vc = kernel.heuristic.scale(vertex.partial.d_vc, vertex.cos)  # before the edge to it
-        return dr.minimum(_probability(d_vc, self.kappa_eta(vertex)) / survived, 1)
+        return dr.minimum(_probability(d_vc, self.kappa_eta(vertex), vertex.volume) / survived, 1)
 
     def stored(self, kernel, y, stream):
         keep = self.may_merge(kernel, y, newest_connection(kernel, y, adjoint=True))
@@ -143,7 +150,10 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
-        light = mis.Partial(0, y.d_vc, y.d_vm, y.d_vm_newest), y.connection, f.pdf_fwd_w
+        before = y.d_vm, y.d_vm_newest
+        if self.balls is not None:
+            before = (dr.select(is_spread(f), 0, x) for x in before)
+        light = mis.Partial(0, y.d_vc, *before), y.connection, f.pdf_fwd_w
         camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic
         connections = h.combine(y.connection, newest_connection(kernel, z, adjoint=False))
@@ -178,11 +188,12 @@ def _connection(kernel: TraceContext, z: Vertex) -> mis.PartialSum:
     return newest_connection(kernel, z, adjoint=False, prime=True)
 
 
-def _probability(d_vc: mis.PartialSum, merge: mi.Float) -> mi.Float:
+def _probability(d_vc: mis.PartialSum, merge: mi.Float, volume: mi.Bool) -> mi.Float:
     """Probability of sampling a ``merge`` of this partial sum; ``d_vc`` before the edge to it."""
     if mis.is_absent(d_vc):
         return mi.Float(1)
-    return dr.minimum(SLACK * dr.pi * merge / (mis.MERGE_DOMINATED * d_vc), 1)
+    measure = dr.select(volume, 4 * dr.pi, dr.pi)
+    return dr.minimum(SLACK * measure * merge / (mis.MERGE_DOMINATED * d_vc), 1)
 
 
 def coefficient(samples: float, radius: float) -> float:
@@ -286,7 +297,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
     tag = tag_of(most, wavelength_set, medium)
     while dr.hint(level <= last, label="grids of photons", exclude=[z, photons, r, radius, tag, last]):
         first, cells = _overlapped(z.si.p, r, width_of(radius, level))
-        place, end = mi.UInt32(0), mi.UInt32(0)
+        place, end, step = mi.UInt32(0), mi.UInt32(0), mi.UInt32(1)
         while dr.hint(
             (cells != 0) | (place < end),
             label="photons near a camera vertex",
@@ -294,18 +305,23 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
         ):
             through = place >= end  # the next cell
             bucket = bucket_of(_neighbour(first, dr.tzcnt(cells)), level, tag)
-            place = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket, through), place)
+            start = dr.gather(mi.UInt32, photons.starts, bucket, through)
             end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
             cells = dr.select(through, cells & (cells - 1), cells)
+            # Of many photons one in ``step``, from a random one on.
+            many = dr.maximum(dr.ceil(mi.Float(end - start) / merging.tested), 1)
+            step = dr.select(through, mi.UInt32(many), step)
+            u, _ = sequential(~word)
+            place = dr.select(through, start + mi.UInt32(u * mi.Float(step)), place)
 
             tried = place < end
-            size = _flux_near(photons, place, z, r, tag, tried)
+            size = _flux_near(photons, place, z, r, tag, tried) * mi.Float(step)
             u, after = sequential(word)
             total, take, _ = offer(total, size, u)
             take &= tried
             word = dr.select(tried, after, word)
             chosen = dr.select(take, place, chosen)
-            place += dr.select(tried, mi.UInt32(1), 0)
+            place += dr.select(tried, step, 0)
         level += 1
     return chosen, total
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import drjit as dr
@@ -29,10 +28,11 @@ from .merging import (
 from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
-SAMPLES_PER_PHOTON = 8  # camera samples of a pass per photon subpath (experiments, "Vertex merging")
+# Camera samples of a pass per photon subpath, also in media (experiments, "Vertex merging", "Merging in media").
+SAMPLES_PER_PHOTON, IN_MEDIA = 4, 2
 
-# Most photon subpaths of a pass per disc of its radius on the film: bounds the cost of a merge.
-_PER_DISC = 64
+# Most photons of a cell that a search tests, more where there are fewer camera samples than photon subpaths.
+PER_CELL = 4
 
 # Samples per pixel of a pass; with near-specular lobes or without light subpaths, where many vertices merge;
 # least samples of a pass. Merged photons grow with their square (experiments, "Which paths are merged").
@@ -85,32 +85,26 @@ class Passes:
         ``samples`` per pixel of the pass, ``done`` before it in all parts of the image: their sum gives the
         radius. ``start``: see `WavelengthSets.of`, None but in spectral variants.
         """
-        end = done + samples
-        if self._footprints.measured:
-            radius = after(self._radius, end)  # in pixels
-            count = photons_of_pass(samples * self._uncropped, self._uncropped, radius)
-        else:
-            end = end * self._pixels / _METER_PIXELS
-            radius = after(self._radius, end)
-            count = max(photons_of_pass(samples * self._pixels, math.inf, radius), _METER_PHOTONS)
+        measured = self._footprints.measured
+        end = (done + samples) * (1 if measured else self._pixels / _METER_PIXELS)
+        radius = after(self._radius, end)  # in pixels
+        of_film = samples * (self._uncropped if measured else self._pixels)
+        each = SAMPLES_PER_PHOTON if kernel.space.phase is None else IN_MEDIA
+        count = photon_pass.photons_of(of_film, each, photon_pass.MOST_OF_PASS)
+        count = count if measured else max(count, _METER_PHOTONS)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)
             count = max(count // sets, 1) * sets
         kappa = coefficient(samples / sets, radius)
-        # Photon subpaths beyond one per `SAMPLES_PER_PHOTON` would make ordinary paths merge-dominated.
-        kappa *= min(1.0, samples * self._pixels / (SAMPLES_PER_PHOTON * count))
-        kappa, met = (dr.opaque(mi.Float, x) for x in (kappa, count / sets))
+        # More photon subpaths than that would make ordinary paths merge-dominated.
+        kappa *= min(1.0, samples * self._pixels / (each * count))
+        tested = PER_CELL * max(1.0, count / (samples * self._pixels))
+        kappa, met, tested = (dr.opaque(mi.Float, x) for x in (kappa, count / sets, tested))
         balls = self._footprints.balls(after(BALLS * self._radius, end, 3), kernel.space)
         discs = self._footprints.radius(radius)
-        merging = Merging(discs, met, kappa, wavelengths=wavelengths, balls=balls)
+        merging = Merging(discs, met, kappa, tested, wavelengths=wavelengths, balls=balls)
         return trace(kernel, merging, self._aim, points, count)
-
-
-def photons_of_pass(samples: int, pixels: float, radius: float) -> int:
-    """Number of photon subpaths of a pass; ``samples`` of the whole film, ``radius`` in pixels."""
-    most = max(_PER_DISC * pixels / (math.pi * radius**2), 64)
-    return int(min(photon_pass.photons_of(samples, SAMPLES_PER_PHOTON, photon_pass.MOST_OF_PASS), most))
 
 
 def trace(

@@ -6,10 +6,12 @@ where ``adjoint``, else of camera subpaths.
 
 from __future__ import annotations
 
+import drjit as dr
 import mitsuba as mi
 
 from . import mis
 from .inputs import TraceContext
+from .sds import is_spread
 
 
 def where_lit(kernel: TraceContext, lit: mi.Bool | None) -> mis.Coefficient:
@@ -55,19 +57,25 @@ def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
     return possible if state is None else possible & state.isolated
 
 
-def side_of(kernel: TraceContext, vertex, adjoint: bool, pdf_rev_w, pdf_a) -> tuple:
+def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, spread=None) -> tuple:
     """Other strategies on the side of a connected ``vertex``.
 
+    ``f``: its `bsdf.Evaluation`; ``pdf_a`` as in `mis.alternatives`; ``spread``, of a light vertex: mask,
+    `sds.is_spread` an event of the camera subpath; None: at none.
     Returns `mis.alternatives`, and a tuple for `Heuristic.weigh`: `mis.merges`, empty without merging.
     """
     h, partial = kernel.heuristic, vertex.partial
     newest = newest_coefficient(kernel, vertex, adjoint)
-    found = mis.alternatives(h, partial, newest, pdf_rev_w, pdf_a)
+    found = mis.alternatives(h, partial, newest, f.pdf_rev_w, pdf_a)
     if not kernel.sds.merges:
         return found, ()
     kappa_prime = newest_coefficient(kernel, vertex, adjoint, prime=True)
     kappa_eta = kernel.sds.kappa_eta(vertex)
-    return found, (mis.merges(h, partial, kappa_prime, pdf_rev_w, pdf_a, kappa_eta),)
+    there, older = mis.merges(h, partial, kappa_prime, f.pdf_rev_w, pdf_a, kappa_eta)
+    if adjoint and kernel.sds.balls is not None:
+        older = dr.select(is_spread(f), 0, older)
+        there, older = (x if spread is None else dr.select(spread, 0, x) for x in (there, older))
+    return found, ((there, older),)
 
 
 def merges_before_end(

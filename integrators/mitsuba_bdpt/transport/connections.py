@@ -23,7 +23,7 @@ from .contribution import (
 from .inputs import TraceContext
 from .light_path import LightPath, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
-from .sds import connects_sds_path
+from .sds import connects_sds_path, is_spread
 from .vacuum import ShadowRay
 from .walk import PathVertex, Vertex
 
@@ -50,10 +50,9 @@ def inner(kernel: TraceContext, z: Vertex, y: PathVertex) -> Contribution:
     active &= ~spectra.is_zero(value)
 
     own = kernel.kappa.inner
-    at_y = f_y.pdf_rev_w, f_z.pdf_fwd_w * cos_y * inverse
-    at_z = f_z.pdf_rev_w, f_y.pdf_fwd_w * cos_z * inverse
-    light_side, merges_y = side_of(kernel, y, True, *at_y)
-    camera_side, merges_z = side_of(kernel, z, False, *at_z)
+    spread = None if kernel.sds.balls is None else z.sds.spread | is_spread(f_z)
+    light_side, merges_y = side_of(kernel, y, True, f_y, f_z.pdf_fwd_w * cos_y * inverse, spread)
+    camera_side, merges_z = side_of(kernel, z, False, f_z, f_y.pdf_fwd_w * cos_z * inverse)
     if kernel.sds.near_specular:
         newest_y, newest_z = newest_coefficient(kernel, y, True), newest_coefficient(kernel, z, False)
         active &= ~connects_sds_path(k, (y.sds, f_y, newest_y), (z.sds, f_z, newest_z))

@@ -7,6 +7,7 @@ guide through near-specular events, on which all strategies but s = 0 and s = 1 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,13 +20,17 @@ from .near_specular import SPECULAR, is_narrow
 FEWEST_EDGES = 3  # edges of the shortest guided path: no photon directly from the emitter guides
 
 
+_SPREAD = 1.001 / (4 * math.pi)  # density of isotropic scattering (1 / sr), and its rounding error
+
+
 @dataclass
 class State:
     """State of a subpath that may be part of an SDS path; fields that are not needed are None.
 
     ``isolated``: no edge is connectible; ``only_delta``, with guiding: all events were delta; ``guided``, on
     camera subpaths with guiding: r, the guide's densities over the BSDF's; ``survived``, on photon
-    subpaths with merging: product of `PhotonStrategy.survival`. Where near-specular events count as specular:
+    subpaths with merging: product of `PhotonStrategy.survival`; ``spread``, on camera subpaths that merge in
+    media: an event `is_spread`. Where near-specular events count as specular:
     ``specular``, the last event was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term
     of the last vertex, not in ``guided``: that vertex does not guide if the next one is the end.
     """
@@ -37,6 +42,7 @@ class State:
     specular: Any = None
     diffuse: Any = None
     newest: Any = None
+    spread: Any = None
 
     def scattered(self, specular: mi.Bool, coefficient: mis.Coefficient) -> State:
         """The state after an event; ``coefficient`` of the connection of the edge to it."""
@@ -98,6 +104,14 @@ def is_specular(f) -> mi.Bool:
     return is_narrow(f, SPECULAR)
 
 
+def is_spread(f) -> mi.Bool:
+    """Mask: scattering in a volume of at most the density of isotropic scattering, the same from both sides.
+
+    Camera subpaths merge at it, not after it (docs/method/merging_in_media.md). ``f`` as in `is_specular`.
+    """
+    return f.volume & (dr.maximum(f.pdf_fwd_w, f.pdf_rev_w) <= _SPREAD)
+
+
 @dataclass
 class Advice:
     """The guide at a vertex: ``active`` where s = 0 can be guided.
@@ -119,13 +133,15 @@ class PhotonStrategy:
     """A further strategy for SDS paths: hooks of the kernel, which add nothing here.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined;
+    subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined, in
+    volumes too with ``balls``;
     ``near_specular``: near-specular events count as specular.
     """
 
     counters: tuple[str, ...] = ()
     wavelengths: Any = None
     merges = False
+    balls: Any = None
     near_specular = False
 
     def kappa_eta(self, vertex) -> mi.Float:

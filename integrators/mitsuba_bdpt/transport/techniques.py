@@ -115,8 +115,7 @@ def next_event(kernel: TraceContext, z: Vertex, stream: Stream, sds: PhotonStrat
     active = active & ~spectra.is_zero(value)
 
     light_side = h.scale(h.start(dr.select(e.delta, 0, f.pdf_fwd_w / e.pdf_w)), kernel.kappa.hit)
-    densities = f.pdf_rev_w, e.emission_ratio * z.cosine(e.d)
-    camera_side, merges = side_of(kernel, z, False, *densities)
+    camera_side, merges = side_of(kernel, z, False, f, e.emission_ratio * z.cosine(e.d))
     merges = [[mis.choose(k <= kernel.last_merged, x, 0) for x in pair] for pair in merges]
     ends = light_side, mis.choose(k <= kernel.reach, camera_side, 0)
     if sds.near_specular:
@@ -206,8 +205,7 @@ def splat(kernel: TraceContext, y: Vertex, stream: Stream) -> Contribution:
     value = estimate * (connection.importance / connection.dist2) * dr.rcp(kernel.count_light)
     active = y.endpoint_active & ~spectra.is_zero(value)
 
-    densities = f.pdf_rev_w, connection.pdf_w * to_area
-    light_side, merges = side_of(kernel, y, True, *densities)
+    light_side, merges = side_of(kernel, y, True, f, connection.pdf_w * to_area)
     camera_side = h.scale(h.start(f.pdf_fwd_w * connection.arrival), kernel.kappa.arrival)
     sides = kernel.kappa.splat, light_side, camera_side, merges, kernel.kappa.splat_prime
     if kernel.sds.near_specular:

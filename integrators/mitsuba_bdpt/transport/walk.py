@@ -22,7 +22,7 @@ from .alternatives import newest_coefficient
 from .contribution import Counters, one
 from .inputs import Shared, TraceContext
 from .near_specular import is_narrow
-from .sds import PhotonStrategy, State
+from .sds import PhotonStrategy, State, is_spread
 
 
 @dataclass
@@ -354,7 +354,12 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
     if side.sds.merges:
         kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
         kappa_eta = side.sds.kappa_eta(vertex)
-        return state, *mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
+        d_vm, newest = mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
+        if side.sds.balls is not None and side.adjoint:
+            d_vm = dr.select(is_spread(step), 0, d_vm)
+        elif side.sds.balls is not None:
+            state = replace(state, spread=state.spread | is_spread(step))
+        return state, d_vm, newest
     if state is None:
         return None, 0, 0
     state = state.after(h, vertex, coefficient, step)

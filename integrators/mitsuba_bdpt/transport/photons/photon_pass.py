@@ -22,7 +22,7 @@ from .aim import Aim
 from .photon import Photon
 from .photon_guide import Guide
 
-_CAPACITY = 1.0  # initial memory, in photons per subpath
+_CAPACITY = 2.0  # initial memory, in photons per subpath
 
 # Bounds of the number of photon subpaths: of all, of a guide, of a pass of merging.
 FEWEST_PHOTONS, MOST_OF_GUIDE, MOST_OF_PASS = 1 << 12, 1 << 19, 1 << 18
