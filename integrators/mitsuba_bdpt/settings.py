@@ -109,10 +109,7 @@ class Settings:
         low=1,
         high=UNLIMITED,
     )
-    hide_emitters: bool = _parameter(
-        False,
-        "Hides directly visible emitters, as in ``path``.",
-    )
+    hide_emitters: bool = _parameter(False, "Hides directly visible emitters, as in ``path``.")
     heuristic: str = _parameter(
         "balance",
         "Heuristic of multiple importance sampling: ``balance`` or ``power`` (exponent 2).",

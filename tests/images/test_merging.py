@@ -369,6 +369,16 @@ def test_cells_may_share_a_bucket(monkeypatch):
     np.testing.assert_allclose(images(scene, 16, 1, merging=True), expected, **ROUNDING)
 
 
+def test_few_photons_of_a_cell_are_tested(monkeypatch):
+    """The image has the same mean as if all were, to 1 %: they stand for those left out."""
+    scene = mi.load_dict(under_glass(point()))
+    means = []
+    for most in (3, 1 << 20):
+        monkeypatch.setattr(passes, "PER_CELL", most)
+        means.append(images(scene, 64, 4, merging=True, merging_radius=1.5).mean())
+    assert means[0] == pytest.approx(means[1], rel=0.01)
+
+
 def test_which_photons_are_near():
     """On surfaces those in a flat disc, whose normals agree to 37 degrees, but for twice the rounding error
     of a hit. In volumes, without normals, those in a ball."""

@@ -89,9 +89,7 @@ class Parser(argparse.ArgumentParser):
 
 def build_parser() -> argparse.ArgumentParser:
     parser = Parser(
-        prog="mitsuba-bdpt",
-        description="Bidirectional path tracing for Mitsuba 3.",
-        epilog=mistakes.STATUSES,
+        prog="mitsuba-bdpt", description="Bidirectional path tracing for Mitsuba 3.", epilog=mistakes.STATUSES
     )
     parser.add_argument("--version", action="version", version=f"mitsuba-bdpt {mitsuba_bdpt.__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")

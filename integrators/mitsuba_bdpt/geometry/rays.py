@@ -17,16 +17,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from .rounding import (
-    FAR,
-    LEAST_COSINE,
-    QUADRIC_ULPS,
-    Errors,
-    ShapeErrors,
-    met,
-    offset_at,
-    rounding_offset,
-)
+from .rounding import FAR, LEAST_COSINE, QUADRIC_ULPS, Errors, ShapeErrors, met, offset_at, rounding_offset
 
 
 @dataclass

@@ -24,15 +24,7 @@ from ..errors import CommandError
 from ..files.texts import write_text
 from ..files.whole import check_own, check_writable
 from . import figures
-from .analysis import (
-    INDEPENDENT,
-    LIGHT_TRACER,
-    NONE,
-    RIVALS,
-    Results,
-    Unavailable,
-    cost,
-)
+from .analysis import INDEPENDENT, LIGHT_TRACER, NONE, RIVALS, Results, Unavailable, cost
 from .estimates import KINDS, Error
 from .metrics import Estimate, rel_mse_epsilon
 from .project import Project

@@ -289,19 +289,21 @@ def sample(kernel: TraceContext, merging: Merging, z: Vertex, stream: Stream, wa
 @dr.syntax
 def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelength_set):
     """Draw a photon of up to ``most`` edges in the disc or ball at ``z`` by flux; its index, total flux."""
-    photons, chosen, total = merging.photons, mi.UInt32(0), mi.Float(0)
+    photons, tested, chosen, total = merging.photons, merging.tested, mi.UInt32(0), mi.Float(0)
     r, radius = merging.around(z.si.p, z.volume, z.medium)
     level = level_of(radius, r * (1 - 1.01 * radius.steepest))
     last = level_of(radius, r * (1 + 1.01 * radius.steepest))
     medium = None if merging.balls is None else dr.select(z.volume, z.medium, 0)
     tag = tag_of(most, wavelength_set, medium)
-    while dr.hint(level <= last, label="grids of photons", exclude=[z, photons, r, radius, tag, last]):
+    while dr.hint(
+        level <= last, label="grids of photons", exclude=[z, photons, tested, r, radius, tag, last]
+    ):
         first, cells = _overlapped(z.si.p, r, width_of(radius, level))
         place, end, step = mi.UInt32(0), mi.UInt32(0), mi.UInt32(1)
         while dr.hint(
             (cells != 0) | (place < end),
             label="photons near a camera vertex",
-            exclude=[z, photons, r, radius, tag, last, level, first],
+            exclude=[z, photons, tested, r, radius, tag, last, level, first],
         ):
             through = place >= end  # the next cell
             bucket = bucket_of(_neighbour(first, dr.tzcnt(cells)), level, tag)
@@ -309,7 +311,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
             end = dr.select(through, dr.gather(mi.UInt32, photons.starts, bucket + 1, through), end)
             cells = dr.select(through, cells & (cells - 1), cells)
             # Of many photons one in ``step``, from a random one on.
-            many = dr.maximum(dr.ceil(mi.Float(end - start) / merging.tested), 1)
+            many = dr.maximum(dr.ceil(mi.Float(end - start) / tested), 1)
             step = dr.select(through, mi.UInt32(many), step)
             u, _ = sequential(~word)
             place = dr.select(through, start + mi.UInt32(u * mi.Float(step)), place)

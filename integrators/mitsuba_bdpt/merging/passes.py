@@ -28,7 +28,7 @@ from .merging import (
 from .radius import BALLS, Footprints, after, film_pixels
 from .wavelength_sets import SETS, WavelengthSets
 
-# Camera samples of a pass per photon subpath, also in media (experiments, "Vertex merging", "Merging in media").
+# Camera samples of a pass per photon subpath; in media (experiments, "Vertex merging", "Merging in media").
 SAMPLES_PER_PHOTON, IN_MEDIA = 4, 2
 
 # Most photons of a cell that a search tests, more where there are fewer camera samples than photon subpaths.

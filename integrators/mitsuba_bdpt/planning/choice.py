@@ -89,10 +89,7 @@ class Prediction:
 
 
 def choose(
-    moments: Moments,
-    candidates: list[Configuration],
-    samples: float = math.inf,
-    learnt: Learnt | None = None,
+    moments: Moments, candidates: list[Configuration], samples: float = math.inf, learnt: Learnt | None = None
 ) -> list[Prediction]:
     """Predictions for a render of ``samples`` samples with the tables ``learnt``, the best first.
 

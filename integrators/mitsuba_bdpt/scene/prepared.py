@@ -15,13 +15,7 @@ from ..emitters.infinite import contrast
 from ..geometry.boxes import is_finite, known_box, scene_box
 from ..geometry.hits import Hits
 from ..geometry.shape_facts import ShapeFacts
-from ..host.introspection import (
-    all_shapes,
-    is_instance,
-    media_of,
-    own_parameters,
-    registry_id,
-)
+from ..host.introspection import all_shapes, is_instance, media_of, own_parameters, registry_id
 from ..host.notices import State, cached
 from ..sensors.checks import check_sensor
 from ..sensors.kinds import prepare

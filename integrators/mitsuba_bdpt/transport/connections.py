@@ -12,14 +12,7 @@ from ..sampling.points import Purpose, Stream, sequential
 from ..sampling.reservoir import offer
 from . import path_layers, scattering, spectra
 from .alternatives import newest_coefficient, side_of
-from .contribution import (
-    Contribution,
-    Counters,
-    drop_non_finite,
-    one,
-    roulette,
-    size_of,
-)
+from .contribution import Contribution, Counters, drop_non_finite, one, roulette, size_of
 from .inputs import TraceContext
 from .light_path import LightPath, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess

@@ -59,12 +59,7 @@ class Lane:
 
 
 def trace(
-    kernel: TraceContext,
-    sink,
-    batch: Batch,
-    points: Points,
-    spp: int,
-    observer: Observer | None = None,
+    kernel: TraceContext, sink, batch: Batch, points: Points, spp: int, observer: Observer | None = None
 ) -> mi.UInt64:
     """Trace one batch and accumulate its contributions in ``sink`` (see `image.sink`).
 
@@ -116,9 +111,7 @@ def _light_subpaths(kernel: TraceContext, sink, place: mi.UInt64, index, shared,
     counters = Counters.zeros("light", "non_finite") + counted_by_light(kernel)
     number, count = mi.UInt32(0), kernel.plan.joined
     while dr.hint(
-        number < count,
-        label=f"{count} light subpaths",
-        exclude=[kernel, sink, place, index, shared, count],
+        number < count, label=f"{count} light subpaths", exclude=[kernel, sink, place, index, shared, count]
     ):
         stream = kernel.points.stream("light", place * count + mi.UInt64(number))
         path, counted, _ = _light_subpath(kernel, sink, stream, shared, path)
