@@ -788,6 +788,7 @@ def point_lamp_seen_from_below_the_plate():
 
 # One photon subpath for each sample: else merges have little of the weight beside a large lamp.
 MANY_PHOTONS = ("mitsuba_bdpt.merging.passes.SAMPLES_PER_PHOTON", 1)
+MANY_IN_MEDIA = ("mitsuba_bdpt.merging.passes.IN_MEDIA", 1)
 NEVER = {"guiding": "never"}
 
 
@@ -878,7 +879,7 @@ def all_vertices_merged(light, kind):
 ALL_MERGED = (mis, "MERGE_DOMINATED", 0.0)
 
 
-def under_water(medium, bed=0.2, judge=VOLPATH, patched=(MANY_PHOTONS, ALL_MERGED), **more):
+def under_water(medium, bed=0.2, judge=VOLPATH, patched=(MANY_IN_MEDIA, ALL_MERGED), **more):
     """A lamp so large that hits find it through water; balls lack 1 % of the light, at surfaces."""
     scene = sds.pool(medium, sds.ball(0.8), matte(bed), **more)
     return Row(scene, judge, 5, 256, 2048, 8, patched=patched)
@@ -915,7 +916,7 @@ def coloured_pool_in(variant):
 @same(*(f"small balls, {way}" for way in (*CHOICES, "quarter, three vertices, independent, roulette")))
 def pool_by():
     """Merges of half of the light, where they dominate."""
-    return under_water(fogs.fog(1, 0.8), patched=(MANY_PHOTONS,))
+    return under_water(fogs.fog(1, 0.8), patched=(MANY_IN_MEDIA,))
 
 
 @same("small balls, all", "small balls, camera", of=("homogeneous", "grid"))
@@ -934,7 +935,7 @@ def pool_point_lamp_and_wide_lens():
     eye = camera("thinlens", (-2.2, -2, 2.5), (0, 0, -0.3), 40, aperture_radius=0.8, focus_distance=3.9)
     scene = sds.pool(fogs.fog(1, 0.8), point, matte(0.2), sensor=eye)
     judge = EVERYTHING | {"merging": False}
-    return Row(scene, judge, 5, 256, 4096, 8, tile=8, error=0.06, patched=(MANY_PHOTONS,))
+    return Row(scene, judge, 5, 256, 4096, 8, tile=8, error=0.06, patched=(MANY_IN_MEDIA,))
 
 
 @same("small balls", "small balls, camera", of=("null", "dielectric"))
@@ -945,7 +946,7 @@ def fog_all_merged(bsdf):
     eye = fogs.sensor(medium=FOG)
     scene = {"fog": fogs.fog(0.8, 0.8, id="fog"), **fogs.room(eye, dense=dense, glass=glass)}
     judge = WAYS["camera"] if bsdf == "null" else VOLPATH
-    return Row(scene, judge, 4, 64, 256, 8, patched=(MANY_PHOTONS, ALL_MERGED))
+    return Row(scene, judge, 4, 64, 256, 8, patched=(MANY_IN_MEDIA, ALL_MERGED))
 
 
 # -- guided emission, and several light subpaths in a lane --------------------------------------

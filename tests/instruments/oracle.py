@@ -213,7 +213,7 @@ class Merged(Explicit):
         with np.errstate(divide="ignore", invalid="ignore"):
             merges, log_b = log_merges(paths, eta), np.log(least)
             if volume is not None:
-                spread = volume & (np.maximum(paths.to_camera, paths.to_light) <= 1 / (4 * np.pi))
+                spread = volume & (np.maximum(paths.to_camera, paths.to_light) <= 1.001 / (4 * np.pi))
                 later = np.cumsum(spread[:, ::-1], axis=1)[:, ::-1] - spread  # number beyond x_i
                 merges[later[:, 1:k] > 0] = -np.inf
             if coefficients.splat and k > 1:

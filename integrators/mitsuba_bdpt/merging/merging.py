@@ -4,10 +4,12 @@ Source: Georgiev 2012, see `mis`; in media docs/method/merging_in_media.md. A ph
 camera vertex counts as if it were there. Two bounds from one side leave out most photons and camera vertices
 of other paths, without bias (docs/method/sds_paths.md, "Bounds"):
 
-* A merge counts if its kappa eta is at least B times c of both adjacent edges, one from each side.
+* A merge counts if its kappa eta is at least B times c of both adjacent edges, one from each side, and the
+  camera's subpath has no spread event before it (`sds.is_spread`).
 * Photons, photon subpaths and camera vertices play Russian roulette with the ratio of the merge to the older
-  alternatives of their side at a diffuse surface. The estimate of a merge is then at most 1 / SLACK times
-  that at a diffuse surface: its density, and with it its BSDF, is as small as the probability.
+  alternatives of their side at a diffuse surface, in volumes at isotropic scattering. The estimate of a
+  merge is then at most 1 / SLACK times that there: its density, and with it its BSDF, is as small as the
+  probability.
 """
 
 from __future__ import annotations
@@ -115,7 +117,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
         # Also at the median radius: the subpath may go on to where discs are larger.
         median = self.kappa * self.count * dr.pi * dr.square(self.radius.median)
         most = dr.maximum(self.kappa_eta(vertex), median)
-        survived = dr.minimum(state.survived, _probability(partial.d_vc, most, vertex.volume))
+        in_media = mi.Bool(self.balls is not None)  # the next vertex may lie in a volume
+        survived = dr.minimum(state.survived, _probability(partial.d_vc, most, in_media))
         return survived / state.survived, State(survived=survived)
 
     def may_merge(self, kernel: TraceContext, vertex, connection: mis.PartialSum) -> mi.Bool:
@@ -298,7 +301,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
     while dr.hint(
         level <= last, label="grids of photons", exclude=[z, photons, tested, r, radius, tag, last]
     ):
-        first, cells = _overlapped(z.si.p, r, width_of(radius, level))
+        first, cells = _overlapped(z, r, width_of(radius, level))
         place, end, step = mi.UInt32(0), mi.UInt32(0), mi.UInt32(1)
         while dr.hint(
             (cells != 0) | (place < end),
@@ -328,16 +331,20 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
     return chosen, total
 
 
-def _overlapped(p: mi.Point3f, r: mi.Float, width: mi.Float) -> tuple[mi.Point3i, mi.UInt32]:
-    """Cells that the ball of radius ``r`` about ``p`` overlaps: the lowest of 27, and a bit for each."""
+def _overlapped(z: Vertex, r: mi.Float, width: mi.Float) -> tuple[mi.Point3i, mi.UInt32]:
+    """Cells that the disc or ball of radius ``r`` at ``z`` overlaps: the lowest of 27, and a bit for each."""
+    p, n = z.si.p, z.si.n  # in volumes 0
     first = mi.Point3i(dr.floor((p - r) / width))
     lows = [mi.Vector3f(first + i) * width - p for i in range(3)]
     squares = [dr.square(dr.maximum(dr.maximum(low, -low - width), 0)) for low in lows]
+    heights = [n * (low + width / 2) for low in lows]
+    most = _FLAT * r + 2 * z.anchor.offset + width / 2 * dr.sum(dr.abs(n))
     cells = mi.UInt32(0)
     for number in range(27):
-        x, y, z = number % 3, number // 3 % 3, number // 9
-        distance2 = squares[x].x + squares[y].y + squares[z].z
-        cells |= dr.select(distance2 <= dr.square(r), mi.UInt32(1 << number), 0)
+        x, y, k = number % 3, number // 3 % 3, number // 9
+        within = squares[x].x + squares[y].y + squares[k].z <= dr.square(r)
+        within &= dr.abs(heights[x].x + heights[y].y + heights[k].z) <= most
+        cells |= dr.select(within, mi.UInt32(1 << number), 0)
     return first, cells
 
 

@@ -99,7 +99,7 @@ class Passes:
         kappa = coefficient(samples / sets, radius)
         # More photon subpaths than that would make ordinary paths merge-dominated.
         kappa *= min(1.0, samples * self._pixels / (each * count))
-        tested = PER_CELL * max(1.0, count / (samples * self._pixels))
+        tested = PER_CELL * max(1, -(-count // (samples * self._pixels)))
         kappa, met, tested = (dr.opaque(mi.Float, x) for x in (kappa, count / sets, tested))
         balls = self._footprints.balls(after(BALLS * self._radius, end, 3), kernel.space)
         discs = self._footprints.radius(radius)

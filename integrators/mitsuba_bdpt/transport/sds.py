@@ -19,7 +19,6 @@ from .near_specular import SPECULAR, is_narrow
 
 FEWEST_EDGES = 3  # edges of the shortest guided path: no photon directly from the emitter guides
 
-
 _SPREAD = 1.001 / (4 * math.pi)  # density of isotropic scattering (1 / sr), and its rounding error
 
 
@@ -30,9 +29,9 @@ class State:
     ``isolated``: no edge is connectible; ``only_delta``, with guiding: all events were delta; ``guided``, on
     camera subpaths with guiding: r, the guide's densities over the BSDF's; ``survived``, on photon
     subpaths with merging: product of `PhotonStrategy.survival`; ``spread``, on camera subpaths that merge in
-    media: an event `is_spread`. Where near-specular events count as specular:
-    ``specular``, the last event was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term
-    of the last vertex, not in ``guided``: that vertex does not guide if the next one is the end.
+    media: an event `is_spread`. Where near-specular events count as specular: ``specular``, the last event
+    was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term of the last vertex, not in
+    ``guided``: that vertex does not guide if the next one is the end.
     """
 
     isolated: Any = None
@@ -134,8 +133,7 @@ class PhotonStrategy:
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
     subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined, in
-    volumes too with ``balls``;
-    ``near_specular``: near-specular events count as specular.
+    volumes too with ``balls``; ``near_specular``: near-specular events count as specular.
     """
 
     counters: tuple[str, ...] = ()
