@@ -30,7 +30,7 @@ MOST = {
     "": 1269,  # top files
 }
 OUTSIDE = {"scripts": 2839, "tests": 28586}
-MOST_WORDS = 31076
+MOST_WORDS = 31098
 
 
 def _lines(files):
