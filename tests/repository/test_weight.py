@@ -29,7 +29,7 @@ MOST = {
     "sensors": 881,
     "": 1269,  # top files
 }
-OUTSIDE = {"scripts": 2839, "tests": 28586}
+OUTSIDE = {"scripts": 2839, "tests": 28587}
 MOST_WORDS = 31098
 
 
