@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -85,21 +86,22 @@ class Passes:
         ``samples`` per pixel of the pass, ``done`` before it in all parts of the image: their sum gives the
         radius. ``start``: see `WavelengthSets.of`, None but in spectral variants.
         """
-        measured = self._footprints.measured
+        measured, of_window = self._footprints.measured, samples * self._pixels
         end = (done + samples) * (1 if measured else self._pixels / _METER_PIXELS)
         radius = after(self._radius, end)  # in pixels
-        of_film = samples * (self._uncropped if measured else self._pixels)
+        of_film = samples * self._uncropped if measured else of_window
         each = SAMPLES_PER_PHOTON if kernel.space.phase is None else IN_MEDIA
         count = photon_pass.photons_of(of_film, each, photon_pass.MOST_OF_PASS)
-        count = count if measured else max(count, _METER_PHOTONS)
+        if not measured:
+            count = max(count, _METER_PHOTONS)
         sets, wavelengths = 1, None
         if start is not None:
             sets, wavelengths = SETS, WavelengthSets.of(start, done / samples)
             count = max(count // sets, 1) * sets
         kappa = coefficient(samples / sets, radius)
         # More photon subpaths than that would make ordinary paths merge-dominated.
-        kappa *= min(1.0, samples * self._pixels / (each * count))
-        tested = PER_CELL * max(1, -(-count // (samples * self._pixels)))
+        kappa *= min(1.0, of_window / (each * count))
+        tested = PER_CELL * math.ceil(count / of_window)
         kappa, met, tested = (dr.opaque(mi.Float, x) for x in (kappa, count / sets, tested))
         balls = self._footprints.balls(after(BALLS * self._radius, end, 3), kernel.space)
         discs = self._footprints.radius(radius)

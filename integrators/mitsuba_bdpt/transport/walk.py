@@ -355,10 +355,12 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
         kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
         kappa_eta = side.sds.kappa_eta(vertex)
         d_vm, newest = mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
-        if side.sds.balls is not None and side.adjoint:
-            d_vm = dr.select(is_spread(step), 0, d_vm)
-        elif side.sds.balls is not None:
-            state = replace(state, spread=state.spread | is_spread(step))
+        if side.sds.balls is not None:
+            spread = is_spread(step)
+            if side.adjoint:
+                d_vm = dr.select(spread, 0, d_vm)
+            else:
+                state = replace(state, spread=state.spread | spread)
         return state, d_vm, newest
     if state is None:
         return None, 0, 0
