@@ -204,8 +204,9 @@ class Merged(Explicit):
     """With merges in further columns, see `mis`. S is the sum of kappa p of all strategies but merges, V that
     of the merges that have at least ``least`` (B) times that of the connection of either edge at their
     vertex, where t = 1 has `splat_prime` for kappa; a path is ``merged`` if V >= B S. ``log_s``, ``log_v``:
-    their logarithms; ``near``: a comparison is closer than 0.1 %, so that rounding may decide it. No merge
-    counts on the light's side of an event in a ``volume`` of up to the density of isotropic scattering."""
+    their logarithms; ``near``: a comparison is closer than 0.1 %, so that rounding may decide it. With
+    ``volume``, a mask, no merge counts on the light's side of an event of up to the density of isotropic
+    scattering in a volume, of a diffuse reflection on a surface."""
 
     def __init__(self, paths, coefficients: Coefficients, eta, least: float, heuristic: str, volume=None):
         super().__init__(paths, coefficients)
@@ -213,7 +214,9 @@ class Merged(Explicit):
         with np.errstate(divide="ignore", invalid="ignore"):
             merges, log_b = log_merges(paths, eta), np.log(least)
             if volume is not None:
-                spread = volume & (np.maximum(paths.to_camera, paths.to_light) <= 1.001 / (4 * np.pi))
+                diffuse = np.where(volume, 1.001 / (4 * np.pi), 1.001 / np.pi)
+                spread = ~paths.delta & (np.maximum(paths.to_camera, paths.to_light) <= diffuse)
+                spread[:, [0, k]] = False
                 later = np.cumsum(spread[:, ::-1], axis=1)[:, ::-1] - spread  # number beyond x_i
                 merges[later[:, 1:k] > 0] = -np.inf
             if coefficients.splat and k > 1:

@@ -791,7 +791,8 @@ def test_kernel_with_merges(name, classes, lens, least, monkeypatch):
             weights = kernel_weights(world, kappa, name, patch, merges)
         distance = np.linalg.norm(world.position.astype(np.float64) - centre, axis=2)
         eta = share * count * np.pi * np.clip(angle * distance, low, high) ** 2
-        explicit = oracle.Merged(world.paths, kappa, eta, least, name)
+        volume = np.zeros_like(world.paths.delta)
+        explicit = oracle.Merged(world.paths, kappa, eta, least, name, volume)
         check_merged(explicit, name, weights, 1e-3, world.paths.delta)
         sure, paths, inner = ~explicit.near, world.paths, slice(1, k)
         towards_light = paths.cos_camera[:, : k - 1]  # at x_1 ... x_{k-1}

@@ -107,8 +107,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return replace(walk, partial=replace(walk.partial, d_vm=zero, d_vm_newest=zero))
 
     def begin_camera(self, kernel, walk):
-        state = None if self.balls is None else State(spread=mi.Bool(False))
-        return replace(self.begin_light(kernel, walk), sds=state)
+        return replace(self.begin_light(kernel, walk), sds=State(spread=mi.Bool(False)))
 
     def begin(self, kernel, e, walk):
         return replace(walk, sds=State(survived=mi.Float(1)))
@@ -153,9 +152,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
-        before = y.d_vm, y.d_vm_newest
-        if self.balls is not None:
-            before = (dr.select(is_spread(f), 0, x) for x in before)
+        spread = is_spread(f)
+        before = (dr.select(spread, 0, x) for x in (y.d_vm, y.d_vm_newest))
         light = mis.Partial(0, y.d_vc, *before), y.connection, f.pdf_fwd_w
         camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic

@@ -61,7 +61,7 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, spread=None) 
     """Other strategies on the side of a connected ``vertex``.
 
     ``f``: its `bsdf.Evaluation`; ``pdf_a`` as in `mis.alternatives`; ``spread``, of a light vertex: mask,
-    `sds.is_spread` an event of the camera subpath; None: at none.
+    `sds.is_spread` an event of the camera subpath (None: of t = 1).
     Returns `mis.alternatives`, and a tuple for `Heuristic.weigh`: `mis.merges`, empty without merging.
     """
     h, partial = kernel.heuristic, vertex.partial
@@ -72,7 +72,7 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, spread=None) 
     kappa_prime = newest_coefficient(kernel, vertex, adjoint, prime=True)
     kappa_eta = kernel.sds.kappa_eta(vertex)
     there, older = mis.merges(h, partial, kappa_prime, f.pdf_rev_w, pdf_a, kappa_eta)
-    if adjoint and kernel.sds.balls is not None:
+    if adjoint:
         older = dr.select(is_spread(f), 0, older)
         there, older = (x if spread is None else dr.select(spread, 0, x) for x in (there, older))
     return found, ((there, older),)

@@ -43,7 +43,7 @@ def inner(kernel: TraceContext, z: Vertex, y: PathVertex) -> Contribution:
     active &= ~spectra.is_zero(value)
 
     own = kernel.kappa.inner
-    spread = None if kernel.sds.balls is None else z.sds.spread | is_spread(f_z)
+    spread = None if not kernel.sds.merges else z.sds.spread | is_spread(f_z)
     light_side, merges_y = side_of(kernel, y, True, f_y, f_z.pdf_fwd_w * cos_y * inverse, spread)
     camera_side, merges_z = side_of(kernel, z, False, f_z, f_y.pdf_fwd_w * cos_z * inverse)
     if kernel.sds.near_specular:

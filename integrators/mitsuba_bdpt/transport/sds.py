@@ -19,7 +19,8 @@ from .near_specular import SPECULAR, is_narrow
 
 FEWEST_EDGES = 3  # edges of the shortest guided path: no photon directly from the emitter guides
 
-_SPREAD = 1.001 / (4 * math.pi)  # density of isotropic scattering (1 / sr), and its rounding error
+# Largest densities (1 / sr) of diffuse reflection and isotropic scattering, with their rounding error.
+_DIFFUSE, _ISOTROPIC = 1.001 / math.pi, 1.001 / (4 * math.pi)
 
 
 @dataclass
@@ -28,8 +29,8 @@ class State:
 
     ``isolated``: no edge is connectible; ``only_delta``, with guiding: all events were delta; ``guided``, on
     camera subpaths with guiding: r, the guide's densities over the BSDF's; ``survived``, on photon
-    subpaths with merging: product of `PhotonStrategy.survival`; ``spread``, on camera subpaths that merge in
-    media: an event `is_spread`. Where near-specular events count as specular: ``specular``, the last event
+    subpaths with merging: product of `PhotonStrategy.survival`; ``spread``, on camera subpaths with merging:
+    an event `is_spread`. Where near-specular events count as specular: ``specular``, the last event
     was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term of the last vertex, not in
     ``guided``: that vertex does not guide if the next one is the end.
     """
@@ -104,11 +105,11 @@ def is_specular(f) -> mi.Bool:
 
 
 def is_spread(f) -> mi.Bool:
-    """Mask: scattering in a volume of at most the density of isotropic scattering, the same from both sides.
+    """Mask: an event with at most the density of diffuse or isotropic scattering, the same from both sides.
 
-    Camera subpaths merge at it, not after it (docs/method/merging_in_media.md). ``f`` as in `is_specular`.
+    Camera subpaths merge at it, not after it (docs/method/sds_paths.md). ``f`` as in `is_specular`.
     """
-    return f.volume & (dr.maximum(f.pdf_fwd_w, f.pdf_rev_w) <= _SPREAD)
+    return dr.maximum(f.pdf_fwd_w, f.pdf_rev_w) <= dr.select(f.volume, _ISOTROPIC, _DIFFUSE)
 
 
 @dataclass

@@ -355,12 +355,11 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
         kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
         kappa_eta = side.sds.kappa_eta(vertex)
         d_vm, newest = mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
-        if side.sds.balls is not None:
-            spread = is_spread(step)
-            if side.adjoint:
-                d_vm = dr.select(spread, 0, d_vm)
-            else:
-                state = replace(state, spread=state.spread | spread)
+        spread = is_spread(step) & ~step.delta
+        if side.adjoint:
+            d_vm = dr.select(spread, 0, d_vm)
+        else:
+            state = replace(state, spread=state.spread | spread)
         return state, d_vm, newest
     if state is None:
         return None, 0, 0
