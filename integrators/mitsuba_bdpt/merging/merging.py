@@ -296,15 +296,16 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
     last = level_of(radius, r * (1 + 1.01 * radius.steepest))
     medium = None if merging.balls is None else dr.select(z.volume, z.medium, 0)
     tag = tag_of(most, wavelength_set, medium)
+    offset = sequential(~word)[0]
     while dr.hint(
-        level <= last, label="grids of photons", exclude=[z, photons, tested, r, radius, tag, last]
+        level <= last, label="grids of photons", exclude=[z, photons, tested, r, radius, tag, last, offset]
     ):
         first, cells = _overlapped(z, r, width_of(radius, level))
         place, end, step = mi.UInt32(0), mi.UInt32(0), mi.UInt32(1)
         while dr.hint(
             (cells != 0) | (place < end),
             label="photons near a camera vertex",
-            exclude=[z, photons, tested, r, radius, tag, last, level, first],
+            exclude=[z, photons, tested, r, radius, tag, last, offset, level, first],
         ):
             through = place >= end  # the next cell
             bucket = bucket_of(_neighbour(first, dr.tzcnt(cells)), level, tag)
@@ -314,8 +315,7 @@ def _draw(merging: Merging, z: Vertex, most: mi.UInt32, word: mi.UInt32, wavelen
             # Of many photons one in ``step``, from a random one on.
             many = dr.maximum(dr.ceil(mi.Float(end - start) / tested), 1)
             step = dr.select(through, mi.UInt32(many), step)
-            u, _ = sequential(~word)
-            place = dr.select(through, start + mi.UInt32(u * mi.Float(step)), place)
+            place = dr.select(through, start + mi.UInt32(offset * mi.Float(step)), place)
 
             tried = place < end
             size = _flux_near(photons, place, z, r, tag, tried) * mi.Float(step)
