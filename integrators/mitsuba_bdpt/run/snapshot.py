@@ -108,7 +108,7 @@ class Snapshot:
             if name not in apart_from and mine != given:
                 raise UsageError(
                     f"the snapshot is of another render: its {name} is {mine!r}, here it is {given!r}; "
-                    "go on with what it was begun with, or begin anew"
+                    "go on with what it was begun with, or begin anew (command line: --resume never)"
                 )
 
     def joined(self, other: Snapshot) -> Snapshot:
