@@ -216,7 +216,7 @@ class Merged(Explicit):
             if volume is not None:
                 diffuse = np.where(volume, 1.001 / (4 * np.pi), 1.001 / np.pi)
                 spread = ~paths.delta & (np.maximum(paths.to_camera, paths.to_light) <= diffuse)
-                spread[:, [0, k]] = False
+                spread[:, k] = False
                 later = np.cumsum(spread[:, ::-1], axis=1)[:, ::-1] - spread  # number beyond x_i
                 merges[later[:, 1:k] > 0] = -np.inf
             if coefficients.splat and k > 1:

@@ -5,7 +5,7 @@ camera vertex counts as if it were there. Two bounds from one side leave out mos
 of other paths, without bias (docs/method/sds_paths.md, "Bounds"):
 
 * A merge counts if its kappa eta is at least B times c of both adjacent edges, one from each side, and the
-  camera's subpath has no spread event before it (`sds.is_spread`).
+  camera's subpath has no diffuse event before it (`sds.is_diffuse`).
 * Photons, photon subpaths and camera vertices play Russian roulette with the ratio of the merge to the older
   alternatives of their side at a diffuse surface, in volumes at isotropic scattering. The estimate of a
   merge is then at most 1 / SLACK times that there: its density, and with it its BSDF, is as small as the
@@ -30,7 +30,7 @@ from ..transport.contribution import Contribution, one, size_of
 from ..transport.inputs import TraceContext
 from ..transport.photons.photon import Photon
 from ..transport.photons.photon_pass import PhotonPolicy
-from ..transport.sds import PhotonStrategy, State, is_spread
+from ..transport.sds import PhotonStrategy, State, is_diffuse
 from ..transport.walk import Vertex
 from .radius import Balls, Radius
 from .wavelength_sets import SET_BITS, WavelengthSets
@@ -98,8 +98,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
         disc = self.kappa * (self.count * dr.pi * dr.square(self.radius.at(vertex.si.p)))
         if self.balls is not None:  # kappa of a ball: a disc's over the probability of a collision, at most 1
             disc = dr.select(vertex.volume, dr.minimum(self.eta(vertex), disc), disc)
-        if vertex.sds is not None and vertex.sds.spread is not None:
-            disc = dr.select(vertex.sds.spread, 0, disc)
+        if vertex.sds is not None and vertex.sds.behind_diffuse is not None:
+            disc = dr.select(vertex.sds.behind_diffuse, 0, disc)
         return dr.minimum(disc, mis.SATURATION)
 
     def begin_light(self, kernel, walk):
@@ -107,7 +107,7 @@ class Merging(PhotonStrategy, PhotonPolicy):
         return replace(walk, partial=replace(walk.partial, d_vm=zero, d_vm_newest=zero))
 
     def begin_camera(self, kernel, walk):
-        return replace(self.begin_light(kernel, walk), sds=State(spread=mi.Bool(False)))
+        return replace(self.begin_light(kernel, walk), sds=State(behind_diffuse=mi.Bool(False)))
 
     def begin(self, kernel, e, walk):
         return replace(walk, sds=State(survived=mi.Float(1)))
@@ -152,8 +152,8 @@ class Merging(PhotonStrategy, PhotonPolicy):
     def merged(self, kernel: TraceContext, z: Vertex, stream: Stream, wavelength_set=None) -> Contribution:
         drawn = sample(kernel, self, z, stream, wavelength_set)
         y, f = drawn.photon, drawn.f
-        spread = is_spread(f)
-        before = (dr.select(spread, 0, x) for x in (y.d_vm, y.d_vm_newest))
+        diffuse = is_diffuse(kernel, f)
+        before = (dr.select(diffuse, 0, x) for x in (y.d_vm, y.d_vm_newest))
         light = mis.Partial(0, y.d_vc, *before), y.connection, f.pdf_fwd_w
         camera = z.partial, _connection(kernel, z), f.pdf_rev_w
         h = kernel.heuristic

@@ -11,7 +11,7 @@ import mitsuba as mi
 
 from . import mis
 from .inputs import TraceContext
-from .sds import is_spread
+from .sds import is_diffuse
 
 
 def where_lit(kernel: TraceContext, lit: mi.Bool | None) -> mis.Coefficient:
@@ -57,11 +57,11 @@ def is_sds_vertex(kernel: TraceContext, vertex, adjoint: bool) -> mi.Bool:
     return possible if state is None else possible & state.isolated
 
 
-def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, spread=None) -> tuple:
+def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, behind_diffuse=False) -> tuple:
     """Other strategies on the side of a connected ``vertex``.
 
-    ``f``: its `bsdf.Evaluation`; ``pdf_a`` as in `mis.alternatives`; ``spread``, of a light vertex: mask,
-    `sds.is_spread` an event of the camera subpath (None: of t = 1).
+    ``f``: its `bsdf.Evaluation`; ``pdf_a`` as in `mis.alternatives`; ``behind_diffuse``, of a light
+    vertex: mask, an event of the camera subpath is `sds.is_diffuse`.
     Returns `mis.alternatives`, and a tuple for `Heuristic.weigh`: `mis.merges`, empty without merging.
     """
     h, partial = kernel.heuristic, vertex.partial
@@ -73,8 +73,8 @@ def side_of(kernel: TraceContext, vertex, adjoint: bool, f, pdf_a, spread=None) 
     kappa_eta = kernel.sds.kappa_eta(vertex)
     there, older = mis.merges(h, partial, kappa_prime, f.pdf_rev_w, pdf_a, kappa_eta)
     if adjoint:
-        older = dr.select(is_spread(f), 0, older)
-        there, older = (x if spread is None else dr.select(spread, 0, x) for x in (there, older))
+        there = dr.select(behind_diffuse, 0, there)
+        older = dr.select(behind_diffuse | is_diffuse(kernel, f), 0, older)
     return found, ((there, older),)
 
 

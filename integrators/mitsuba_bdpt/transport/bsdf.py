@@ -63,11 +63,12 @@ class Step:
 class Traits:
     """Properties of the BSDFs that rays can hit.
 
-    ``full_pdf``: see `draws.needs_full_pdf`; ``round_trip``: a delta event may exist from one end only, with
-    maps: Mitsuba's reject sampled directions (not incident ones) on different sides of the surface and of the
-    perturbed normal, and flip the normal towards the incident direction; ``glossy``: one has a glossy lobe;
-    ``transmits``: one has a non-delta lobe on the other side; ``parts``: one is sampled by its parts, see
-    `draws`; ``reverse``: weights need reverse densities; ``only_delta``: only delta lobes are sampled.
+    ``full_pdf``: see `draws.needs_full_pdf`; ``one_way``: an event may exist from one end only, with maps:
+    Mitsuba's reject sampled directions (not incident ones) on different sides of the surface and of the
+    perturbed normal, and flip the normal towards the incident direction; ``round_trip``: a delta one;
+    ``glossy``: one has a glossy lobe; ``transmits``: one has a non-delta lobe on the other side; ``parts``:
+    one is sampled by its parts, see `draws`; ``reverse``: weights need reverse densities; ``only_delta``:
+    only delta lobes are sampled.
     """
 
     full_pdf: bool
@@ -77,6 +78,7 @@ class Traits:
     transmits: bool = False
     parts: bool = False
     reverse: bool = True
+    one_way: bool = False
     only_delta: bool = False
 
     def from_one_side(self) -> Traits:
@@ -103,7 +105,7 @@ class Traits:
         """
         hit = {id(bsdf): bsdf for bsdf in bsdfs}
         inner = {id(bsdf): bsdf for bsdf in family or nested(hit.values())}
-        maps = (bsdf for bsdf in inner.values() if bsdf.class_name() in draws.MAPS)
+        maps = [bsdf for bsdf in inner.values() if bsdf.class_name() in draws.MAPS]
         flags, f = [int(bsdf.flags()) for bsdf in hit.values()], mi.BSDFFlags
         parts = any(draws.by_parts(b) for b in hit.values())
         full_pdf = needs_full_pdf(inner.values())
@@ -115,6 +117,7 @@ class Traits:
             glossy=any(has & int(f.Glossy) for has in flags),
             transmits=any(has & (int(f.DiffuseTransmission) | int(f.GlossyTransmission)) for has in flags),
             parts=parts,
+            one_way=bool(maps),
         )
 
 

@@ -16,7 +16,7 @@ from .contribution import Contribution, Counters, drop_non_finite, one, roulette
 from .inputs import TraceContext
 from .light_path import LightPath, read_light_vertex, read_proxy
 from .proxy_vertices import ProxyVertex, guess
-from .sds import connects_sds_path, is_spread
+from .sds import connects_sds_path, is_diffuse
 from .vacuum import ShadowRay
 from .walk import PathVertex, Vertex
 
@@ -43,8 +43,9 @@ def inner(kernel: TraceContext, z: Vertex, y: PathVertex) -> Contribution:
     active &= ~spectra.is_zero(value)
 
     own = kernel.kappa.inner
-    spread = None if not kernel.sds.merges else z.sds.spread | is_spread(f_z)
-    light_side, merges_y = side_of(kernel, y, True, f_y, f_z.pdf_fwd_w * cos_y * inverse, spread)
+    behind_diffuse = kernel.sds.merges and z.sds.behind_diffuse | is_diffuse(kernel, f_z)
+    pdf_y = f_z.pdf_fwd_w * cos_y * inverse
+    light_side, merges_y = side_of(kernel, y, True, f_y, pdf_y, behind_diffuse)
     camera_side, merges_z = side_of(kernel, z, False, f_z, f_y.pdf_fwd_w * cos_z * inverse)
     if kernel.sds.near_specular:
         newest_y, newest_z = newest_coefficient(kernel, y, True), newest_coefficient(kernel, z, False)

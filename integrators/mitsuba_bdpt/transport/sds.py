@@ -29,8 +29,8 @@ class State:
 
     ``isolated``: no edge is connectible; ``only_delta``, with guiding: all events were delta; ``guided``, on
     camera subpaths with guiding: r, the guide's densities over the BSDF's; ``survived``, on photon
-    subpaths with merging: product of `PhotonStrategy.survival`; ``spread``, on camera subpaths with merging:
-    an event `is_spread`. Where near-specular events count as specular: ``specular``, the last event
+    subpaths with merging: product of `PhotonStrategy.survival`; ``behind_diffuse``, on camera subpaths with
+    merging: an event `is_diffuse`. Where near-specular events count as specular: ``specular``, the last event
     was; on camera subpaths ``diffuse``, an event was not; ``newest``, the term of the last vertex, not in
     ``guided``: that vertex does not guide if the next one is the end.
     """
@@ -42,7 +42,7 @@ class State:
     specular: Any = None
     diffuse: Any = None
     newest: Any = None
-    spread: Any = None
+    behind_diffuse: Any = None
 
     def scattered(self, specular: mi.Bool, coefficient: mis.Coefficient) -> State:
         """The state after an event; ``coefficient`` of the connection of the edge to it."""
@@ -104,11 +104,14 @@ def is_specular(f) -> mi.Bool:
     return is_narrow(f, SPECULAR)
 
 
-def is_spread(f) -> mi.Bool:
-    """Mask: an event with at most the density of diffuse or isotropic scattering, the same from both sides.
+def is_diffuse(kernel, f) -> mi.Bool:
+    """Mask: neither density of an event exceeds that of diffuse reflection; in volumes isotropic scattering.
 
-    Camera subpaths merge at it, not after it (docs/method/sds_paths.md). ``f`` as in `is_specular`.
+    Camera subpaths merge at it, not after it (docs/method/sds_paths.md). ``f`` as in `is_specular`. None with
+    events `bsdf.Traits.one_way`: photons cannot follow.
     """
+    if kernel.traits.one_way:
+        return mi.Bool(False)
     return dr.maximum(f.pdf_fwd_w, f.pdf_rev_w) <= dr.select(f.volume, _ISOTROPIC, _DIFFUSE)
 
 

@@ -22,7 +22,7 @@ from .alternatives import newest_coefficient
 from .contribution import Counters, one
 from .inputs import Shared, TraceContext
 from .near_specular import is_narrow
-from .sds import PhotonStrategy, State, is_spread
+from .sds import PhotonStrategy, State, is_diffuse
 
 
 @dataclass
@@ -355,11 +355,11 @@ def _sds(kernel: TraceContext, side: Side, vertex: Vertex, coefficient: mis.Coef
         kappa_prime = newest_coefficient(kernel, vertex, side.adjoint, prime=True)
         kappa_eta = side.sds.kappa_eta(vertex)
         d_vm, newest = mis.scattered_merges(h, vertex.partial, step, kappa_eta, kappa_prime)
-        spread = is_spread(step) & ~step.delta
+        diffuse = is_diffuse(kernel, step) & ~step.delta
         if side.adjoint:
-            d_vm = dr.select(spread, 0, d_vm)
+            d_vm = dr.select(diffuse, 0, d_vm)
         else:
-            state = replace(state, spread=state.spread | spread)
+            state = replace(state, behind_diffuse=state.behind_diffuse | diffuse)
         return state, d_vm, newest
     if state is None:
         return None, 0, 0
