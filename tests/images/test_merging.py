@@ -141,16 +141,17 @@ def through_water(mu):
 def seen_in_water(sigma, albedo, g, mu, mu0, r):
     """Radiance by one scattering, of extinction ``sigma`` (colours, depths), and of a bed of reflectance 0.2.
 
-    Fluence is that in the ball of radius ``r``, each photon's over the part of its ball below the surface.
+    Fluence is that in the ball of radius ``r``, each photon's over the part of its ball in the water.
     """
     (cos, seen), (cos0, sunlit) = through_water(mu), through_water(mu0)
     step = 1 / sigma.shape[1]
     depth = np.cumsum(sigma, axis=1) * step
     height = np.arange(-int(r / step), int(r / step) + 1) * step / r
     ball = (1 - height**2) / (1 - height**2).sum()
-    h = np.minimum((np.arange(sigma.shape[1]) + 0.5) * step / r, 1)
+    h = np.minimum((np.arange(sigma.shape[1]) + 0.5) * step / r, 1)  # from the surface
     below = 1 - (1 - h) ** 2 * (2 + h) / 4
-    fluence = [np.convolve(np.exp(-of / cos0) / below, ball, "same") for of in depth - sigma * step / 2]
+    part = below * below[::-1]
+    fluence = [np.convolve(np.exp(-of / cos0) / part, ball, "same") for of in depth - sigma * step / 2]
     scattered = (sigma * fluence * np.exp((sigma * step / 2 - depth) / cos)).sum(1) * step / cos
     turn = np.sqrt((1 - cos**2) * (1 - cos0**2)) - cos * cos0
     phase = (1 - g * g) / (4 * np.pi * (1 + g * g - 2 * g * turn) ** 1.5)
@@ -173,6 +174,7 @@ EVEN, DEPTHS = np.ones((3, 2000)), (np.arange(2000) + 0.5) / 2000
 OF_LAYERS = np.interp(5 * (1 - DEPTHS) - 0.5, np.arange(5), LAYERS)
 WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radius in pixels
     "gray": (lambda: fogs.fog(1.0, 0.9, 0.3), EVEN, 0.9, 0.3, 0.85, 0.9, 0.5),
+    "thin": (lambda: fogs.fog(0.2, 0.9, -0.7), 0.2 * EVEN, 0.9, -0.7, 0.85, 0.9, 4.0),
     "dense": (lambda: fogs.fog(6.0, 0.9, -0.5), 6 * EVEN, 0.9, -0.5, 1.0, 0.7, 0.5),
     "forward": (lambda: fogs.fog(2.0, 0.9, 0.8), 2 * EVEN, 0.9, 0.8, 0.95, 0.8, 0.5),
     "coloured": (
@@ -199,7 +201,7 @@ WATERS = {  # medium, extinction, albedo and g; cosines of camera and sun, radiu
 
 @pytest.mark.parametrize("name", WATERS)
 def test_the_sun_in_water(name, monkeypatch):
-    """Also what balls lack at the bed, up to a tenth. One pass of 256 samples per pixel."""
+    """Balls end at the surface and at the bed. One pass of 256 samples per pixel."""
     monkeypatch.setattr(passes, "IN_MEDIA", 1)
     make, *water, mu, mu0, radius = WATERS[name]
     sun = {"type": "directional", "direction": [np.sqrt(1 - mu0 * mu0), 0, -mu0], "irradiance": 1.0}
@@ -408,26 +410,26 @@ def test_which_photons_are_near():
     assert found == [True, True, False, True, True, True, True, False]
 
 
-def test_balls_end_at_the_surface_where_a_photon_comes_from():
-    """The part on its side, of 10^6 points of a ball, for each distance from the surface; all of a disc, and
-    of a ball whose photon comes from a volume."""
+def test_balls_end_at_surfaces():
+    """The part between two planes, of 10^6 points of a ball, for each distance from the first; all of a disc,
+    and without a plane."""
     points = np.random.default_rng(1).normal(size=(1000000, 3))
     points *= (
         np.random.default_rng(2).uniform(size=(1000000, 1)) ** (1 / 3)
         / np.linalg.norm(points, axis=1)[:, None]
     )
     h = np.array([0, 0.3, 0.9, 1.1])
-    expected = [(points[:, 2] > -x).mean() for x in h]
+    expected = [((points[:, 2] > -x) & (points[:, 2] < 2 - x)).mean() for x in h]
     of_pass = merging.Merging(None, mi.Float(1), mi.Float(1))
     of_pass.around = lambda *_: (mi.Float(2), None)
     y = SimpleNamespace(
         si=SimpleNamespace(p=mi.Point3f(5, 7, mi.Float(2 * h))), volume=mi.Bool(True), medium=None
     )
-    start, n = mi.Point3f(1, -3, 0), mi.Normal3f(0, 0, -1)
-    np.testing.assert_allclose(of_pass.inside(y, start, n), expected, atol=2e-3)
-    np.testing.assert_array_equal(of_pass.inside(y, start, mi.Normal3f(0)), 1)
+    start, end, n = mi.Point3f(1, -3, 0), mi.Point3f(0, 9, 4), mi.Normal3f(0, 0, -1)
+    np.testing.assert_allclose(of_pass.inside(y, (start, n), (end, n)), expected, atol=2e-3)
+    np.testing.assert_array_equal(of_pass.inside(y, (start, mi.Normal3f(0))), 1)
     y.volume = mi.Bool(False)
-    np.testing.assert_array_equal(of_pass.inside(y, start, n), 1)
+    np.testing.assert_array_equal(of_pass.inside(y, (start, n)), 1)
 
 
 def test_which_photons_are_of_a_kind():

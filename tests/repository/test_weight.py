@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5089,
-    "transport merging guided_emission": 5865,
+    "transport merging guided_emission": 5883,
     "planning": 1730,
     "emitters": 2182,
     "cli": 1434,
@@ -29,8 +29,8 @@ MOST = {
     "sensors": 881,
     "": 1269,  # top files
 }
-OUTSIDE = {"scripts": 2839, "tests": 28604}
-MOST_WORDS = 31071
+OUTSIDE = {"scripts": 2839, "tests": 28606}
+MOST_WORDS = 31088
 
 
 def _lines(files):

@@ -138,11 +138,13 @@ class Merging(PhotonStrategy, PhotonPolicy):
         u = kernel.points.draw_1d("light", stream, Purpose.CONNECTION, y.event)
         return keep & (u < probability), probability
 
-    def inside(self, y, start, n):
+    def inside(self, y, *planes):
         r, _ = self.around(y.si.p, y.volume, y.medium)
-        h = dr.minimum(dr.abs(dr.dot(n, y.si.p - start)) / r, 1)
-        cut = y.volume & (dr.squared_norm(n) > 0)
-        return dr.select(cut, 1 - dr.square(1 - h) * (2 + h) / 4, 1)
+        part = mi.Float(1)
+        for p, n in planes:
+            h = dr.minimum(dr.abs(dr.dot(n, y.si.p - p)) / r, 1)
+            part *= dr.select(dr.squared_norm(n) > 0, 1 - dr.square(1 - h) * (2 + h) / 4, 1)
+        return dr.select(y.volume, part, 1)
 
     def is_merged(self, kernel, z, stream):
         word = kernel.points.series(stream, Purpose.CONNECTION, z.event, mi.UInt32(_OF_QUERIES))

@@ -54,8 +54,8 @@ class PhotonPolicy:
         """Mask: ``y`` is stored; the probability of that."""
         raise NotImplementedError
 
-    def inside(self, y: Vertex, start: mi.Point3f, n: mi.Normal3f) -> mi.Float:
-        """Part of the photon's ball on its side of the plane at ``start`` with normal ``n``; 1 of a disc."""
+    def inside(self, y: Vertex, *planes: tuple[mi.Point3f, mi.Normal3f]) -> mi.Float:
+        """Part of the photon's ball on its side of all ``planes`` (point; normal, or 0); 1 of a disc."""
         raise NotImplementedError
 
 
@@ -126,7 +126,7 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
         # Otherwise all estimates near it would be NaN; the walk counts it.
         keep &= spectra.is_finite(y.throughput)
         arriving, medium = kernel.space.before_event(y, walk.d)
-        inside = 1.0 if boundary is None else policy.inside(y, walk.o, boundary)
+        inside = 1.0 if boundary is None else policy.inside(y, (walk.o, boundary), _ahead(kernel, walk, y))
         found = Photon(
             p=y.si.p,
             d=-walk.d,
@@ -147,7 +147,7 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
         place = dr.scatter_inc(number, mi.UInt32(0), keep)
         out.put(found, place, keep & (place < most))
         if boundary is not None:
-            boundary = dr.select(mi.has_flag(y.bsdf.flags(), mi.BSDFFlags.Null), 0, y.si.n)
+            boundary = _normal(y.si, y.bsdf)
         return counters + Counters(photons=one(keep)), boundary
 
     state = Counters.zeros("photons"), boundary
@@ -159,3 +159,14 @@ def _traced(kernel: TraceContext, policy: PhotonPolicy, aim: Aim, count: int, ou
     dr.scatter(broken, mi.Bool(True), e.index, astray)
     dr.eval(number, out, counts, broken)
     return Traced(out, int(number[0]), counts, broken)
+
+
+def _normal(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr) -> mi.Normal3f:
+    """Normal of a surface that may bound a medium; 0 in volumes and at null BSDFs."""
+    return dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null), 0, si.n)
+
+
+def _ahead(kernel: TraceContext, walk: Walk, y: Vertex) -> tuple[mi.Point3f, mi.Normal3f]:
+    """The surface that the edge to ``y``, in a volume, would have reached: a point and `_normal`."""
+    si = kernel.hits.at(walk.pi, mi.Ray3f(walk.o, walk.d), y.volume & walk.pi.is_valid())
+    return si.p, dr.select(si.is_valid(), _normal(si, si.bsdf()), 0)
