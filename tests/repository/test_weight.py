@@ -30,7 +30,7 @@ MOST = {
     "": 1269,  # top files
 }
 OUTSIDE = {"scripts": 2839, "tests": 28606}
-MOST_WORDS = 31070
+MOST_WORDS = 31170
 
 
 def _lines(files):
