@@ -336,7 +336,7 @@ def traced(count=1 << 14, described=None):
 @pytest.mark.parametrize("mapped", [True, False])
 def test_maps_lose_no_light(mapped, monkeypatch):
     """A normal map may let light scatter towards the camera and no photon back: merges behind diffuse events
-    count, else a room of such walls, by camera subpaths alone, lacked 5 % of its light. Expected: with a map
+    count, else a room of such walls lacked 5 % of its light with ``light_paths=0``. Expected: with a map
     the image is the same to the bit if no event counts as diffuse, without one it is not."""
     scene = mi.load_dict(under_glass(point(), bsdf_parts.tilted(matte(0.8)) if mapped else matte(0.8)))
     first = images(scene, 64, 1, merging=True, max_depth=8)

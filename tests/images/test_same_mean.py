@@ -880,7 +880,7 @@ ALL_MERGED = (mis, "MERGE_DOMINATED", 0.0)
 
 
 def under_water(medium, bed=0.2, judge=VOLPATH, patched=(MANY_IN_MEDIA, ALL_MERGED), **more):
-    """A lamp so large that hits find it through water; balls lack 1 % of the light, at surfaces."""
+    """A lamp so large that hits find it through water; balls lack up to 1 % of the light, at surfaces."""
     scene = sds.pool(medium, sds.ball(0.8), matte(bed), **more)
     return Row(scene, judge, 5, 256, 2048, 8, patched=patched)
 

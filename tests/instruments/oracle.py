@@ -215,9 +215,9 @@ class Merged(Explicit):
             merges, log_b = log_merges(paths, eta), np.log(least)
             if volume is not None:
                 diffuse = np.where(volume, 1.001 / (4 * np.pi), 1.001 / np.pi)
-                spread = ~paths.delta & (np.maximum(paths.to_camera, paths.to_light) <= diffuse)
-                spread[:, k] = False
-                later = np.cumsum(spread[:, ::-1], axis=1)[:, ::-1] - spread  # number beyond x_i
+                events = ~paths.delta & (np.maximum(paths.to_camera, paths.to_light) <= diffuse)
+                events[:, k] = False
+                later = np.cumsum(events[:, ::-1], axis=1)[:, ::-1] - events  # number beyond x_i
                 merges[later[:, 1:k] > 0] = -np.inf
             if coefficients.splat and k > 1:
                 primed[:, k] += np.log(coefficients.splat_prime / coefficients.splat)

@@ -15,7 +15,7 @@ PACKAGE = ROOT / "integrators" / "mitsuba_bdpt"
 # Most lines of `*.py`, docstrings included, by folder.
 MOST = {
     "measure": 5089,
-    "transport merging guided_emission": 5878,
+    "transport merging guided_emission": 5877,
     "planning": 1730,
     "emitters": 2182,
     "cli": 1434,
@@ -30,7 +30,7 @@ MOST = {
     "": 1269,  # top files
 }
 OUTSIDE = {"scripts": 2839, "tests": 28606}
-MOST_WORDS = 31170
+MOST_WORDS = 31198
 
 
 def _lines(files):

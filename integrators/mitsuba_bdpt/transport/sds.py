@@ -107,8 +107,8 @@ def is_specular(f) -> mi.Bool:
 def is_diffuse(kernel, f) -> mi.Bool:
     """Mask: neither density of an event exceeds that of diffuse reflection; in volumes isotropic scattering.
 
-    Camera subpaths merge at it, not after it (docs/method/sds_paths.md). ``f`` as in `is_specular`. None with
-    events `bsdf.Traits.one_way`: photons cannot follow.
+    Camera subpaths merge at it, not after it (docs/method/sds_paths.md). ``f`` as in `is_specular`. No event
+    is diffuse with `bsdf.Traits.one_way`: photons cannot follow each.
     """
     if kernel.traits.one_way:
         return mi.Bool(False)
@@ -136,14 +136,13 @@ class PhotonStrategy:
     """A further strategy for SDS paths: hooks of the kernel, which add nothing here.
 
     ``counters``: names of the `Counters` that `visit` changes; ``wavelengths``: `WavelengthSets` that all
-    subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined, in
-    volumes too with ``balls``; ``near_specular``: near-specular events count as specular.
+    subpaths use, or None; ``merges``: it merges vertices, and `kappa_eta` and `survival` are defined;
+    ``near_specular``: near-specular events count as specular.
     """
 
     counters: tuple[str, ...] = ()
     wavelengths: Any = None
     merges = False
-    balls: Any = None
     near_specular = False
 
     def kappa_eta(self, vertex) -> mi.Float:

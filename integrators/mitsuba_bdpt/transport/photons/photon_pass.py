@@ -167,6 +167,6 @@ def _normal(si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr) -> mi.Normal3f:
 
 
 def _ahead(kernel: TraceContext, walk: Walk, y: Vertex) -> tuple[mi.Point3f, mi.Normal3f]:
-    """The surface that the edge to ``y``, in a volume, would have reached: a point and `_normal`."""
+    """The first surface on or behind the edge to ``y``, in a volume: a point and `_normal`."""
     si = kernel.hits.at(walk.pi, mi.Ray3f(walk.o, walk.d), y.volume & walk.pi.is_valid())
     return si.p, dr.select(si.is_valid(), _normal(si, si.bsdf()), 0)
